@@ -30,8 +30,8 @@ class Look(TypedDict, total=False):
 class Result:
     """What is found, abstract. `shown_by` names its module of `apc.present`, and it there: "vary:critical".
 
-    That module has a function for each form of it: `critical_text`, `critical_picture`. Its document is its
-    fields (`forms.document`), unless there is a `critical_document`.
+    That module has a function for each form of it: `critical_text`, which yields its lines,
+    `critical_picture`. Its document is its fields (`forms.record`), unless there is a `critical_document`.
     """
 
     __slots__ = ()
@@ -50,13 +50,12 @@ class Result:
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, str]:
         """Return what a notebook shows: the text, and as HTML the text with its picture."""
-        html: str = import_module("apc.present.notebook").html_of(self)
+        html: str = import_module("apc.present.pictures").html_of(self)
         return {"text/plain": str(self), "text/html": html}
 
     def __str__(self) -> str:
         """Return the result as text of at most 80 columns."""
-        text: str = self._shown("text")
-        return text
+        return "\n".join(self._shown("text")).rstrip()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as plain data, ready for JSON."""
@@ -83,5 +82,5 @@ class Result:
         forms: Any = import_module(f"apc.present.{module}")
         if hasattr(forms, f"{name}_{form}"):
             return getattr(forms, f"{name}_{form}")(self, *arguments)
-        other, called = {"document": ("forms", "document"), "table": ("pictures", "table_of")}[form]
+        other, called = {"document": ("forms", "record"), "table": ("pictures", "table_of")}[form]
         return getattr(import_module(f"apc.present.{other}"), called)(self)

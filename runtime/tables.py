@@ -1,7 +1,7 @@
 """Tables of named columns as files, written as their rows come: CSV or Parquet, by the suffix.
 
 Takes: columns, and rows block by block.
-Gives: `Column`, `Row`, `Writer` and `WRITERS` of the formats; `check_table_path`, `write_table`,
+Gives: `Column`, `Row`, `Tabled`, `Writer` and `WRITERS` of the formats; `check_table_path`, `write_table`,
 `read_table`, `blocks_of`, `keep_room`.
 Guarantees: a block is in the file whole or not at all; before a block is written, room is kept on the disk
 for it and for the file's end, so that on a full disk the blocks before it can still be finished. The same
@@ -65,6 +65,10 @@ class Column:
     def heading(self) -> str:
         """The column's heading: name, and unit if it has one."""
         return f"{self.name} [{self.unit}]" if self.unit else self.name
+
+
+# What a table is made of: its columns, its rows, and what a file says of how it was made.
+Tabled = tuple[list[Column], Iterator[Row], dict[str, Any]]
 
 
 class Writer(ABC):

@@ -95,4 +95,4 @@ def _compile(path: Path) -> None:
     system = compile_topology(path)
     check_values(system)
     save(system, target := path.with_suffix(".apc"), compiled=True)
-    tell(compile_text(system, needs(system), target))
+    tell("\n".join(compile_text(system, needs(system), target)))

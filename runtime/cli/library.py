@@ -104,7 +104,7 @@ def _gallery(out: Path) -> str:
     from apc.compiler.files import check_target, write_text
     from apc.compiler.view.catalogue import scenes
     from apc.optional import need
-    from apc.present.gallery import gallery_page
+    from apc.present.pages import gallery_page
     from apc.suffixes import check_suffix
 
     check_suffix(out, (".html",), "--out")

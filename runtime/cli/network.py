@@ -51,7 +51,7 @@ def network_command(
             raise ApcError(Mistake("E207", Place("--interval"), "the interval", expected, interval, hint))
     found = describe(recording, between)
     if out is not None:
-        from apc.present.recorded_network import recording_table
+        from apc.present.network import recording_table
 
         write_text(out, recording_table(found))
     print_result(found, as_json=as_json, written=[out])

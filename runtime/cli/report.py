@@ -52,7 +52,7 @@ def report_command(
         return
     assert out is not None
     from apc.inputs import check_topology_outputs, find_input, refuse_model
-    from apc.present.report import check_report_path, report_text, save_report
+    from apc.present.report import check_report_path, save_report
     from apc.reports.contents import report
 
     check_report_path(out)
@@ -63,7 +63,7 @@ def report_command(
     with at_work("reporting"):
         found = report(paths, settings)
         save_report(found, out)
-    tell(report_text(found))
+    tell(str(found))
     tell(f"\n{out} is written")
 
 

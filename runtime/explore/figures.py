@@ -9,7 +9,6 @@ Does not: compute, or know sliders.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from html import escape
 from typing import Any
 
@@ -28,7 +27,8 @@ from bokeh.models import (
 from bokeh.plotting import figure
 
 from apc.compiler.words import counted
-from apc.explore.motion import ROWS, Motion
+from apc.explore.motion import MM, ROWS, Motion
+from apc.present.forms import Plain
 
 # Colours that are distinct in print and for colour-blind eyes: Okabe and Ito, 2008, the lightest two of them
 # darkened until they stand out from white as graphics have to (WCAG 2.1, 1.4.11).
@@ -136,7 +136,7 @@ class Words:
         """Show lines, as they are."""
         self.model.text = "".join(f"<p>{escape(line)}</p>" for line in lines)
 
-    def verdict(self, found: Mapping[str, Any]) -> None:
+    def verdict(self, found: Plain) -> None:
         """Show a verdict, what limits it, and behind a lid all that `apc analyze` prints."""
         kind = {True: "stable", False: "unstable"}.get(found["stable"], "")
         self.model.text = (
@@ -193,7 +193,7 @@ class RegionFigure:
         _legend_below(self.plot)
         self.words = Words("region-words")
 
-    def show(self, found: Mapping[str, Any]) -> None:
+    def show(self, found: Plain) -> None:
         """Draw a region."""
         self.plot.visible = True
         outlines = [np.asarray(one) for one in found["outlines"]]
@@ -264,7 +264,7 @@ class RootsFigure:
         self.words, self.way_words = Words("roots-words"), Words("way-words")
         self.way_words.say("Move a slider: dots show the way the eigenvalues take.")
 
-    def show(self, found: Mapping[str, Any]) -> None:
+    def show(self, found: Plain) -> None:
         """Draw the eigenvalues of an analysis."""
         self.now.data = {"x": found["real"], "y": found["imag"], "name": found["names"]}
         size = BEYOND * float(np.hypot(found["real"], found["imag"]).max(initial=0.0))
@@ -274,7 +274,7 @@ class RootsFigure:
         outside = int((np.hypot(found["real"], found["imag"]) > 1).sum())
         self.words.say(f"{counted(len(found['real']), 'eigenvalue')}, {outside} outside the unit circle.")
 
-    def way_of(self, found: Mapping[str, Any]) -> None:
+    def way_of(self, found: Plain) -> None:
         """Draw where the eigenvalues go as a slider goes through all its values."""
         self.way.data = {"x": found["real"], "y": found["imag"], "name": found["name"]}
         self.way_words.say(
@@ -371,51 +371,47 @@ class MotionFigure:
         """Draw a motion, and put the bodies where they are at the time that is shown."""
         self._visible(True)
         peers, names = (
-            list(dict.fromkeys(column))
-            for column in zip(*((one.peer, one.name) for one in motion.bodies), strict=True)
+            list(dict.fromkeys(one))
+            for one in zip(*((peer, one.name) for peer, one in motion.bodies), strict=True)
         )
-        colours = [COLOURS[peers.index(one.peer) % len(COLOURS)] for one in motion.bodies]
-        labels = [f"{one.peer}.{one.name}" for one in motion.bodies]
+        colours = [COLOURS[peers.index(peer) % len(COLOURS)] for peer, _ in motion.bodies]
+        labels = [f"{peer}.{one.name}" for peer, one in motion.bodies]
+        x, y = motion.x, motion.y
         self.lines.data = {
-            "xs": [motion.time for _ in motion.bodies],
-            "ys": [one.x for one in motion.bodies],
+            "xs": [motion.time for _ in labels],
+            "ys": [*x.T],
             "colour": colours,
-            "dash": [DASHES[names.index(one.name) % len(DASHES)] for one in motion.bodies],
+            "dash": [DASHES[names.index(one.name) % len(DASHES)] for _, one in motion.bodies],
             "name": labels,
         }
-        planar = motion.bodies[0].y is not None
-        heights = [
-            np.full(len(motion.time), one.row + STAGGER * names.index(one.name)) if one.y is None else one.y
-            for one in motion.bodies
-        ]
-        x, y = np.stack([one.x for one in motion.bodies], axis=1), np.stack(heights, axis=1)
-        still = np.zeros(len(motion.time))
-        angle = np.stack([still if one.angle is None else one.angle for one in motion.bodies], axis=1)
-        sizes = [one.size for one in motion.bodies]
+        planar = y is not None
+        if y is None:
+            rows = [peers.index(peer) + STAGGER * names.index(one.name) for peer, one in motion.bodies]
+            y = np.tile(rows, (len(x), 1))
+        sizes = [MM * one.radius for _, one in motion.bodies]
         self.bodies.data = {
             "x": x[0],
             "y": y[0],
-            "angle": angle[0],
-            "bar": [0 if one.angle is None else BAR for one in motion.bodies],
+            "angle": motion.angle[0],
+            "bar": [BAR if one.turning else 0 for _, one in motion.bodies],
             "width": [2 * one for one in sizes],
             "height": [2 * one if planar else 0.5 * (one > 0) for one in sizes],
-            "name": labels if planar else [one.name for one in motion.bodies],
+            "name": labels if planar else [one.name for _, one in motion.bodies],
             # In a plane bodies may stand on one place, where their names would lie on each other.
             "above": [-8 - (LINE if planar else 0) * place for place in range(len(labels))],
             "colour": colours,
         }
-        rows = [row for row, _ in motion.walls]
+        fixed = [at for _, at in motion.walls]
         self.walls.data = {
-            "x": [at for _, at in motion.walls],
-            "top": [row + 0.45 for row in rows],
-            "bottom": [row - 0.45 for row in rows],
+            "x": fixed,
+            "top": [row + 0.45 for row, _ in motion.walls],
+            "bottom": [row - 0.45 for row, _ in motion.walls],
         }
         self.discs.data = {
             name: [one[n] for one in motion.discs] for n, name in enumerate(("x", "y", "radius"))
         }
-        self.frames.data = {"time": motion.time, "x": x, "y": y, "angle": angle}
+        self.frames.data = {"time": motion.time, "x": x, "y": y, "angle": motion.angle}
         reach = max(sizes)
-        fixed = [at for _, at in motion.walls]
         low, high = min([x.min() - reach, *fixed]), max([x.max() + reach, *fixed])
         room = ROOM * (high - low) or 1.0
         self.plot.x_range.update(start=0.0, end=float(motion.time[-1]))
@@ -479,7 +475,7 @@ class FeelFigure:
         self.plot.yaxis.minor_tick_line_color = None  # over less than a decade they lie on each other
         self.words = Words("feel-words")
 
-    def show(self, found: Mapping[str, Any]) -> None:
+    def show(self, found: Plain) -> None:
         """Draw what is felt."""
         self.plot.visible = self.phase.visible = True
         self.source.data = {name: found[name] for name in ("frequency", "magnitude", "phase")}

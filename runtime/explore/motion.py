@@ -1,7 +1,7 @@
 """A scene played for the page: a push and what follows of it, and the bodies that move.
 
 Takes: a `CompiledSystem`.
-Gives: `Motion`, `Body`, `motion_of`.
+Gives: `Motion`, `motion_of`.
 Guarantees: rows are those of `simulation`, some of them left out where more are not seen; what grows without
 end is shown until it has left the picture, and says so.
 Does not: draw.
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.present.bodies import Disc, moves_in_plane, views_of
+from apc.present.bodies import Body, Disc, moves_in_plane, views_of
 from apc.simulation.strike import SPEED, WATCHED, strike
 from apc.simulation.trajectory import simulate
 
@@ -30,30 +30,19 @@ MM = 1e3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Body:
-    """A body of a peer: where it is (rows,) in mm, along its line or in its plane; `size` is half its width.
-
-    `row` counts the peers that are shown. `angle` (rows,) in rad is that of a body of a plane that turns.
-    """
-
-    peer: str
-    name: str
-    row: int
-    x: Floats
-    y: Floats | None
-    size: float
-    angle: Floats | None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """What is seen of a scene: times (rows,) in s, bodies, and what stands still: (row, mm), or discs.
+    """What is seen of a scene: times (rows,) in s, n bodies, and what stands still: (row, mm), or discs.
 
-    `told` says it in words; `others` is how many peers are not shown.
+    `x`, `y` and `angle` (rows, n) are where each body is, in mm and rad; `y` is None where all move along
+    lines, a row a peer. `bodies` are their peers and what they are at the start. `told` says it in words;
+    `others` is how many peers are not shown.
     """
 
     time: Floats
-    bodies: tuple[Body, ...]
+    bodies: tuple[tuple[str, Body], ...]
+    x: Floats
+    y: Floats | None
+    angle: Floats
     walls: tuple[tuple[int, float], ...]
     discs: tuple[tuple[float, float, float], ...]
     told: tuple[str, ...]
@@ -81,16 +70,17 @@ def motion_of(system: CompiledSystem, *, struck: bool) -> Motion:
     if struck:
         system, what = strike(system)
         told.append(f"{what} is struck: it starts at {SPEED * MM:g} mm/s.")
+    shown = tuple((view.name, body) for view in views for body in view.bodies)
     names = [
-        f"{view.name}.{state}"
-        for view in views
-        for body in view.bodies
-        for state in (*body.states[:2], *filter(None, [body.turning]))
+        [f"{peer}.{state}" for state in (one.states[0], one.states[planar], one.turning)]
+        for peer, one in shown
     ]
     if not names:
         raise ApcError(Mistake("E983", Place(system.name), "nothing here has a position that could be shown"))
     duration = system.experiment.duration or WATCHED
-    played = simulate(system, duration=duration, signals=names)
+    played = simulate(
+        system, duration=duration, signals=[one for own in names for one in own if one[-1] != "."]
+    )
     values, time = played.values, played.time
     places = [number for number, one in enumerate(played.signals) if one.unit == "m"]
     apart = np.abs(values - values[0])[:, places].max(axis=1) > FAR
@@ -100,19 +90,18 @@ def motion_of(system: CompiledSystem, *, struck: bool) -> Motion:
         told.append(f"Shown until something is {FAR:g} m from where it began.")
     some = np.unique(np.linspace(0, len(time) - 1, min(ROWS, len(time))).astype(int))
     columns = {one.name: values[some, place] for place, one in enumerate(played.signals)}
-    found = []
-    for row, view in enumerate(views):
-        for body in view.bodies:
-            x, *rest = (MM * columns[f"{view.name}.{state}"] for state in body.states[:2])
-            angle = columns.get(f"{view.name}.{body.turning}")
-            found.append(
-                Body(view.name, body.name, row, x, rest[0] if rest else None, MM * body.radius, angle)
-            )
+    still = np.zeros(len(some))
+    x, y, angle = (
+        np.stack([columns.get(one, still) for one in each], axis=1) for each in zip(*names, strict=True)
+    )
     fixed = [(row, surface) for row, view in enumerate(views) for surface in view.surfaces]
     told.append(f"It {played.summary.verdict}.")
     return Motion(
         time=time[some],
-        bodies=tuple(found),
+        bodies=shown,
+        x=MM * x,
+        y=MM * y if planar else None,
+        angle=angle,
         walls=tuple((row, MM * one.offset) for row, one in fixed if not planar and not isinstance(one, Disc)),
         discs=tuple(
             dict.fromkeys(

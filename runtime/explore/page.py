@@ -47,7 +47,7 @@ from apc.explore.written import with_values
 from apc.frame.linearize import reaches_start
 from apc.frame.names import Range
 from apc.frame.overrides import Override, apply
-from apc.present.forms import json_text
+from apc.present.forms import Plain, json_text
 from apc.processes import model_bytes
 from apc.vary.evaluator import reaches_count, reaches_time
 from apc.vary.growth import MEAN_SQUARE, NOMINAL
@@ -186,7 +186,7 @@ class Page:
         self.tuned = Words("tuned")
         self.region, self.roots = RegionFigure(), RootsFigure()
         self.motion, self.feel = MotionFigure(), FeelFigure()
-        self.modes: Mapping[str, Any] | None = None  # of the newest verdict
+        self.modes: Plain | None = None  # of the newest verdict
         # Whether the scene is linear, and many points are analysed at once: what the first verdict says.
         self.linear: bool | None = None
         self.at_once = False
@@ -314,9 +314,8 @@ class Page:
 
     def _ask_numbers(self) -> None:
         """Have the numbers computed that are downloaded."""
-        overrides = tuple(overrides_of(self.sliders, self.places))
         self.desks[LATER].forget("numbers")  # who asks twice wants two files
-        self._ask("numbers", overrides, self._region_asked())
+        self._ask("numbers", self._overrides, self._region_asked())
 
     def _tuning_asked(self) -> tuple[tuple[str, ...], str] | None:
         """Return the gains on the axes and the one to be large; nothing of both where a study says it."""
@@ -335,7 +334,7 @@ class Page:
         if (asked := self._tuning_asked()) is not None:
             self.desks[TUNED].forget("tune")  # who asks twice wants it twice
             self.tuned.say("Computing …")
-            self._ask("tune", tuple(overrides_of(self.sliders, self.places)), asked)
+            self._ask("tune", self._overrides, asked)
 
     def _untuned(self) -> None:
         """Say what the button looks for, in the place of gains for other sliders."""
@@ -345,10 +344,15 @@ class Page:
         self.tune.disabled = asked is None
         self.tuned.say(NO_AXES if asked is None else TUNES.format(*reversed(names)) if asked[0] else STUDIED)
 
-    def _save_numbers(self, found: Mapping[str, Any]) -> None:
+    def _save_numbers(self, found: Plain) -> None:
         values = {one.label: one.texts[place] for one, place in self._pairs()}
         told = {"topology": self.system.name, "apc": program_version(), "set": values, **found}
         self.out.data = {"name": [f"{self.system.name}.json"], "text": [json_text(told)]}
+
+    @property
+    def _overrides(self) -> tuple[Override, ...]:
+        """What sets the sliders that were moved."""
+        return tuple(overrides_of(self.sliders, self.places))
 
     def _pairs(self) -> list[tuple[Slider, int]]:
         return list(zip(self.sliders, self.places, strict=True))
@@ -424,7 +428,7 @@ class Page:
 
     def _moved(self) -> None:
         """Ask for everything anew."""
-        overrides = tuple(overrides_of(self.sliders, self.places))
+        overrides = self._overrides
         self._ask("verdict", overrides)
         if self.sliders:
             moved = self.sliders[self.last]
@@ -440,7 +444,7 @@ class Page:
 
     def _ask_feel(self) -> None:
         """Ask what is felt by the hand that was chosen."""
-        self._ask("feel", tuple(overrides_of(self.sliders, self.places)), self.at.value)
+        self._ask("feel", self._overrides, self.at.value)
 
     def _ask_region(self, overrides: tuple[Override, ...]) -> None:
         """Ask for the region, if there are two axes: nobody waits for it where it takes long."""
@@ -512,7 +516,7 @@ class Page:
         if section == "verdict" and self.linear is None:
             self.linear = found is not None and found["linear"]
             self.at_once = found is not None and found["at_once"]
-            self._ask_region(tuple(overrides_of(self.sliders, self.places)))
+            self._ask_region(self._overrides)
         if section == "region" and self.modes is not None:
             self._later(lambda: self.roots.show(self.modes), FRAMES)
         if found is None:

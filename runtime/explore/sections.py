@@ -9,7 +9,7 @@ Does not: know the browser, or keep an answer.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
@@ -33,6 +33,7 @@ from apc.hands.answers import held_names
 from apc.hands.asked import read_frequencies
 from apc.hands.feel import feel
 from apc.moments.network import judge_network
+from apc.present.forms import Plain
 from apc.present.region_picture import drawn_points, stable_outlines
 from apc.processes import model_of_bytes
 from apc.regions.region import region
@@ -66,7 +67,7 @@ class Task:
 class Told:
     """What a section has to show, as plain data and arrays; None with the reason in `why`."""
 
-    found: Mapping[str, Any] | None
+    found: Plain | None
     why: str = ""
 
 
@@ -97,7 +98,7 @@ def compute(model: bytes, task: Task) -> Told:
         return Told(None, f"This is a bug of apc, not of your scene: {type(error).__name__}: {error}")
 
 
-def _verdict(system: CompiledSystem, prepared: Prepared, _: None) -> dict[str, Any]:
+def _verdict(system: CompiledSystem, prepared: Prepared, _: None) -> Plain:
     found = analyze(system, prepared=prepared)
     values = np.array([mode.eigenvalue for mode in found.modes], dtype=np.complex128)
     return {
@@ -132,7 +133,7 @@ def _limits(found: Analysis) -> str:
     return f"{_named(leading)[0].upper()}{_named(leading)[1:]} {changes}, {times}: mostly {moves}."
 
 
-def _region(system: CompiledSystem, prepared: Prepared, asked: tuple[Range, Range, str]) -> dict[str, Any]:
+def _region(system: CompiledSystem, prepared: Prepared, asked: tuple[Range, Range, str]) -> Plain:
     x, y, criterion = asked
     found = region(system, (x, y), tolerance=DRAWN, criterion=criterion, prepared=prepared)
     return {
@@ -146,9 +147,7 @@ def _region(system: CompiledSystem, prepared: Prepared, asked: tuple[Range, Rang
     }
 
 
-def _roots(
-    system: CompiledSystem, prepared: Prepared, asked: tuple[Free, tuple[Fraction, ...]]
-) -> dict[str, Any]:
+def _roots(system: CompiledSystem, prepared: Prepared, asked: tuple[Free, tuple[Fraction, ...]]) -> Plain:
     """Return the eigenvalues at values of a slider: from matrices in rows, or one analysis after another."""
     free, values = asked
     if reaches_time(system, free) or reaches_count(system, free):
@@ -194,11 +193,11 @@ def _eigenvalues(system: CompiledSystem, prepared: Prepared, override: Override)
     return np.array([mode.eigenvalue for mode in found.modes], dtype=np.complex128)
 
 
-def _margins(system: CompiledSystem, prepared: Prepared, _: None) -> dict[str, Any]:
+def _margins(system: CompiledSystem, prepared: Prepared, _: None) -> Plain:
     return {"text": str(margins(system, prepared=prepared, quick=True))}
 
 
-def _tune(system: CompiledSystem, _: Prepared, asked: tuple[tuple[str, ...], str]) -> dict[str, Any]:
+def _tune(system: CompiledSystem, _: Prepared, asked: tuple[tuple[str, ...], str]) -> Plain:
     """Return the best of the gains that the scene's `studies: tune:` frees, or else of those asked for."""
     free, best = asked
     held, criterion = held_as_studied(system)
@@ -206,11 +205,11 @@ def _tune(system: CompiledSystem, _: Prepared, asked: tuple[tuple[str, ...], str
     return {"text": str(tune(held, demands))}
 
 
-def _motion(system: CompiledSystem, _: Prepared, struck: bool) -> dict[str, Any]:
+def _motion(system: CompiledSystem, _: Prepared, struck: bool) -> Plain:
     return {"motion": motion_of(system, struck=struck)}
 
 
-def _feel(system: CompiledSystem, prepared: Prepared, at: str) -> dict[str, Any]:
+def _feel(system: CompiledSystem, prepared: Prepared, at: str) -> Plain:
     """Return what is felt at a device, the first there is if it isn't said, and what else may be held."""
     frequencies = read_frequencies(system, None, LOWEST, None, FREQUENCIES)
     names = held_names(system, prepared)
@@ -225,7 +224,7 @@ def _feel(system: CompiledSystem, prepared: Prepared, at: str) -> dict[str, Any]
     }
 
 
-def _network(system: CompiledSystem, prepared: Prepared, _: None) -> dict[str, Any]:
+def _network(system: CompiledSystem, prepared: Prepared, _: None) -> Plain:
     """Return the verdict over the network, and the loss and the jitter of each link at which it changes."""
     links = [link for link in system.links if link.channel is not None]
     if not links:
@@ -250,9 +249,7 @@ def _critical(system: CompiledSystem, name: str) -> str:
         return f"{name}: {error.mistakes[0].reason}"
 
 
-def _numbers(
-    system: CompiledSystem, prepared: Prepared, asked: tuple[Range, Range, str] | None
-) -> dict[str, Any]:
+def _numbers(system: CompiledSystem, prepared: Prepared, asked: tuple[Range, Range, str] | None) -> Plain:
     """Return what is downloaded: the analysis and the region as `--json` prints them."""
     told = {"analyze": analyze(system, prepared=prepared).to_dict()}
     if asked is not None:
@@ -261,7 +258,7 @@ def _numbers(
     return told
 
 
-SECTIONS: dict[str, Callable[[CompiledSystem, Prepared, Any], dict[str, Any]]] = {
+SECTIONS: dict[str, Callable[[CompiledSystem, Prepared, Any], Plain]] = {
     "verdict": _verdict,
     "region": _region,
     "roots": _roots,

@@ -49,7 +49,7 @@ class Unit(Result):
     step: float
     duration: float
     texts: Mapping[str, str]
-    shown_by: ClassVar[str] = "code:unit"
+    shown_by: ClassVar[str] = "exports:unit"
 
     @property
     def description(self) -> str:

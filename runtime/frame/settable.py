@@ -55,7 +55,7 @@ class Parameters(Result):
     topology: str
     rows: tuple[Settable, ...]
 
-    shown_by: ClassVar[str] = "parameters:parameters"
+    shown_by: ClassVar[str] = "vary:parameters"
 
 
 def parameters(system: CompiledSystem) -> Parameters:

@@ -82,7 +82,7 @@ class NetworkRecording(Result):
     where the interval is not known; `delays` (n,) are all, infinite for a lost packet.
     """
 
-    shown_by: ClassVar[str] = "recorded_network:recording"
+    shown_by: ClassVar[str] = "network:recording"
 
     file: str
     program: str

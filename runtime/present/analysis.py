@@ -18,14 +18,16 @@ from typing import TYPE_CHECKING, Any
 from apc.compiler.words import counted, in_hertz, measured, wrapped
 from apc.present.forms import (
     LINEARIZED,
+    Lines,
+    Plain,
     document,
     labelled,
     listed,
-    note,
     notes,
     picked,
     quantity,
     record,
+    sentences,
     table,
 )
 
@@ -69,8 +71,8 @@ _WORDS = {
 }
 
 
-def compile_text(system: CompiledSystem, needs: Needs, target: Path) -> str:
-    """Return what `apc compile` prints.
+def compile_text(system: CompiledSystem, needs: Needs, target: Path) -> Lines:
+    """Yield what `apc compile` prints.
 
     Parameters
     ----------
@@ -82,13 +84,12 @@ def compile_text(system: CompiledSystem, needs: Needs, target: Path) -> str:
     ticks = ", ".join(
         f"{name} ticks {count} times" if count != 1 else f"{name} once" for name, count in needs.ticks
     )
-    lines = [
-        f"{system.name} → {target}",
-        *note(str(replace(needs, pairs=()))),  # they follow, with their reason
-        f"  frame {_time(float(needs.frame))}: {ticks or 'no clock is used, any frame will do'}",
-    ]
-    dropped = [f"left out: {name}, as {reason}" for name, reason in system.dropped]
-    return "\n".join([*lines, *warning_lines(system.warnings), *notes([*_pairwise(system), *dropped])])
+    yield f"{system.name} → {target}"
+    yield from notes(str(replace(needs, pairs=())))  # they follow, with their reason
+    yield f"  frame {quantity(float(needs.frame), 's')}: {ticks or 'no clock is used, any frame will do'}"
+    yield from warning_lines(system.warnings)
+    dropped = (f"left out: {name}, as {reason}" for name, reason in system.dropped)
+    yield from notes(*_pairwise(system), *dropped)
 
 
 def _pairwise(system: CompiledSystem) -> Iterator[str]:
@@ -109,8 +110,8 @@ def _pairwise(system: CompiledSystem) -> Iterator[str]:
         yield f"costs N²: {name} is evaluated once a pair of peers, as {why}"
 
 
-def analysis_text(result: Analysis) -> str:
-    """Return what `apc analyze` prints: the verdict in words, the numbers, the modes as a table."""
+def analysis_text(result: Analysis) -> Lines:
+    """Yield what `apc analyze` prints: the verdict in words, the numbers, the modes as a table."""
     words = _WORDS.get(result.verdict, "The spectral radius lies nearer to 1 than its error bound.")
     named = (("translation", result.translations), ("rotation", result.rotations))
     free = " and ".join(counted(count, noun) for noun, count in named if count)
@@ -125,33 +126,33 @@ def analysis_text(result: Analysis) -> str:
         words += "\nWhat it does in time is played: apc simulate"
     if not result.states_per_peer:
         words = "Nothing here is free to move."
+    yield f"{result.topology}: {result.verdict}{LINEARIZED if result.linearized else ''}"
+    yield from notes(*result.left_out)
+    yield ""
+    yield from sentences(*words.splitlines())
+    yield ""
     radius = measured(result.spectral_radius, result.spectral_radius_error)
-    facts = (
-        ("spectral radius", f"{radius} per frame of {_time(result.frame_s)}"),
+    unfelt = f"{listed(result.unfelt, MOST_UNFELT)}, which nothing that moves reads at these values"
+    yield from labelled(
+        ("spectral radius", f"{radius} per frame of {quantity(result.frame_s, 's')}"),
         ("peers", f"{result.peers}, {result.states_per_peer} states each"),
         ("method", result.method + (f", {free} left out" if free else "")),
         ("proof", result.proof),
-        (
-            "left out",
-            result.unfelt
-            and f"{listed(result.unfelt, MOST_UNFELT)}, which nothing that moves reads at these values",
-        ),
+        ("left out", unfelt if result.unfelt else ""),
     )
-    lines = [f"{result.topology}: {result.verdict}{LINEARIZED if result.linearized else ''}"]
-    lines += [*notes(result.left_out), ""]
-    lines += [line for one in words.splitlines() for line in wrapped(one, "  ", "  ")]
-    lines += ["", *(line for label, text in facts if text for line in labelled(label, text)), ""]
-    return "\n".join([*lines, *_mode_table(result.modes), *notes(result.notes)])
+    yield ""
+    yield from _mode_table(result.modes)
+    yield from notes(*result.notes)
 
 
-def analysis_document(result: Analysis) -> dict[str, Any]:
+def analysis_document(result: Analysis) -> Plain:
     """Return what `apc analyze --json` prints of the analysis itself."""
     return record(result, {"modes": [_mode_document(mode) for mode in result.modes]})
 
 
-def _mode_document(mode: Mode) -> dict[str, Any]:
+def _mode_document(mode: Mode) -> Plain:
     (motion,) = mode.motion
-    moved: dict[str, Any] = document(motion, {"participation": dict(motion.participation)})
+    moved = record(motion, {"participation": dict(motion.participation)})
     return record(mode, {"motion": ..., **moved})
 
 
@@ -162,13 +163,13 @@ def analysis_picture(result: Analysis, ax: Any = None) -> Any:
     return eigenvalues_picture(result, ax)
 
 
-def answer_text(found: Answer) -> str:
-    """Return what `apc analyze` prints: the analysis, and what stands beside it."""
-    conventions = found.conventions
-    warning = conventions.warning and "\n".join(wrapped(f"Warning: {conventions.warning}"))
-    nominal: tuple[object, ...] = (analysis_text(found.analysis), found.sensitivities, found.margins)
+def answer_text(found: Answer) -> Lines:
+    """Yield what `apc analyze` prints: the analysis, and what stands beside it."""
+    conventions, topology = found.conventions, found.analysis.topology
+    warned = f"Warning: {conventions.warning}" if conventions.warning else ""
+    nominal: tuple[object, ...] = (found.analysis, found.sensitivities, found.margins)
     if found.network is not None and not found.nominal:
-        nominal = ("\n".join(_in_short(found.analysis)),)
+        nominal = (_in_short(found.analysis),)
     parts = (
         found.box,
         found.network,
@@ -176,34 +177,36 @@ def answer_text(found: Answer) -> str:
         found.contact_modes,
         found.switching,
         found.buzz,
-        "\n".join(wrapped(f"{found.analysis.topology}: {found.no_buzz}")) if found.no_buzz else "",
-        conventions if found.detailed else warning,
+        "\n".join(wrapped(f"{topology}: {found.no_buzz}")) if found.no_buzz else "",
+        conventions if found.detailed else "\n".join(wrapped(warned)),
     )
-    first, *rest = "\n\n".join(str(one) for one in parts if one is not None and one != "").split("\n")
-    return "\n".join((first, *warning_lines(found.warnings), *rest))
+    first, _, rest = "\n\n".join(filter(None, map(str, filter(None, parts)))).partition("\n")
+    yield first
+    yield from warning_lines(found.warnings)
+    yield rest
 
 
-def _in_short(found: Analysis) -> list[str]:
+def _in_short(found: Analysis) -> str:
     """Return the verdict of the nominal network, beside that of the network as it is."""
     radius = measured(found.spectral_radius, found.spectral_radius_error)
     text = (
         f"With every packet on time: {found.verdict}, spectral radius {radius} per frame of "
         f"{found.frame_s * 1000:.6g} ms (apc analyze --nominal says all of it)."
     )
-    return wrapped(text, "  ", "  ")
+    return "\n".join(sentences(text))
 
 
-def warning_lines(warnings: Sequence[str]) -> list[str]:
-    """Return the warnings of a topology as lines to stand under a sentence."""
-    return notes(f"Warning: {text}" for text in warnings)
+def warning_lines(warnings: Sequence[str]) -> Lines:
+    """Yield the warnings of a topology as lines to stand under a sentence."""
+    return notes(*(f"Warning: {text}" for text in warnings))
 
 
-def network_answer_text(found: NetworkAnswer) -> str:
-    """Return the verdict over the network as it is, and what moves it."""
-    return "\n\n".join(map(str, (found.verdict, found.sensitivities, found.margins)))
+def network_answer_text(found: NetworkAnswer) -> Lines:
+    """Yield the verdict over the network as it is, and what moves it."""
+    yield f"{found.verdict}\n\n{found.sensitivities}\n\n{found.margins}"
 
 
-def network_answer_document(found: NetworkAnswer) -> dict[str, Any]:
+def network_answer_document(found: NetworkAnswer) -> Plain:
     """Return the verdict over the network as it is, and what moves it, as plain data."""
     return found.verdict.to_dict() | {
         "sensitivities": found.sensitivities.to_dict(),
@@ -212,11 +215,10 @@ def network_answer_document(found: NetworkAnswer) -> dict[str, Any]:
     }
 
 
-def answer_document(found: Answer) -> dict[str, Any]:
+def answer_document(found: Answer) -> Plain:
     """Return what `apc analyze --json` prints: the analysis with more keys."""
-    parts = ("network", "sensitivities", "contact_modes", "switching", "buzz")
     told = found.analysis.to_dict()
-    told |= {name: one.to_dict() if (one := getattr(found, name)) else None for name in parts}
+    told |= picked(found, "network", "sensitivities", "contact_modes", "switching", "buzz")
     told |= {
         "margins": document(found.margins.rows),
         "margins_note": found.margins.note,
@@ -230,7 +232,7 @@ def answer_document(found: Answer) -> dict[str, Any]:
     return told
 
 
-def _mode_table(modes: Sequence[Mode]) -> list[str]:
+def _mode_table(modes: Sequence[Mode]) -> Lines:
     # What can't be told from zero is counted only: its rounding differs from machine to machine.
     alive = [mode for mode in modes if _is_alive(mode)]
     rows = [mode for mode in alive if mode.eigenvalue.imag >= -mode.error]  # a conjugate pair is one row
@@ -240,9 +242,8 @@ def _mode_table(modes: Sequence[Mode]) -> list[str]:
     # A mode not told from zero may be any size up to its error.
     least = max(shown[-1].magnitude if shown else 0.0, 2 * LEAST_MAGNITUDE)
     unsure = sum(not mode.magnitude + mode.error <= least for mode in dead)
-    lines = table([HEADINGS, *map(_cells, shown)], "><>>><") if shown else []
-    if not left:
-        return lines or ["  nothing moves but that"]
+    if shown:
+        yield from table([HEADINGS, *map(_cells, shown)], "><>>><")
     if unsure:
         many = "all" if unsure == left > 1 else str(unsure)
         ends = "it dies" if unsure == 1 else "they die"
@@ -254,7 +255,10 @@ def _mode_table(modes: Sequence[Mode]) -> list[str]:
         told = (
             f"{counted(left, 'mode')} {'dies' if left == 1 else 'die'} out within a frame (--json lists all)"
         )
-    return [*lines, *note(f"and {told}" if shown else told)]
+    if left:
+        yield from notes(f"and {told}" if shown else told)
+    elif not shown:
+        yield "  nothing moves but that"
 
 
 def _is_alive(mode: Mode) -> bool:
@@ -287,12 +291,8 @@ def _leading(mode: Mode) -> str:
     return ", ".join(f"{name} {share:.0%}" for name, share in largest if share >= LEAST_SHARE)
 
 
-def _time(seconds: float) -> str:
-    return f"{seconds * 1e3:.6g} ms" if seconds < 1 else f"{seconds:.6g} s"
-
-
-def needs_text(found: Needs) -> str:
-    """Return what a scene needs in one sentence."""
+def needs_text(found: Needs) -> Lines:
+    """Yield what a scene needs in one sentence."""
     several = len(found.sites) > 1
     sites = "; ".join(f"{one.name}: {_site(one)}" if several else _site(one) for one in found.sites)
     whole = found.peers > 1 and sum(count for count, _ in found.systems) == 1
@@ -300,7 +300,7 @@ def needs_text(found: Needs) -> str:
     systems = " and ".join(f"{counted(count, noun)} of {size}" for count, size in found.systems)
     analysed = f"not analysed: {found.refused}" if found.refused else f"analysed as {systems}"
     pairs = "".join(f"; costs N²: {name} is evaluated once a pair of peers" for name in found.pairs)
-    return f"{sites}, {counted(found.peers, 'peer')}; {analysed}{pairs}"
+    yield f"{sites}, {counted(found.peers, 'peer')}; {analysed}{pairs}"
 
 
 def _site(found: SiteNeeds) -> str:
@@ -312,29 +312,32 @@ def _site(found: SiteNeeds) -> str:
     return f"{found.states} states a peer ({', '.join(parts)})"
 
 
-def box_proof_text(found: BoxProof) -> str:
-    """Return what was proved of a box."""
+def box_proof_text(found: BoxProof) -> Lines:
+    """Yield what was proved of a box."""
     where = [
         f"  {one.free.label} = {quantity(value, one.unit, 12)}"
         for one, value in zip(found.ranges, found.point, strict=False)  # a proved box has no point
     ]
     cells = counted(found.cells, "cell")
-    more = []
-    if found.stable:
-        said = f"proved {found.verdict} for every value in the box ({cells})"
-    elif found.stable is False:
-        said = "not stable in all of the box"
-        more = [f"proved {found.verdict} at", *where]
-    else:
-        said = f"undecided, {100 * found.open_share:.3g} % of the box is left open ({cells})"
-        if found.point:  # else nothing was looked at, as its notes say
-            more = ["among others around", *where]
-            more += wrapped(f"more cells may decide it: --cells {MORE_CELLS * found.cells}")
-    told = [line for text in (*found.left_out, said) for line in wrapped(text)]
-    ranges = [f"  {range_text(one)}" for one in found.ranges]
+    said = f"undecided, {100 * found.open_share:.3g} % of the box is left open ({cells})"
+    if found.stable is not None:
+        whole = f"proved {found.verdict} for every value in the box ({cells})"
+        said = whole if found.stable else "not stable in all of the box"
+    yield f"{found.topology}:"
+    for text in (*found.left_out, said):
+        yield from wrapped(text)
+    yield from (f"  {range_text(one)}" for one in found.ranges)
+    if found.stable is False:
+        yield f"proved {found.verdict} at"
+        yield from where
+    elif found.stable is None and found.point:  # else nothing was looked at, as its notes say
+        yield "among others around"
+        yield from where
+        yield from wrapped(f"more cells may decide it: --cells {MORE_CELLS * found.cells}")
     if found.changing is not None:
-        more += ["", *wrapped(_changing(found.changing, found.ranges[0]))]
-    return "\n".join([f"{found.topology}:", *told, *ranges, *more, *notes(found.notes)])
+        yield ""
+        yield from wrapped(_changing(found.changing, found.ranges[0]))
+    yield from notes(*found.notes)
 
 
 def _changing(found: ChangingDelay, over: Range) -> str:
@@ -357,12 +360,12 @@ def range_text(found: Range) -> str:
     return f"{found.free.label} from {low} to {high}"
 
 
-def range_document(found: Range) -> dict[str, Any]:
+def range_document(found: Range) -> Plain:
     """Return a parameter and its range as plain data."""
     return {"parameter": found.free.label, "unit": found.unit, "range": document((found.low, found.high))}
 
 
-def box_proof_document(found: BoxProof) -> dict[str, Any]:
+def box_proof_document(found: BoxProof) -> Plain:
     """Return what was proved of a box as plain data."""
     return {
         **picked(found, "topology", "left_out", "verdict", "stable", "cells", "open_share", "notes"),
@@ -373,36 +376,41 @@ def box_proof_document(found: BoxProof) -> dict[str, Any]:
     }
 
 
-def contact_modes_text(found: ContactModes) -> str:
-    """Return the modes of contact as a table, and which is unstable in words."""
+def contact_modes_text(found: ContactModes) -> Lines:
+    """Yield the modes of contact as a table, and which is unstable in words."""
     if not found.modes:
-        return "\n".join([f"{found.topology}: no part switches", *found.notes])
-    lines = [*wrapped(f"{found.topology}: {found.summary}"), ""]
-    lines += [f"  {name} on: it follows the motion; off: it does not" for name in found.parts]
+        yield f"{found.topology}: no part switches"
+        yield from found.notes
+        return
+    yield from wrapped(f"{found.topology}: {found.summary}")
+    yield ""
+    yield from (f"  {name} on: it follows the motion; off: it does not" for name in found.parts)
     rows = [("spectral radius", "frequency", "verdict", "")]
+    refused = []
     for mode in found.modes:
         if mode.refusal:
             rows.append(("–", "–", "not analysed", mode.name))
+            refused.append(f"{mode.name}: not analysed: {mode.refusal}")
             continue
         radius = measured(mode.spectral_radius, max(mode.spectral_radius_error, SHOWN))
         frequency = in_hertz(mode.frequency_hz) if mode.frequency_hz else "–"
         verdict = mode.verdict.partition(" up to ")[0].partition(":")[0]
         rows.append((radius, frequency, verdict + "*" * mode.linearized, mode.name))
-    lines += ["", *table(rows, "<><<")]
+    yield ""
+    yield from table(rows, "<><<")
     if any(mode.linearized for mode in found.modes):
-        lines += ["", "  * near the start values: this piece is not linear"]
-    refused = [f"{mode.name}: not analysed: {mode.refusal}" for mode in found.modes if mode.refusal]
-    return "\n".join([*lines, *notes([*refused, *found.notes])])
+        yield "\n  * near the start values: this piece is not linear"
+    yield from notes(*refused, *found.notes)
 
 
-def contact_modes_document(found: ContactModes) -> dict[str, Any]:
+def contact_modes_document(found: ContactModes) -> Plain:
     """Return the modes of contact as plain data."""
     modes = [_analysed(mode, {"on": dict(mode.on)}, "frequency_hz") for mode in found.modes]
     return record(found, {"unstable": found.unstable, "modes": modes})
 
 
-def switching_text(found: Switching) -> str:
-    """Return whether contacts may open and close at will, in words."""
+def switching_text(found: Switching) -> Lines:
+    """Yield whether contacts may open and close at will, in words."""
     reach = found.reach
     if found.stable:
         said = "proved stable by the circle criterion"
@@ -415,69 +423,65 @@ def switching_text(found: Switching) -> str:
         said += f"; the criterion holds for contacts up to {times} times as stiff"
     elif reach is not None:
         said += "; the criterion holds however stiff the contacts"
-    return "\n".join(wrapped(f"{found.topology}, contacts that open and close at will: {said}", "", "  "))
+    yield from wrapped(f"{found.topology}, contacts that open and close at will: {said}", "", "  ")
 
 
-def switching_document(found: Switching) -> dict[str, Any]:
+def switching_document(found: Switching) -> Plain:
     """Return whether contacts may open and close at will, as plain data."""
-    return {"stable": found.stable, **document(found)}
+    return {"stable": found.stable, **record(found)}
 
 
-def _analysed(found: ContactMode | Outcome, instead: dict[str, Any], *more: str) -> dict[str, Any]:
+def _analysed(found: ContactMode | Outcome, instead: Plain, *more: str) -> Plain:
     """Return plain data of what may have been refused: then there are no numbers of an analysis."""
     if not found.verdict:
         instead |= dict.fromkeys(("verdict", "spectral_radius", "spectral_radius_error", *more))
     return record(found, instead)
 
 
-def conventions_text(found: Conventions) -> str:
-    """Return what every convention leads to."""
+def conventions_text(found: Conventions) -> Lines:
+    """Yield what every convention leads to."""
     from apc.analysis.conventions import (  # loaded where there are outcomes, and else not needed
         DEFAULT,
         ORDERS,
     )
 
+    headline = "the same verdict under every convention"
     if not found.repeated:
         headline = found.not_repeated
     elif found.flips:
         headline = "the verdict depends on the conventions"
-    else:
-        headline = "the same verdict under every convention"
-    lines = [f"{found.topology}: {headline}", ""]
+    yield f"{found.topology}: {headline}\n"
     for number, one in enumerate(found.outcomes, 1):
         radius = measured(one.spectral_radius, one.spectral_radius_error)
-        lines.append(f"  {number}  {one.verdict or 'not analysed'}")
-        lines.append(f"     spectral radius {radius}" if one.verdict else f"     {one.refusal}")
-        lines += [f"     {departure}" for departure in one.departures or (DEFAULT,)]
+        yield f"  {number}  {one.verdict or 'not analysed'}"
+        yield f"     spectral radius {radius}" if one.verdict else f"     {one.refusal}"
+        yield from (f"     {departure}" for departure in one.departures or (DEFAULT,))
         if one.start:
-            lines.append(f"     heard before the first packet: {one.start}")
-        shown = " < ".join(one.orders[0])
-        lines.append(f"     {len(one.orders)} of {ORDERS} orders, such as {shown}")
+            yield f"     heard before the first packet: {one.start}"
+        yield f"     {len(one.orders)} of {ORDERS} orders, such as {' < '.join(one.orders[0])}"
     if found.repeated and not found.start_matters:
-        lines += ["", "  What is heard before the first packet can't change the verdict."]
-    return "\n".join(lines)
+        yield "\n  What is heard before the first packet can't change the verdict."
 
 
-def conventions_document(found: Conventions) -> dict[str, Any]:
+def conventions_document(found: Conventions) -> Plain:
     """Return what every convention leads to as plain data."""
     outcomes = [_analysed(one, {}) for one in found.outcomes]
     return record(found, {"flips": found.flips, "repeated": found.repeated, "outcomes": outcomes})
 
 
-def paper_route_text(found: PaperRoute) -> str:
-    """Return the shapes of the paper's matrices, a line each."""
-    lines = [f"ratio {found.ratio}, frame {found.frame_s * 1e3:.6g} ms"]
+def paper_route_text(found: PaperRoute) -> Lines:
+    """Yield the shapes of the paper's matrices, a line each."""
+    yield f"ratio {found.ratio}, frame {found.frame_s * 1e3:.6g} ms"
     for field in fields(found):
         matrix = getattr(found, field.name)
         if hasattr(matrix, "columns"):
             which, mark, of = field.name.partition("_")
             name = "A_cl" if which == "closed" else f"{which.upper()}{mark}{of.replace('d', 'D')}"
-            lines.append(f"  {name:<6} {len(matrix.rows):>4} × {len(matrix.columns)}")
-    return "\n".join(lines)
+            yield f"  {name:<6} {len(matrix.rows):>4} × {len(matrix.columns)}"
 
 
-def matrix_text(found: NamedMatrix) -> str:
-    """Return the shape of a matrix and the ends of its names."""
+def matrix_text(found: NamedMatrix) -> Lines:
+    """Yield the shape of a matrix and the ends of its names."""
     rows, columns = found.rows, found.columns
-    shown = f"{len(rows)} × {len(columns)}"
-    return f"{shown}: {rows[0]} … {rows[-1]} by {columns[0]} … {columns[-1]}" if found.values.size else shown
+    ends = f": {rows[0]} … {rows[-1]} by {columns[0]} … {columns[-1]}" if found.values.size else ""
+    yield f"{len(rows)} × {len(columns)}{ends}"

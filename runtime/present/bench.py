@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from apc.benchmark.bench import SAME, Bench, Comparison, Measured
 from apc.compiler.words import counted, wrapped
-from apc.present.forms import document, notes, table
+from apc.present.forms import Lines, notes, record, table
 from apc.present.pictures import COLOURS, new_figure
 
 if TYPE_CHECKING:
@@ -33,35 +33,33 @@ BETTER = (
 STARRED = "stable*: stable up to a common translation"
 
 
-def bench_text(found: Bench) -> str:
-    """Return a table a task, the methods sorted by time."""
+def bench_text(found: Bench) -> Lines:
+    """Yield a table a task, the methods sorted by time."""
     peers = counted(found.peers, "peer", ",")
-    where = ", ".join(f"{name} {value}" for name, value in found.machine.items() if value)
-    parts = [
-        f"{found.topology}: {peers}",
-        *(_task(one) for one in found.comparisons),
-        "\n".join(notes([where])),
-    ]
-    return "\n\n".join(parts)
+    yield f"{found.topology}: {peers}\n"
+    for one in found.comparisons:
+        yield from _task(one)
+        yield ""
+    yield from notes(", ".join(f"{name} {value}" for name, value in found.machine.items() if value))
 
 
-def _task(found: Comparison) -> str:
-    title = f"apc {found.task}: time against error of the {found.quantity}"
-    left_out = notes(f"{name} left out: {reason}" for name, reason in found.refused)
-    head = [title, *notes(found.left_out), ""]
-    if not found.measured:
-        return "\n".join([*head, *left_out])
-    rows = [("method", "median", "spread", "error", "bound", "")]
-    for one in found.measured:
-        spread = NOTHING if one.rounds < 2 else _time(one.spread)
-        marks = ("*" if one.front else " ") + (" chosen" if one.chosen else "")
-        rows.append((one.name, _time(one.seconds), spread, _size(one.error), _size(one.bound), marks))
-    known = any(one.error is not None for one in found.measured)
-    told = [_times(found)]
-    if known:
-        told += [f"error and bound are {found.relative}", BETTER]
-    told += [_choice(found), f"{'' if known else 'no '}reference: {found.reference}", *found.notes]
-    return "\n".join([*head, *table(rows, "<>>>><"), "", *notes(told), *left_out])
+def _task(found: Comparison) -> Lines:
+    yield f"apc {found.task}: time against error of the {found.quantity}"
+    yield from notes(*found.left_out)
+    yield ""
+    if found.measured:
+        rows = [("method", "median", "spread", "error", "bound", "")]
+        for one in found.measured:
+            spread = NOTHING if one.rounds < 2 else _time(one.spread)
+            marks = ("*" if one.front else " ") + (" chosen" if one.chosen else "")
+            rows.append((one.name, _time(one.seconds), spread, _size(one.error), _size(one.bound), marks))
+        yield from table(rows, "<>>>><")
+        yield ""
+        known = any(one.error is not None for one in found.measured)
+        told = [f"error and bound are {found.relative}", BETTER] if known else []
+        reference = f"{'' if known else 'no '}reference: {found.reference}"
+        yield from notes(_times(found), *told, _choice(found), reference, *found.notes)
+    yield from notes(*(f"{name} left out: {reason}" for name, reason in found.refused))
 
 
 def _times(found: Comparison) -> str:
@@ -83,26 +81,28 @@ def _choice(found: Comparison) -> str:
     return f"{found.task} chooses {chosen.name}, {where}"
 
 
-def hard_text(found: HardReport) -> str:
-    """Return a line a hard case, and what failed."""
+def hard_text(found: HardReport) -> Lines:
+    """Yield a line a hard case, and what failed."""
+    yield f"{found.folder}: {counted(len(found.cases), 'scene')} with a known truth\n"
     rows = [("scene", "error", "bound", "bound÷error", "time", "verdict")]
     for case in found.cases:
         loose = f"{case.looseness:.2g}" if math.isfinite(case.looseness) else NOTHING
         mark = "FAILED" if case.failed else _short(case.verdict)
         rows.append((case.name, _size(case.error), _size(case.bound), loose, _time(case.seconds), mark))
-    told = ["error and bound are of the spectral radius ρ, divided by ρ where it is above 1"]
-    told += [STARRED] if any(row[-1] == "stable*" for row in rows) else []
-    told += [f"{name} has no truth beside it: left out" for name in found.without]
-    told += [f"FAILED {case.name}: {case.failed}" for case in found.failures]
+    yield from table(rows, "<>>>><")
+    yield ""
+    yield from notes("error and bound are of the spectral radius ρ, divided by ρ where it is above 1")
+    if any(row[-1] == "stable*" for row in rows):
+        yield from notes(STARRED)
+    yield from notes(*(f"{name} has no truth beside it: left out" for name in found.without))
+    yield from notes(*(f"FAILED {case.name}: {case.failed}" for case in found.failures))
     if found.failures:
         undecided = sum(case.undecided for case in found.cases)
         unbounded = sum(case.unbounded for case in found.cases)
         scenes = f"{len(found.failures)} of {counted(len(found.cases), 'scene')} failed"
-        told.append(f"{scenes}; {undecided} left open, {unbounded} without a bound")
+        yield from notes(f"{scenes}; {undecided} left open, {unbounded} without a bound")
     else:
-        told.append("every bound holds; every verdict is right")
-    title = f"{found.folder}: {counted(len(found.cases), 'scene')} with a known truth"
-    return "\n".join([title, "", *table(rows, "<>>>><"), "", *notes(told)])
+        yield from notes("every bound holds; every verdict is right")
 
 
 def _short(verdict: str) -> str:
@@ -110,30 +110,34 @@ def _short(verdict: str) -> str:
     return words.get(verdict, verdict.partition(":")[0])
 
 
-def scale_text(found: Scale) -> str:
-    """Return a line a number of peers."""
+def scale_text(found: Scale) -> Lines:
+    """Yield a line a number of peers."""
     from apc.benchmark.scale import REPEATS  # loaded where there is one, and else not needed
 
     beside = {one.peers - one.count for one in found.rows} - {0}
     others = "".join(f", beside {number:,} of other groups" for number in sorted(beside))
+    yield from wrapped(f"{found.topology}: peers of group {found.group}{others}")
+    yield ""
     rows = [("peers", "compile", "analyze", "memory", "error", "bound", "method")]
     for one in found.rows:
         memory = f"{one.memory / 2**20:.0f} MiB"
         numbers = (_time(one.compile_s), _time(one.analyze_s), memory, _size(one.error), _size(one.bound))
         rows.append((f"{one.count:,}", *numbers, one.method))
+    yield from table(rows, ">>>>>><")
+    yield ""
     times = f"processor time of compiling, and the median of {REPEATS} analyses"
-    told = [f"{times}; error of the spectral radius"]
-    told.append(f"memory is the most the whole process took, of which {found.floor}")
-    told += [f"{counted(count, 'peer', ',')}: {reason}" for count, reason in found.refused]
-    title = wrapped(f"{found.topology}: peers of group {found.group}{others}")
-    return "\n".join([*title, "", *table(rows, ">>>>>><"), "", *notes(told)])
+    yield from notes(
+        f"{times}; error of the spectral radius",
+        f"memory is the most the whole process took, of which {found.floor}",
+        *(f"{counted(count, 'peer', ',')}: {reason}" for count, reason in found.refused),
+    )
 
 
 def hard_document(found: HardReport) -> dict[str, Any]:
     """Return what `apc bench --hard --json` prints."""
     return {
         "folder": found.folder,
-        "cases": [document(case, {"bound_over_error": case.looseness}) for case in found.cases],
+        "cases": [record(case, {"bound_over_error": case.looseness}) for case in found.cases],
         "without_truth": list(found.without),
         "failed": [case.name for case in found.failures],
         "undecided": [case.name for case in found.cases if case.undecided],

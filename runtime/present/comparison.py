@@ -1,23 +1,27 @@
-"""Schemes side by side as text, plain data and rows of a table.
+"""Schemes side by side as text, plain data, a table, and a picture: a panel a quantity, a bar a scheme.
 
-Takes: a `Comparison`. Gives: its text, document and rows.
+Takes: a `Comparison`. Gives: its text, document, rows and picture.
 Guarantees: what is left out stands first; a cell that can't be had says why in a footnote; a line is at most
 80 columns wide.
-Does not: compute, or draw itself (see `comparison_picture`).
+In the picture bars of one scheme have one colour and hatch in every panel, so that they can be told apart
+without colour; a bar that ends nowhere within what was looked at says so by ">"; what can't be had is a dash.
+Does not: compute, or need a display.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+import textwrap
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from apc.compiler.words import counted, known_digits, measured, with_unit, wrapped
-from apc.present.comparison_picture import comparison_picture  # noqa: F401 -- looked up
-from apc.present.forms import MEANT, notes, picked, quantity, reached, record, table
-from apc.tables import Column, Row
+from apc.present.forms import MEANT, Lines, Plain, notes, picked, quantity, reached, record, table
+from apc.present.pictures import COLOURS, new_figure
+from apc.tables import Column, Row, Tabled
 
 if TYPE_CHECKING:
     from apc.comparison.comparison import Comparison, Scheme
@@ -33,14 +37,44 @@ VARIED = (
     ("loss", "loss that breaks it"),
 )
 
+# How bars are hatched: as 7 colours and 8 hatches have no common divisor, the first 56 schemes all differ.
+HATCHES = ("", "////", "\\\\\\\\", "||||", "xxxx", "----", "....", "oooo")
+ABREAST = 3  # panels beside each other
+PANEL, BAR = 2.4, 0.28  # inches: the width of a panel, the height of a bar
+FURTHER = 4.0  # times the longest bar that ends, to which one that does not is drawn at most
+LABEL = 24  # letters of a scheme's name in a line
 
-def comparison_text(found: Comparison) -> str:
-    """Return what `apc compare` prints: a table for each question, a line for each scheme."""
+LETTERS: dict[str, Any] = {
+    "textcoords": "offset points",
+    "va": "center",
+    "fontsize": 8,
+    "bbox": {"facecolor": "white", "edgecolor": "none", "pad": 1, "alpha": 0.85},
+}
+BOUNDARY = 1.0  # the spectral radius from which on a motion grows
+
+# The panels: title, where in a scheme the number is, in how many of its units it is drawn.
+NUMBERS = (
+    ("spectral radius a frame", "analysis.spectral_radius", 1.0),
+    ("settles within 2 % in (s)", "analysis.settling_s", 1.0),
+    ("felt at 1 Hz (N·s/m)", "feel.impedance.0", 1.0),
+    ("felt at 10 Hz (N·s/m)", "feel.impedance.1", 1.0),
+    ("operations a tick", "effort.operations", 1.0),
+    ("numbers sent a second", "effort.sent", 1.0),
+)
+REACHES = (
+    ("largest stable stiffness (N/m)", "stiffness", 1.0),
+    ("delay that breaks it (ms)", "delay", 1e3),
+    ("loss that breaks it (%)", "loss", 1e2),
+)
+
+
+def comparison_text(found: Comparison) -> Lines:
+    """Yield what `apc compare` prints: a table for each question, a line for each scheme."""
     schemes = found.schemes
     feet: dict[str, int] = {}
-    lines = [counted(len(schemes), "scheme") + " side by side" * (len(schemes) > 1)]
-    lines += notes([*_meant(found), *found.left_out, *(f"note: {text}" for text in found.notes)])
-    tables: list[tuple[tuple[str, ...], list[tuple[str, ...]]]] = [
+    yield counted(len(schemes), "scheme") + " side by side" * (len(schemes) > 1)
+    yield from notes(*_meant(found), *found.left_out, *(f"note: {text}" for text in found.notes))
+    tables: list[tuple[tuple[str, ...], Iterable[tuple[str, ...]]]] = [
         (("",), [(f"{one.topology}, {counted(one.peers, 'peer', ',d')}",) for one in schemes]),
         (("verdict", "spectral radius a frame"), [_verdict(one, feet) for one in schemes]),
     ]
@@ -49,14 +83,15 @@ def comparison_text(found: Comparison) -> str:
     for key, heading in VARIED:
         tables.append(((heading, "of"), [_varied(one, key, feet) for one in schemes]))
     tables.append((("felt at 1 Hz", "at 10 Hz", "of the hand at"), [_felt(one, feet) for one in schemes]))
-    tables.append((("work a tick", "a peer sends at most", "all send"), [_costs(one) for one in schemes]))
+    tables.append((("work a tick", "a peer sends at most", "all send"), map(_costs, schemes)))
     for headings, cells in tables:
         rows = [("", *headings), *((str(place), *row) for place, row in enumerate(cells, 1))]
-        lines += ["", *(line for line in table(rows, later=5) if line)]
-    lines += [""] if feet else []
+        yield ""
+        yield from filter(None, table(rows, later=5))
+    if feet:
+        yield ""
     for text, number in feet.items():
-        lines += wrapped(text, f"  [{number}] ", "      ")
-    return "\n".join(lines)
+        yield from wrapped(text, f"  [{number}] ", "      ")
 
 
 def _marked(cell: str, texts: Iterable[str], feet: dict[str, int]) -> str:
@@ -156,18 +191,16 @@ def _felt(one: Scheme, feet: dict[str, int]) -> tuple[str, str, str]:
     return cells[0], cells[1], one.feel.at
 
 
-def comparison_document(found: Comparison) -> dict[str, Any]:
+def comparison_document(found: Comparison) -> Plain:
     """Return the same as plain data, in SI: each part as the JSON of its command."""
     return {"schemes": [_document(one) for one in found.schemes], "notes": list(found.notes)}
 
 
-def _document(one: Scheme) -> dict[str, Any]:
-    parts = ("analysis", "network", "passive", "played", "stiffness", "delay", "loss", "feel")
-    told = {key: None if (had := getattr(one, key)) is None else had.to_dict() for key in parts}
-    return record(one, {**picked(one, "verdict", "stable", "left_out"), **told, "missing": dict(one.missing)})
+def _document(one: Scheme) -> Plain:
+    return record(one, {**picked(one, "verdict", "stable", "left_out"), "missing": dict(one.missing)})
 
 
-def comparison_rows(found: Comparison) -> tuple[list[Column], Iterator[Row], dict[str, Any]]:
+def comparison_rows(found: Comparison) -> Tabled:
     """Return the columns of a table of schemes, a row a scheme, and what was left out."""
     left_out = {one.topology: list(one.left_out) for one in found.schemes}
     columns = [column for column, _ in COLUMNS]
@@ -217,3 +250,87 @@ def _row(one: Scheme) -> Row:
     return *(
         float(cell) if isinstance(cell, float) else None if cell == "" else cell for cell in cells
     ), missing
+
+
+@dataclass(frozen=True, slots=True)
+class _Bar:
+    """A bar with a text at its end; `further` says that it goes on beyond what was looked at."""
+
+    length: float
+    text: str
+    further: bool = False
+
+
+def comparison_picture(found: Comparison) -> Any:
+    """Draw all schemes beside each other; return the matplotlib Figure.
+
+    Raises
+    ------
+    ApcError
+        E875 matplotlib is not installed.
+    """
+    schemes = found.schemes
+    panels = [(title, [_number(one, path, scale) for one in schemes]) for title, path, scale in NUMBERS]
+    reaches = [
+        (title, [_reach_bar(getattr(one, key), scale) for one in schemes]) for title, key, scale in REACHES
+    ]
+    panels[2:2] = reaches
+    rows = -(-len(panels) // ABREAST)
+    names = [
+        "\n".join(textwrap.wrap(f"{place}  {one.topology}", LABEL)) for place, one in enumerate(schemes, 1)
+    ]
+    size = (PANEL * ABREAST + 1.4, (0.9 + BAR * 1.25 * len(names)) * rows + 0.5)
+    figure = new_figure(size)
+    axes = figure.subplots(rows, ABREAST, squeeze=False, sharey=True).ravel()
+    for ax, (title, bars) in zip(axes, panels, strict=True):
+        _draw(ax, title, bars)
+    axes[0].set_yticks(range(len(names)), names, fontsize=8)
+    axes[0].invert_yaxis()
+    axes[0].axvline(BOUNDARY, color="0.4", linewidth=0.8, linestyle=(0, (3, 2)))
+    for place, one in enumerate(schemes):
+        axes[0].annotate(_judged(one), (0, place), (4, 0), **LETTERS)
+    lines = [line for text in (*found.left_out, *found.notes) for line in textwrap.wrap(text, 110)]
+    figure.suptitle("\n".join(lines), fontsize=8.5)
+    return figure
+
+
+def _number(one: Scheme, path: str, scale: float) -> _Bar:
+    value = reached(one, path)
+    return _Bar(0.0, NONE) if value is None else _Bar(scale * abs(value), f"{scale * abs(value):.4g}")
+
+
+def _reach_bar(found: Critical | None, scale: float) -> _Bar:
+    """Return how far a scheme is stable: up to a crossing, or beyond all that was looked at."""
+    if found is not None and found.value is not None and found.stable_side == "below":
+        return _Bar(scale * found.value, f"{scale * found.value:.4g}")
+    if found is not None and found.value is None and found.verdict.startswith("stable"):
+        return _Bar(scale * found.scanned[1], f"> {scale * found.scanned[1]:.4g}", further=True)
+    return _Bar(0.0, "unstable" if found is not None and found.verdict.startswith("unstable") else NONE)
+
+
+def _draw(ax: Any, title: str, bars: Sequence[_Bar]) -> None:
+    """Draw one quantity of all schemes."""
+    ax.set_title(title, fontsize=8.5)
+    ax.tick_params(labelsize=8)
+    ax.tick_params(axis="y", length=0)
+    ax.spines[["top", "right"]].set_visible(False)
+    # What ends nowhere may be looked at a thousand times as far, and would leave no room for the others.
+    most = FURTHER * max((bar.length for bar in bars if not bar.further), default=0.0)
+    lengths = [min(bar.length, most or bar.length) if bar.further else bar.length for bar in bars]
+    edges = [COLOURS[place % len(COLOURS)] for place in range(len(bars))]
+    hatches = [HATCHES[place % len(HATCHES)] for place in range(len(bars))]
+    faces = ["white" if hatch else edge for hatch, edge in zip(hatches, edges, strict=True)]
+    look = {"color": faces, "edgecolor": edges, "hatch": hatches, "linewidth": 0.8}
+    drawn = ax.barh(range(len(bars)), lengths, height=0.6, **look)
+    ax.bar_label(drawn, [bar.text for bar in bars], padding=4, fontsize=8, bbox=LETTERS["bbox"])
+    ax.set(xlim=(0, 1.3 * max(lengths) or 1.0), ylim=(-0.6, len(bars) - 0.4))
+    ax.locator_params(axis="x", nbins=4)
+
+
+def _judged(one: Scheme) -> str:
+    """Say of a scheme that it is not stable, and what one does that isn't linear."""
+    if one.analysis is None:
+        return one.verdict
+    said = [] if one.stable else ["unstable" if one.stable is False else "undecided"]
+    said += [] if one.played is None else [f"{one.played.summary.verdict} in time"]
+    return ", ".join(said)

@@ -1,7 +1,7 @@
-"""What an export is, in words and as plain data.
+"""What a scene handed over to other tools is, in words and as plain data.
 
-Takes: what `exports` makes.
-Gives: `state_space_text`, `state_space_document`, `state_space_control`; `modelica_text`.
+Takes: what `exports` makes: a state space, a Modelica model, a peer's code, an FMU.
+Gives: of each its text, and its document; `state_space_control`.
 Guarantees: at most 80 columns.
 Does not: write files.
 """
@@ -9,29 +9,35 @@ Does not: write files.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
+from itertools import accumulate
 from typing import TYPE_CHECKING, Any
 
-from apc.compiler.words import counted, wrapped
-from apc.present.forms import listed, notes, record
+from apc.compiler.words import counted
+from apc.present.forms import Lines, Plain, document, listed, notes, picked, record
 
 if TYPE_CHECKING:
+    from apc.exports.code import Code
+    from apc.exports.fmu import Unit
     from apc.exports.lifted import StateSpace
     from apc.exports.modelica import ModelicaModel
 
 
-def state_space_text(found: StateSpace) -> str:
-    """Return what a state space has."""
-    lines = [f"{found.topology}: {found.what} over one frame of {found.frame_s * 1e3:.6g} ms", ""]
+def _numbered(word: str, names: Sequence[str]) -> Lines:
+    """Yield how many there are, and the first of them by name."""
+    return notes(f"{counted(len(names), word)}: {listed(names)}")
+
+
+def state_space_text(found: StateSpace) -> Lines:
+    """Yield what a state space has."""
+    yield f"{found.topology}: {found.what} over one frame of {found.frame_s * 1e3:.6g} ms\n"
     for word, ports in (("state", found.states), ("input", found.inputs), ("output", found.outputs)):
-        lines += wrapped(
-            f"{counted(len(ports), word)}: {listed([port.name for port in ports])}", "  ", "    "
-        )
+        yield from _numbered(word, [port.name for port in ports])
     if found.free:
-        lines += wrapped(
-            f"A, B, C and D are a function of {listed([port.name for port in found.free])}", "  ", "    "
-        )
-    lines += ["", *notes([found.meaning, *found.notes])]
-    return "\n".join(lines)
+        free = listed([port.name for port in found.free])
+        yield from notes(f"A, B, C and D are a function of {free}")
+    yield ""
+    yield from notes(found.meaning, *found.notes)
 
 
 def state_space_control(found: StateSpace) -> Any:
@@ -41,15 +47,88 @@ def state_space_control(found: StateSpace) -> Any:
     return as_control(found)
 
 
-def state_space_document(found: StateSpace) -> dict[str, Any]:
+def state_space_document(found: StateSpace) -> Plain:
     """Return a state space as plain data."""
     function = found.function and found.function.serialize()
     instead = {"made_by": json.loads(found.made_by), "function": function, "meaning": found.meaning}
     return record(found, instead)
 
 
-def modelica_text(found: ModelicaModel) -> str:
-    """Return what a Modelica model has."""
-    has = f"{counted(found.peers, 'peer')}, {counted(found.variables, 'variable')}, one equation each"
-    lines = [f"{found.topology}: the model {found.name} of Modelica 3.3", "", f"  {has}"]
-    return "\n".join([*lines, *(f"  {clock}" for clock in found.clocks)])
+def modelica_text(found: ModelicaModel) -> Lines:
+    """Yield what a Modelica model has."""
+    yield f"{found.topology}: the model {found.name} of Modelica 3.3\n"
+    yield f"  {counted(found.peers, 'peer')}, {counted(found.variables, 'variable')}, one equation each"
+    yield from (f"  {clock}" for clock in found.clocks)
+
+
+def code_text(found: Code) -> Lines:
+    """Yield what a peer's code takes and gives."""
+    peer = found.code
+    period = float(peer.schedule.frame_s) / len(peer.instants) * 1e3
+    every = f"every {period:.6g} ms" if len({one.move for one in peer.instants}) == 1 else "at its instants"
+    yield f"{found.topology}: {peer.name} in C99, {peer.identifier}_tick {every}\n"
+    for what, names in (
+        ("measures", [f"{peer.kind.states[i].name} [{peer.kind.states[i].unit}]" for i in peer.measured]),
+        ("hears", [f"{sender.name} over {line.link}" for line in peer.lines for sender in line.senders]),
+        ("puts out", [f"{one.name} [N]" for one in peer.forces.values()]),
+        ("sends", [f"{name} over {line.link}" for line in peer.sending for name in line.channels]),
+        ("moves itself", [one.name for i, one in enumerate(peer.kind.states) if i not in peer.outside]),
+    ):
+        yield from notes(f"{what} {listed(names)}")
+    yield ""
+    yield from notes(f"method between ticks: {found.method}; all numbers in SI units")
+
+
+def code_document(found: Code) -> Plain:
+    """Return a peer's code as plain data."""
+    from apc.exports.c_text import source
+
+    peer = found.code
+    starts = accumulate((peer.moves[one.move].quanta for one in peer.instants), initial=0)
+    return {
+        **picked(found, "topology", "method"),
+        "peer": peer.name,
+        "name": peer.identifier,
+        "measured": [peer.kind.states[place].name for place in peer.measured],
+        "heard": [
+            {"link": line.link, "from": [one.name for one in line.senders], "channels": list(line.channels)}
+            for line in peer.lines
+            if line.senders
+        ],
+        "forces": [one.name for one in peer.forces.values()],
+        "sent": [picked(line, "link", "channels") for line in peer.sending],
+        "instants_s": [float(start * peer.schedule.quantum) for start in [*starts][:-1]],
+        "source": source(peer, f"{peer.identifier}.h"),
+    }
+
+
+def unit_text(found: Unit) -> Lines:
+    """Yield what an FMU takes and gives."""
+    what = found.peer or counted(len(found.scene.peers), "peer")
+    yield f"{found.system.name}: {what} for co-simulation, FMI 2.0\n"
+    variables = found.scene.variables
+    fixed = [one.name for one in variables if one.fixed]
+    yield from _numbered("input", [one.name for one in variables if one.given])
+    yield from _numbered("output", [one.name for one in variables if not (one.given or one.fixed)])
+    if fixed:
+        yield from _numbered("parameter", fixed)
+    told = f"steps of {found.step * 1e3:.6g} ms show every tick of the fastest clock, values before the tick"
+    if found.peer:
+        told += "; what it hears is set when it has arrived: delays and losses are the network's"
+    yield ""
+    yield from notes(told)
+
+
+def unit_document(found: Unit) -> Plain:
+    """Return an FMU as plain data."""
+    variables = [
+        {**picked(one, "name", "unit"), "input": bool(one.given), "parameter": one.fixed}
+        for one in found.scene.variables
+    ]
+    return {
+        "topology": found.system.name,
+        "peer": found.peer or None,
+        "step_s": found.step,
+        "duration_s": document(found.duration),
+        "variables": variables,
+    }

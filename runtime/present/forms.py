@@ -1,8 +1,8 @@
 """The forms that all results share: plain data, JSON, notes, labelled lines and tables.
 
 Takes: frozen values, texts.
-Gives: `document`, `record`, `picked`, `reached`, `json_text`; `quantity`, `listed`, `note`, `notes`,
-`labelled`, `table`; `MEANT`.
+Gives: `Plain`, `document`, `record`, `picked`, `reached`, `json_text`; `quantity`, `listed`; `Lines`,
+`notes`, `sentences`, `labelled`, `table`; `MEANT`.
 Guarantees: a document is made of what JSON has words for; the same value gives the same text; a line is at
 most 80 columns wide where its words allow it.
 Does not: know a result.
@@ -12,13 +12,14 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from fractions import Fraction
 from typing import Any
 
 from apc.compiler.words import with_unit, wrapped
 from apc.later import Later
+from apc.result import Result
 
 # What stable means by a criterion, where it is not that motions die out.
 MEANT = {
@@ -26,18 +27,22 @@ MEANT = {
     "passive": "judged with every passive hand at every device",
 }
 
+# Plain data, ready for JSON.
+Plain = dict[str, Any]
+
+# A text as its result has it: line by line, each at most 80 columns wide.
+Lines = Iterator[str]
+
 LINEARIZED = ", linearized at its start"
 
 
-def document(value: Any, instead: Mapping[str, Any] | None = None) -> Any:
-    """Return a value as plain data: a dataclass by its shown fields, a complex number as a pair, no NaN.
+def document(value: Any) -> Any:
+    """Return a value as plain data: a result by its own document, a complex number as a pair, no NaN.
 
     Parameters
     ----------
     value
         Dataclasses, mappings, sequences and arrays of numbers, texts and None.
-    instead
-        What is taken in the place of fields of a dataclass, or after them; `...` leaves a field out.
     """
     if value is None or isinstance(value, str | int):
         return value
@@ -47,10 +52,10 @@ def document(value: Any, instead: Mapping[str, Any] | None = None) -> Any:
         return document((value.real, value.imag))
     if isinstance(value, Fraction):
         return float(value)
+    if isinstance(value, Result):
+        return value.to_dict()
     if is_dataclass(value):
-        shown = {one.name: None for one in fields(value) if one.repr}  # there are as many modes as states
-        own = {**shown, **(instead or {})}
-        value = {key: own[key] if key in (instead or {}) else getattr(value, key) for key in own}
+        return record(value)
     if isinstance(value, Mapping):
         return {key: document(item) for key, item in value.items() if item is not ...}
     if isinstance(value, tuple | list | Later):
@@ -58,13 +63,24 @@ def document(value: Any, instead: Mapping[str, Any] | None = None) -> Any:
     return document(value.tolist())  # of an array
 
 
-def record(value: Any, instead: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Return a dataclass as plain data, see `document`."""
-    plain: dict[str, Any] = document(value, instead)
+def record(value: Any, instead: Mapping[str, Any] | None = None) -> Plain:
+    """Return a dataclass as plain data, by its shown fields.
+
+    Parameters
+    ----------
+    value
+        The dataclass.
+    instead
+        What is taken in the place of fields, or after them; `...` leaves a field out.
+    """
+    shown = [one.name for one in fields(value) if one.repr]  # there are as many modes as states
+    other = instead or {}
+    kept = {name: other[name] if name in other else getattr(value, name) for name in [*shown, *other]}
+    plain: Plain = document(kept)
     return plain
 
 
-def picked(value: Any, *names: str) -> dict[str, Any]:
+def picked(value: Any, *names: str) -> Plain:
     """Return some fields and properties of a value as plain data."""
     return {name: document(getattr(value, name)) for name in names}
 
@@ -102,23 +118,27 @@ def listed(names: Sequence[str], most: int = 6) -> str:
     return ", ".join([*names[:most], *["…"][: max(len(names) - most, 0)]]) or "none"
 
 
-def note(text: str) -> list[str]:
-    """Return a text as lines that stand a little to the right."""
-    return wrapped(text, "  ", "    ")
+def notes(*texts: str) -> Lines:
+    """Yield texts beneath one another as lines that stand a little to the right; nothing of an empty one."""
+    for text in texts:
+        yield from wrapped(text, "  ", "    ")
 
 
-def notes(texts: Iterable[str]) -> list[str]:
-    """Return texts as notes beneath one another."""
-    return [line for text in texts for line in note(text)]
+def sentences(*texts: str) -> Lines:
+    """Yield texts beneath one another, whose lines all stand equally far to the right."""
+    for text in texts:
+        yield from wrapped(text, "  ", "  ")
 
 
-def labelled(label: str, text: str, width: int = 17) -> list[str]:
-    """Return a text beside its label, which takes so many columns."""
-    return wrapped(text, f"  {label:<{width}}", " " * (width + 2))
+def labelled(*rows: tuple[str, str], width: int = 17) -> Lines:
+    """Yield texts beside their labels, which take so many columns; nothing of an empty text."""
+    for label, text in rows:
+        if text:
+            yield from wrapped(text, f"  {label:<{width}}", " " * (width + 2))
 
 
-def table(rows: Sequence[Sequence[str]], sides: str = "", *, later: int | None = None) -> list[str]:
-    """Return rows of cells as lines, each column as wide as its widest cell.
+def table(rows: Sequence[Sequence[str]], sides: str = "", *, later: int | None = None) -> Lines:
+    """Yield rows of cells as lines, each column as wide as its widest cell.
 
     Parameters
     ----------
@@ -130,15 +150,14 @@ def table(rows: Sequence[Sequence[str]], sides: str = "", *, later: int | None =
         The column at which the last cell goes on in a second line; beneath its beginning if not given.
     """
     if not rows:
-        return []
+        return
     sides = sides or "<" * len(rows[0])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     if sides[-1] == "<":
         widths[-1] = 0
-    lines = []
     for row in rows:
         cells = [f"{cell:{side}{width}}" for cell, side, width in zip(row, sides, widths, strict=True)]
         first = "  " + "".join(f"{cell}  " for cell in cells[:-1])
         first += " " * (len(cells[-1]) - len(row[-1]))
-        lines += wrapped(row[-1], first, " " * (len(first) if later is None else later)) or [""]
-    return [line.rstrip() for line in lines]
+        for line in wrapped(row[-1], first, " " * (len(first) if later is None else later)) or [""]:
+            yield line.rstrip()

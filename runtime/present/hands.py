@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.words import known_digits, measured, wrapped
-from apc.present.forms import LINEARIZED, document, labelled, note, notes, record, table
+from apc.present.forms import LINEARIZED, Lines, Plain, document, labelled, notes, record, sentences, table
 from apc.present.pictures import COLOURS, new_figure
-from apc.tables import Column, Row
+from apc.tables import Column, Tabled
 
 if TYPE_CHECKING:
     from apc.hands.feel import Extremes, Feel
@@ -31,25 +31,26 @@ SHOWN = 12
 DIGITS = 6
 
 
-def passive_text(found: PassiveHands) -> str:
-    """Return whether a scene is stable with any passive hands, in words and numbers."""
-    lines = wrapped(f"{found.topology}: {found.verdict}{LINEARIZED if found.linearized else ''}", "", "  ")
-    lines += [*notes(found.left_out), ""]
-    worst = found.worst
-    told = [f"{found.why}."] if found.why else [] if worst is None else [_worst(found, worst)]
+def passive_text(found: PassiveHands) -> Lines:
+    """Yield whether a scene is stable with any passive hands, in words and numbers."""
+    yield from wrapped(f"{found.topology}: {found.verdict}{LINEARIZED if found.linearized else ''}", "", "  ")
+    yield from notes(*found.left_out)
+    yield ""
+    if found.why:
+        yield from sentences(f"{found.why}.")
+    elif found.worst is not None:
+        yield from sentences(_worst(found, found.worst))
     if found.why and not found.modes:
-        told.append(
+        yield from sentences(
             "Take the velocity by a backward difference of samples, as VirtualWall does, or none (damping 0)."
         )
-    lines += [line for text in told for line in wrapped(text, "  ", "  ")]
+    yield ""
     clamped = measured(found.clamped_radius, found.clamped_error)
     moves = f"spectral radius {clamped}" if found.clamped_radius or found.clamped_error else "nothing moves"
-    lines += ["", *labelled("devices clamped", moves)]
-    lines += labelled("proof", found.proof) if found.proof else []
+    yield from labelled(("devices clamped", moves), ("proof", found.proof))
     if found.modes:
-        headings = ("mode", "damping", "needed", "at", "at rest", "")
-        lines += ["", *table([headings, *map(_mode, found.modes)])]
-    return "\n".join(lines)
+        yield ""
+        yield from table([("mode", "damping", "needed", "at", "at rest", ""), *map(_mode, found.modes)])
 
 
 def _worst(found: PassiveHands, worst: PassiveMode) -> str:
@@ -102,53 +103,55 @@ def _mode(one: PassiveMode) -> tuple[str, ...]:
     return name, damping, needed, at, stiffness, verdict
 
 
-def passive_document(found: PassiveHands) -> dict[str, Any]:
+def passive_document(found: PassiveHands) -> Plain:
     """Return the same as plain data."""
     modes = [{**document(one), "damping_needed": document(one.needed)} for one in found.modes]
-    whole: dict[str, Any] = {"hands": "passive", **document(found, {"modes": modes})}
-    return whole
+    return {"hands": "passive", **record(found, {"modes": modes})}
 
 
-def feel_text(found: Feel) -> str:
-    """Return what is felt at a device, in words and numbers."""
+def feel_text(found: Feel) -> Lines:
+    """Yield what is felt at a device, in words and numbers."""
     title = f"{found.topology}: what a hand feels at {found.at}{LINEARIZED if found.linearized else ''}"
-    lines = [*wrapped(title, "", "  "), *notes((*found.notes, *found.left_out)), ""]
+    yield from wrapped(title, "", "  ")
+    yield from notes(*found.notes, *found.left_out)
+    yield ""
     slow = found.low_frequency
     if slow is not None:
-        lines.append("  Of slow motions, the other hands as the scene has them:")
+        yield "  Of slow motions, the other hands as the scene has them:"
         parts = zip(("mass", "damping", "stiffness"), ("kg", "N*s/m", "N/m"), slow.errors, strict=True)
         for name, unit, error in parts:
-            lines += labelled(name, measured(getattr(slow, name), error, unit))
+            yield from labelled((name, measured(getattr(slow, name), error, unit)))
         if (network := found.network_viscosity) is not None:
             share = measured(network.network, network.error, "N*s/m")
-            lines += labelled("of that", f"{share}, which the network adds")
+            yield from labelled(("of that", f"{share}, which the network adds"))
         if slow.mass < 0:
-            lines += note("a mass below 0: late forces act as negative inertia, for slow motions")
-        lines.append("")
+            yield from notes("a mass below 0: late forces act as negative inertia, for slow motions")
+        yield ""
     headings = ("frequency", "impedance", "phase", "arrives", "copies apart", "alias")
     units = ("Hz", "N*s/m", "degrees", "mm/s/N", "mm/N", "")
-    lines += table([headings, units, *_rows_shown(found)], ">>>>>>")
+    yield from table([headings, units, *_rows_shown(found)], ">>>>>>")
     told = [f"arrives: at {found.between}"] if found.between else []
     told += [f"copies: of {found.copy}, from the mean of the others'"] if found.copy else []
     told += ["alias: the largest part that sampling moves to another frequency, beside that at this one"]
-    lines += ["", *wrapped("; ".join(told), "  ", "  ")]
+    yield ""
+    yield from sentences("; ".join(told))
     if found.hinf and found.stable is not False:
-        lines += ["", "  Largest gain at any frequency (H∞), forces of any course:"]
-        lines += table([_extreme(one) for one in found.hinf])
+        yield "\n  Largest gain at any frequency (H∞), forces of any course:"
+        yield from table([_extreme(one) for one in found.hinf])
     for one in found.h2:  # of a sample that is off by a mm, a µm is what a mm is of 1 N
         what, small = ("1 N rms of every hand", "m")
         if one.source != "hands":
             what, small = "1 mm rms of every device's samples", "µ"
         values = [
-            f"{what} {measured(value * 1e3, off * 1e3, unit)}"
-            for what, value, off, unit in (
+            f"{quantity} {measured(value * 1e3, off * 1e3, unit)}"
+            for quantity, value, off, unit in (
                 ("copies apart", one.error_m, one.errors[0], f"{small}m"),
                 ("velocity", one.velocity_m_s, one.errors[1], f"{small}m/s"),
             )
             if value is not None and off is not None
         ]
-        lines += ["", *note(f"{', '.join(values) or 'it drifts'} (rms) for {what}, new at each tick")]
-    return "\n".join(lines)
+        yield ""
+        yield from notes(f"{', '.join(values) or 'it drifts'} (rms) for {what}, new at each tick")
 
 
 def _curves(found: Feel) -> list[tuple[NDArray[np.complex128], Floats, float, bool, str]]:
@@ -188,7 +191,7 @@ def _extreme(one: Extremes) -> tuple[str, str]:
     return f"{one.mode}, {what}", size
 
 
-def feel_document(found: Feel) -> dict[str, Any]:
+def feel_document(found: Feel) -> Plain:
     """Return the same as plain data, in SI; complex numbers as pairs."""
     instead = {
         "hinf": {f"{one.mode} {one.of}": one for one in found.hinf},
@@ -230,7 +233,7 @@ def feel_picture(found: Feel, kind: str = "bode", ax: Any = None) -> Any:
         phase.set_ylabel("phase of the impedance (°)")
         if np.abs(degrees).max() <= 90:
             phase.set_yticks(range(-90, 91, 45))
-    legend: dict[str, Any] = {"fontsize": 8, "frameon": False, "ncols": 2 if kind == "nyquist" else 1}
+    legend: Plain = {"fontsize": 8, "frameon": False, "ncols": 2 if kind == "nyquist" else 1}
     if ax is None:
         size.figure.legend(*size.get_legend_handles_labels(), loc="outside lower center", **legend)
     else:
@@ -238,7 +241,7 @@ def feel_picture(found: Feel, kind: str = "bode", ax: Any = None) -> Any:
     return size.figure
 
 
-def feel_rows(found: Feel) -> tuple[list[Column], Iterator[Row], dict[str, Any]]:
+def feel_rows(found: Feel) -> Tabled:
     """Return the columns of a table of responses, a row a frequency, and what it is of."""
     responses = (("impedance", "N*s/m"), ("transmitted admittance", "m/s/N"), ("error per force", "m/N"))
     headings = [Column("frequency", "Hz")]

@@ -7,13 +7,13 @@ Does not: compute.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from apc.compiler.words import counted, wrapped
+from apc.compiler.words import counted
 from apc.loop.packets import DROPPED
-from apc.present.forms import document, note, record, table
-from apc.present.recorded_network import recording_document
+from apc.present.forms import Lines, notes, record, table
+from apc.present.network import recording_document
 
 if TYPE_CHECKING:
     from apc.loop.beside import Measured, RunComparison, Ticks, WayRun
@@ -21,49 +21,50 @@ if TYPE_CHECKING:
 HEADINGS = ("50 %", "99 %", "99.9 %", "most")
 
 
-def run_comparison_text(found: RunComparison) -> str:
-    """Return what happened beside what is said of it."""
+def run_comparison_text(found: RunComparison) -> Lines:
+    """Yield what happened beside what is said of it."""
     peers = counted(len(found.ticks), "peer")
-    lines = [f"{found.topology}: {peers}, {found.seconds:.6g} s in real time", ""]
+    yield f"{found.topology}: {peers}, {found.seconds:.6g} s in real time\n"
     if found.emulated:
-        lines += [*note("packets were held back and lost at the sender, as the scene's links say"), ""]
+        yield from notes("packets were held back and lost at the sender, as the scene's links say")
+        yield ""
     if found.why_not:
-        lines += [*note(f"not simulated beside it: {found.why_not}"), ""]
+        yield from notes(f"not simulated beside it: {found.why_not}")
     else:
-        lines += note("beside simulate with the same packets at each tick, signals differ by at most")
-        apart = [(far, large, unit) for unit, (far, large) in found.apart.items()]
-        lines += table(
-            [(f"  {far:.0e} {unit}", f"of up to {large:.4g} {unit}") for far, large, unit in apart]
+        yield from notes("beside simulate with the same packets at each tick, signals differ by at most")
+        apart = found.apart.items()
+        yield from table(
+            [(f"  {far:.0e} {unit}", f"of up to {large:.4g} {unit}") for unit, (far, large) in apart]
         )
-        if not any(large for _, large, _ in apart):
-            lines += note("nothing moved: start values or a force in the scene would move it")
-        lines.append("")
-    lines += [*ticks_text(found.ticks), "", *_ways_text(found.ways)]
+        if not any(large for _, (_, large) in apart):
+            yield from notes("nothing moved: start values or a force in the scene would move it")
+    yield ""
+    yield from ticks_text(found.ticks)
+    yield ""
+    yield from _ways_text(found.ways)
     for one in found.measured:
-        lines += ["", *_measured_text(one)]
-    return "\n".join(lines)
+        yield ""
+        yield from _measured_text(one)
 
 
-def ticks_text(ticks: Iterable[Ticks]) -> list[str]:
-    """Return how late ticks were, a row a peer."""
-    listed = list(ticks)
-    lines = []
+def ticks_text(ticks: Sequence[Ticks]) -> Lines:
+    """Yield how late ticks were, a row a peer."""
     for what, shares in (("late by", "late"), ("took", "took")):
         rows: list[tuple[str, ...]] = [("instants", *HEADINGS, what)]
-        rows += [(f"{one.ticks:,}", *map(_ms, getattr(one, shares)), one.peer) for one in listed]
-        lines += table(rows, ">>>>><")
-    for one in listed:
+        rows += [(f"{one.ticks:,}", *map(_ms, getattr(one, shares)), one.peer) for one in ticks]
+        yield from table(rows, ">>>>><")
+    for one in ticks:
         said = [f"not given: {why}" for why in one.not_given]
         said += [f"joined at {one.joined:.4g} s"] if one.joined else []
         said += ["stopped before the end"] if one.stopped else []
         said += [
             f"{counted(count, 'datagram', ',')} dropped: {DROPPED[why]}" for why, count in one.dropped.items()
         ]
-        lines += note(f"{one.peer}: {'; '.join(said)}") if said else []
-    return lines
+        if said:
+            yield from notes(f"{one.peer}: {'; '.join(said)}")
 
 
-def _ways_text(ways: Iterable[WayRun]) -> list[str]:
+def _ways_text(ways: Iterable[WayRun]) -> Lines:
     rows = [("packets", "lost", "half within", "all within", "way")]
     for one in ways:
         came = one.came
@@ -77,28 +78,24 @@ def _ms(seconds: float) -> str:
     return f"{1e3 * seconds:.3f} ms"
 
 
-def _measured_text(one: Measured) -> list[str]:
+def _measured_text(one: Measured) -> Lines:
     after = f"with {one.link} heard after {1e3 * one.delay:.6g} ms, as most of {one.way} was"
     verdict = f"{one.analysis.verdict}, spectral radius {one.analysis.spectral_radius:.6f} per frame"
-    lines = wrapped(f"analyze says, {after}: {verdict}", "  ", "    ")
+    judged = "not judged packet by packet, of which there are many: the link's trace: FILE asks for that"
     if one.network is not None:
-        lines += wrapped(f"and with every packet of that way as it came: {one.network.verdict}", "  ", "    ")
-    else:
-        lines += note(
-            "not judged packet by packet, of which there are many: the link's trace: FILE asks for that"
-        )
-    return lines
+        judged = f"and with every packet of that way as it came: {one.network.verdict}"
+    return notes(f"analyze says, {after}: {verdict}", judged)
 
 
 def run_comparison_document(found: RunComparison) -> dict[str, Any]:
     """Return a run beside its scene as plain data; times in seconds."""
     measured = [
         {
-            **document(one, {"analysis": ..., "network": one.network and one.network.verdict}),
+            **record(one, {"analysis": ..., "network": one.network and one.network.verdict}),
             "verdict": one.analysis.verdict,
             "spectral_radius": one.analysis.spectral_radius,
         }
         for one in found.measured
     ]
-    ways = [document(one, {"came": recording_document(one.came)}) for one in found.ways]
+    ways = [record(one, {"came": recording_document(one.came)}) for one in found.ways]
     return record(found, {"ways": ways, "measured": measured})

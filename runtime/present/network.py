@@ -1,21 +1,26 @@
-"""A verdict over an unreliable network as text and plain data.
+"""A verdict over an unreliable network, and what a recording of packets amounts to, as text and plain data.
 
-Takes: a `NetworkVerdict`. Gives: `network_text`, `network_document`.
-Guarantees: what was not judged says why.
+Takes: a `NetworkVerdict`, a `NetworkRecording`. Gives: of each its text and document; `recording_table`,
+`link_entry`.
+Guarantees: what was not judged says why, what is taken for granted stands first; the keys are those of a
+link's entry as it is.
 Does not: compute.
 """
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from apc.compiler.words import measured, wrapped
-from apc.present.forms import LINEARIZED, labelled, notes, record
+from apc.compiler.words import counted, measured, wrapped
+from apc.present.forms import LINEARIZED, Lines, Plain, labelled, notes, record, sentences
 
 if TYPE_CHECKING:
     from apc.moments.network import NetworkVerdict
     from apc.moments.worst import LossesInARow
+    from apc.network.recorded import NetworkRecording, Share
 
 _WORDS = {
     "stable in mean square": "Over the network as it is, the mean square of every motion dies out.",
@@ -24,52 +29,120 @@ _WORDS = {
 }
 
 
-def network_text(found: NetworkVerdict) -> str:
-    """Return what becomes of a scene over its network, in words and numbers."""
+def network_text(found: NetworkVerdict) -> Lines:
+    """Yield what becomes of a scene over its network, in words and numbers."""
     radius = found.mean_square_radius
     where = " over its network" if radius is None else ""
-    lines = [f"{found.topology}: {found.verdict}{where}{LINEARIZED if found.linearized else ''}", ""]
-    facts = []
+    yield f"{found.topology}: {found.verdict}{where}{LINEARIZED if found.linearized else ''}"
+    yield ""
     if radius is not None:
-        lines += [*wrapped(_WORDS[found.verdict.removeprefix("probably ")], "  ", "  "), ""]
+        yield from sentences(_WORDS[found.verdict.removeprefix("probably ")])
+        yield ""
         error, root = found.error or 0.0, math.sqrt(radius)
         rooted = measured(root, error / (2 * root) if root else error)
-        facts = [
+        yield from labelled(
             ("mean squares", f"multiplied by {measured(radius, error)} a frame"),
             ("their root", f"{rooted}, to compare with a spectral radius"),
-        ]
+        )
     if found.rms_error_m is not None:
         apart = f"{found.rms_error_m * 1e3:.4g} mm rms, for 1 N rms at every hand, white from tick to tick"
-        facts.append(("copies apart", apart))
+        yield from labelled(("copies apart", apart))
     if found.almost_sure is not None:
         low, high = found.almost_sure.interval
         exponent = f"growth e^{found.almost_sure.exponent:.4g} a frame ({low:.4g} to {high:.4g})"
-        facts.append(("almost surely", exponent))
+        yield from labelled(("almost surely", exponent))
     if found.losses_in_a_row is not None:
-        facts += _losses(found.losses_in_a_row)
-    if found.proof:
-        facts.append(("proof", found.proof))
-    lines += [line for label, text in facts for line in labelled(label, text)]
-    return "\n".join([*lines, *notes(found.notes)]).rstrip()
+        yield from labelled(*_losses(found.losses_in_a_row))
+    yield from labelled(("proof", found.proof))
+    yield from notes(*found.notes)
 
 
-def _losses(found: LossesInARow) -> list[tuple[str, str]]:
-    told = []
+def _losses(found: LossesInARow) -> Iterator[tuple[str, str]]:
     if found.certified is not None:
         harmless = (
             f"any pattern of at most {found.certified}" if found.certified else "not even one at a time"
         )
-        told.append(("losses in a row", f"{harmless} is certified harmless"))
+        yield "losses in a row", f"{harmless} is certified harmless"
     pattern = "".join("×" if lost else "·" for lost in found.unstable_pattern or ())
-    grows = f"a motion grows by {found.growth:.6g} a frame" if pattern else ""
+    grows = f"grow by {found.growth:.6g} a frame" if pattern else ""
     if "×" in pattern:
-        grows = grows.replace("a motion grows", "makes a motion grow")
-        told.append(("worst pattern", f"{pattern} lost again and again (×) {grows}"))
+        yield "worst pattern", f"{pattern} lost again and again (×) makes a motion {grows}"
     elif pattern:
-        told.append(("losses in a row", f"with none {grows}"))
-    return told
+        yield "losses in a row", f"with none a motion {grows.replace('grow', 'grows', 1)}"
 
 
-def network_document(found: NetworkVerdict) -> dict[str, Any]:
+def network_document(found: NetworkVerdict) -> Plain:
     """Return what becomes of a scene over its network as plain data."""
     return record(found, {"topology": ...})
+
+
+def recording_text(found: NetworkRecording) -> Lines:
+    """Yield what a recording amounts to, in words and numbers, and a link's entry that says so."""
+    of = f" by {found.program}" if found.program else ""
+    file = Path(found.file).name
+    yield f"{file}: {counted(found.packets, 'packet', ',')} recorded{of}"
+    yield ""
+    if found.left_out:
+        yield from notes(*found.left_out)
+        yield ""
+    yield from labelled(("lost", _share(found.lost)))
+    if found.lost.count:
+        how = "losses follow losses" if found.bursty else "no more than luck makes of independent losses"
+        average = f"{found.lost.count / found.bursts:.3g} packets on average"
+        bursts = f"{found.bursts:,}, {average}, {found.longest_burst:,} the longest"
+        yield from labelled(("bursts", bursts), ("", f"{how} (Fisher's exact test)"))
+    if found.law is not None:
+        several = found.packets > found.lost.count + 1
+        spread = f", standard deviation {_ms(found.deviation)}" if several else ""
+        quantiles = ((f"  {100 * share:g} %", f"at most {_ms(delay)}") for share, delay in found.quantiles)
+        span = f"{_ms(found.shortest)} to {_ms(found.longest)}"
+        yield from labelled(("delay", span), ("  mean", f"{_ms(found.mean)}{spread}"), *quantiles)
+    if found.overtaken is not None:
+        yield from labelled(("overtaken", counted(found.overtaken, "packet", ",")))
+    yield "\n  as keys of a link"
+    yield from wrapped(link_entry(found), "    ", "     ")
+    if found.law is not None and found.law.jitter:
+        away = f"shares of packets below a delay differ by at most {100 * found.law.distance:.2g} %"
+        nearest = f"{found.law.distribution} is the nearest of the distributions: {away}"
+        yield from wrapped(nearest, "    ", "    ")
+    yield f"  or packet by packet\n    lan: {{clock: network, trace: {file}}}"
+
+
+def recording_document(found: NetworkRecording) -> Plain:
+    """Return a recording as plain data: seconds, shares from 0 to 1."""
+    shares = {name: getattr(found, name) for name in ("lost", "turns_bad", "turns_good")}
+    instead = {name: record(share, {"share": share.value}) for name, share in shares.items()}
+    return record(found, {"delays": ..., "entry": link_entry(found), **instead})
+
+
+def recording_table(found: NetworkRecording) -> str:
+    """Return all delays as the table that a link's `trace` takes."""
+    rows = ("lost" if math.isinf(delay) else f"{delay * 1e3:.12g}" for delay in found.delays)
+    return "\n".join(["delay [ms]", *rows])
+
+
+def link_entry(found: NetworkRecording) -> str:
+    """Return the entry of a link with the keys that a recording amounts to."""
+    keys = ["clock: network"]
+    if found.law is not None:
+        keys.append(f"delay: {_ms(found.law.delay)}")
+        if found.law.jitter:
+            keys += [f"jitter: {_ms(found.law.jitter)}", f"distribution: {found.law.distribution}"]
+    if found.bursty:
+        keys.append(f"loss: {{p: {_percent(found.turns_bad.value)}, r: {_percent(found.turns_good.value)}}}")
+    elif found.lost.count:
+        keys.append(f"loss: {_percent(found.lost.value)}")
+    return f"lan: {{{', '.join(keys)}}}"
+
+
+def _share(share: Share) -> str:
+    between = " to ".join(map(_percent, share.interval))
+    return f"{share.count:,} of {share.of:,}: {_percent(share.value)} (95 %: {between})"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.3g} %"
+
+
+def _ms(seconds: float) -> str:
+    return f"{seconds * 1e3:.4g} ms" if math.isfinite(seconds) else "–"

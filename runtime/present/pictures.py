@@ -2,7 +2,7 @@
 
 Takes: a matplotlib Figure and a path.
 Gives: `COLOURS`, `LINES`, `colours_of`, `new_figure`; `FORMATS`, `check_format`, `check_result_path`,
-`write_figure`, `write_picture`, `write_result`, `table_of`, `svg_text`, `svg_image`.
+`write_figure`, `write_picture`, `write_result`, `table_of`, `svg_text`, `svg_image`, `html_of`.
 Guarantees: the same figure gives the same bytes; a file is there whole or not at all; text in an SVG is text.
 Does not: draw, or need a display.
 
@@ -19,6 +19,7 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from apc.compiler.errors import ApcError
 from apc.compiler.files import check_target, write_file, write_text
 from apc.compiler.timings import part
 from apc.distribution import program_version
@@ -162,3 +163,14 @@ def table_of(found: Result) -> pandas.DataFrame:
     """
     columns, rows, _ = found._shown("rows")
     return need("pandas", "data").DataFrame(list(rows), columns=[one.heading for one in columns])
+
+
+def html_of(found: Any) -> str:
+    """Return a result for a notebook: its text, and its picture as an image where matplotlib is there."""
+    text = f"<pre>{escape(str(found))}</pre>"
+    if not (found.pictured and hasattr(found, "plot")):
+        return text
+    try:
+        return text + svg_image(found.plot().figure, repr(found))
+    except ApcError:
+        return text

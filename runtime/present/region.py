@@ -9,16 +9,16 @@ Does not: compute, or draw itself (see `region_picture`).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.words import counted, known_digits, measured, with_unit, wrapped
+from apc.compiler.words import counted, known_digits, measured, with_unit
 from apc.present.analysis import range_document
-from apc.present.forms import MEANT, notes, picked, quantity, table
+from apc.present.forms import MEANT, Lines, Plain, notes, picked, quantity, sentences, table
 from apc.present.region_picture import panel_letter, panels_picture, region_picture  # noqa: F401 -- looked up
-from apc.tables import Column, Row
+from apc.tables import Column, Row, Tabled
 
 if TYPE_CHECKING:
     from apc.regions.panels import Panel, Panels
@@ -30,8 +30,8 @@ Floats = NDArray[np.float64]
 MOST_CURVES = 12
 
 
-def region_text(found: Region) -> str:
-    """Return what `apc region` prints of one region."""
+def region_text(found: Region) -> Lines:
+    """Yield what `apc region` prints of one region."""
     axes = [
         (letter, one.free.label, with_unit(f"{float(one.low):.6g} to {float(one.high):.6g}", one.unit))
         for letter, one in (("x", found.x), ("y", found.y))
@@ -39,29 +39,34 @@ def region_text(found: Region) -> str:
     off, percent = found.stable_area_error, 100 / float(found.rectangle.width.prod())
     share = known_digits(percent * found.stable_area, percent * off, 4)
     area = measured(found.stable_area, off) if off else f"{found.stable_area:.9g}"
-    meant = [MEANT[found.criterion]] if found.criterion in MEANT else []
-    lines = [f"{found.topology}: {_words(found)}", *notes([*meant, *found.left_out]), "", *table(axes)]
-    lines += ["", f"  stable area  {area} in SI, {share} % of the rectangle"]
+    yield f"{found.topology}: {_words(found)}"
+    yield from notes(MEANT.get(found.criterion, ""), *found.left_out)
+    yield ""
+    yield from table(axes)
+    yield f"\n  stable area  {area} in SI, {share} % of the rectangle"
     if found.curves:
+        yield ""
         rows = [("boundary", "frequency [Hz]", "from (x, y)", "to (x, y)", "error")]
-        lines += ["", *table([*rows, *map(_row, found.curves[:MOST_CURVES])])]
+        yield from table([*rows, *map(_row, found.curves[:MOST_CURVES])])
         left = len(found.curves) - MOST_CURVES
         if left > 0:
-            lines.append(f"  and {left} more (--json lists all)")
+            yield f"  and {left} more (--json lists all)"
     if coarse := found.coarse:
         most, many = max(one.error for one in coarse), counted(len(coarse), "curve")
-        what = f"{many} could not be followed to {found.tolerance:.0e} of a coordinate, but to {most:.0e}"
-        lines += ["", *wrapped(what, "  ", "  ")]
+        yield ""
+        yield from sentences(
+            f"{many} could not be followed to {found.tolerance:.0e} of a coordinate, but to {most:.0e}"
+        )
     sizes = zip(found.cell, (found.x, found.y), strict=True)
     cell = " × ".join(quantity(size, axis.unit, 4) for size, axis in sizes)
     looked = f"Looked at in cells of {cell}, and finer where the eigenvalues hint at more; "
-    lines += ["", *wrapped(f"{looked}an island inside one cell could be missed.", "  ", "  ")]
+    yield ""
+    yield from sentences(f"{looked}an island inside one cell could be missed.")
     if found.stepped and found.criterion == "passive":
-        lines.append("  Its points are on the boundary, with straight lines between; the error is an")
-        lines.append("  estimate by how far the middles of these were off, no bound.")
+        yield "  Its points are on the boundary, with straight lines between; the error is an"
+        yield "  estimate by how far the middles of these were off, no bound."
     elif found.stepped:
-        lines.append("  Along these times the boundary has steps: it is right to a cell only.")
-    return "\n".join(lines)
+        yield "  Along these times the boundary has steps: it is right to a cell only."
 
 
 def _words(found: Region) -> str:
@@ -84,7 +89,7 @@ def _point(curve: Curve, place: int) -> str:
     return "({}, {})".format(*(known_digits(one, curve.error * abs(one), 6) for one in curve.points[place]))
 
 
-def region_document(found: Region) -> dict[str, Any]:
+def region_document(found: Region) -> Plain:
     """Return what `apc region --json` prints of one region."""
     names = ("topology", "tolerance", "stable_area", "stable_area_error", "cell", "criterion", "left_out")
     return {
@@ -99,7 +104,7 @@ def region_document(found: Region) -> dict[str, Any]:
     }
 
 
-def _curve_document(curve: Curve) -> dict[str, Any]:
+def _curve_document(curve: Curve) -> Plain:
     names = ("points", "handles", "error", "mode", "frequency_hz", "closed", "smooth")
     return picked(curve, *names) | {"stable_side": "left"}
 
@@ -110,28 +115,26 @@ def _product(x: str, y: str) -> str:
     return "*".join(f"({unit})" if "/" in unit or "*" in unit else unit for unit in units) or "1"
 
 
-def panels_text(found: Panels) -> str:
-    """Return what `apc region` prints of several regions."""
-    lines: list[str] = []
+def panels_text(found: Panels) -> Lines:
+    """Yield what `apc region` prints of several regions."""
     for place, panel in enumerate(found.panels):
         if panel.title:
-            lines += [f"({panel_letter(place)}) {panel.title}", ""]
+            yield f"({panel_letter(place)}) {panel.title}\n"
         for region, gain in zip(panel.regions, panel.gains, strict=True):
-            lines.append(region_text(region))
+            yield from region_text(region)
             if gain != 1:
-                lines.append(f"  Compared at equal effective gain: y counts {gain} times, once an other.")
-            lines.append("")
-    return "\n".join(lines).rstrip("\n")
+                yield f"  Compared at equal effective gain: y counts {gain} times, once an other."
+            yield ""
 
 
-def panels_document(found: Panels) -> dict[str, Any]:
+def panels_document(found: Panels) -> Plain:
     """Return what `apc region --json` prints: the region itself if it is alone, else the panels."""
     if found.alone is not None:
         return found.alone.to_dict()
     return {"normalized": found.normalized, "panels": [_panel_document(one) for one in found.panels]}
 
 
-def _panel_document(panel: Panel) -> dict[str, Any]:
+def _panel_document(panel: Panel) -> Plain:
     return {
         "panel": panel.title,
         "regions": [
@@ -142,7 +145,7 @@ def _panel_document(panel: Panel) -> dict[str, Any]:
     }
 
 
-def panels_rows(found: Panels) -> tuple[list[Column], Iterator[Row], dict[str, Any]]:
+def panels_rows(found: Panels) -> Tabled:
     """Return the columns of a table of boundary points, a row a point, and how they were made."""
     regions = [(one, panel.title) for panel in found.panels for one in panel.regions]
     made = {
@@ -154,7 +157,7 @@ def panels_rows(found: Panels) -> tuple[list[Column], Iterator[Row], dict[str, A
     return _columns(regions[0][0]), rows, made
 
 
-def region_rows(found: Region) -> tuple[list[Column], Iterator[Row], dict[str, Any]]:
+def region_rows(found: Region) -> Tabled:
     """Return the same of one region."""
     return _columns(found), _rows(found), {}
 

@@ -11,6 +11,7 @@ matplotlib is loaded when something is drawn and not before.
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Sequence
 from string import ascii_lowercase
@@ -38,7 +39,6 @@ HATCH = 0.25  # how dark hatches are: curves must stand out
 PANEL = 3.5  # inches: the side of a panel, one column of a paper
 DRAWN = 240  # straight lines a curve is drawn by at least: fewer show their corners
 SAME = 1e-3  # of a panel's sides, less than a line is wide: curves that nowhere differ by more are one
-ON_EDGE = 1e-9  # of a rectangle's sides: what is nearer to its edge is on it
 CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 STABLE = "hatched: stable"
 NO_BREAK = "\N{NO-BREAK SPACE}"
@@ -178,45 +178,30 @@ def drawn_points(found: Region, number: int) -> Floats:
 
 
 def stable_outlines(found: Region) -> list[Floats]:
-    """Return the closed polylines in SI around the stable side: outlines and, the other way round, holes.
+    """Return closed polylines in SI that wind once around the stable side, and not at all around the rest.
 
-    A curve is followed by the one that begins where it ends or, from the rectangle's edge, counter-clockwise
-    along that edge by the next that begins there: the stable side is on the left all the way.
+    Each curve, whose left is stable, is closed along the rectangle's edge, counter-clockwise from its end to
+    its start. What these wind around too often is taken away by whole rectangles, clockwise.
     """
     rectangle = found.rectangle
-    left = [rectangle.points(drawn_points(found, number)) for number in range(len(found.curves))]
-    outlines = []
-    edge = False
-    while left:
-        ring = [left.pop(0)]
-        while not np.array_equal(ring[-1][-1], ring[0][0]):
-            end = ring[-1][-1]
-            following = next((n for n, one in enumerate(left) if np.array_equal(one[0], end)), None)
-            if following is None:
-                edge = True
-                here, _ = _along_edge(end)
-                starts = [_along_edge(one[0]) for one in (ring[0], *left)]
-                lengths = [((along - here) % 4, off) for along, off in starts]
-                nearest = min(range(len(lengths)), key=lambda n: (lengths[n][1] > ON_EDGE, lengths[n][0]))
-                ring.append(_corners(here, lengths[nearest][0]))
-                if not nearest:
-                    break
-                following = nearest - 1
-            ring.append(left.pop(following))
-        outlines.append(np.concatenate(ring))
-    if not edge and found.corner:
-        outlines.append(CORNERS)
-    return [rectangle.values(one) for one in outlines]
+    curves = [rectangle.points(drawn_points(found, number)) for number in range(len(found.curves))]
+    rings = [np.concatenate([one, _along_edge(one[-1], one[0])]) for one in curves]
+    wound = sum(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2 for x, y in (one.T for one in rings))
+    turns = round(wound - found.stable_area / float(rectangle.width.prod()))
+    rings += [CORNERS[::-1] if turns > 0 else CORNERS] * abs(turns)
+    return [rectangle.values(one) for one in rings]
 
 
-def _along_edge(point: Floats) -> tuple[float, float]:
-    """Return the nearest place on the unit square's edge, 0 to 4 counter-clockwise, and its distance."""
+def _along_edge(end: Floats, start: Floats) -> Floats:
+    """Return points (k, 2) along the unit square's edge, counter-clockwise from next to one to another."""
+    first, last = _place(end), _place(start)
+    last += 4 if last < first else 0
+    places = [first, *range(math.floor(first) + 1, math.ceil(last)), last]
+    return np.stack([np.interp(places, range(12), np.tile(column, 3)) for column in CORNERS.T], axis=1)
+
+
+def _place(point: Floats) -> float:
+    """Return the nearest place on the unit square's edge, 0 to 4 counter-clockwise."""
     x, y = np.clip(point, 0, 1)
-    distances = (y, 1 - x, 1 - y, x)
-    side = int(np.argmin(distances))
-    return float(side + (x, y, 1 - x, 1 - y)[side]), float(distances[side])
-
-
-def _corners(start: float, length: float) -> Floats:
-    """Return the unit square's corners passed on its edge (k, 2)."""
-    return CORNERS[[corner % 4 for corner in range(1, 9) if start < corner < start + length]]
+    side = int(np.argmin((y, 1 - x, 1 - y, x)))
+    return float(side + (x, y, 1 - x, 1 - y)[side])

@@ -12,7 +12,7 @@ matplotlib is loaded when something is drawn and not before.
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,7 +21,18 @@ from numpy.typing import NDArray
 from apc.compiler.language.vectors import entry, whole_and_index
 from apc.compiler.words import counted, in_hertz, wrapped
 from apc.optional import need
-from apc.present.forms import document, json_text, labelled, note, notes, quantity, record, table
+from apc.present.forms import (
+    Lines,
+    Plain,
+    document,
+    json_text,
+    labelled,
+    notes,
+    quantity,
+    record,
+    sentences,
+    table,
+)
 from apc.present.pictures import colours_of, new_figure
 from apc.simulation.settings import EXACT
 
@@ -30,7 +41,6 @@ if TYPE_CHECKING:
     from apc.simulation.buzz import Buzz
     from apc.simulation.ensemble import Ensemble, MeanSquare
     from apc.simulation.signals import Signal
-    from apc.simulation.summary import Broken
     from apc.simulation.trajectory import Played, Provenance, Trajectory
 
 Floats = NDArray[np.float64]
@@ -69,8 +79,8 @@ _WORDS = {
 }
 
 
-def buzz_text(found: Buzz) -> str:
-    """Return a buzz as it is predicted beside what was played."""
+def buzz_text(found: Buzz) -> Lines:
+    """Yield a buzz as it is predicted beside what was played."""
     known = found.predicted
     settles = "settles" if found.settles else ""
     played = in_hertz(found.lines[0].frequency_hz) if found.lines else settles or "–"
@@ -85,24 +95,26 @@ def buzz_text(found: Buzz) -> str:
             (f"{one.name}: depth", depth, settles or f"{one.depth_m * 1e3:.4g} mm"),
             (f"{one.name}: in contact", share, f"{one.in_contact:.1%}"),
         ]
-    title = f"{found.topology}: the buzz of its contacts, predicted beside {found.played_s:g} s played"
-    told = notes(filter(None, (found.reason, *found.notes)))
-    return "\n".join([*wrapped(title), "", *table(rows, "<>>"), *told])
+    played_s = f"predicted beside {found.played_s:g} s played"
+    yield from wrapped(f"{found.topology}: the buzz of its contacts, {played_s}")
+    yield ""
+    yield from table(rows, "<>>")
+    yield from notes(found.reason, *found.notes)
 
 
-def played_text(found: Played) -> str:
-    """Return what `apc simulate` prints: the summary, the method if it is not exact, the error if known."""
+def played_text(found: Played) -> Lines:
+    """Yield what `apc simulate` prints: the summary, the method if it is not exact, the error if known."""
     summary = found.summary
+    units = {one.name: one.unit for one in summary.extents}
     swing = ""
     if summary.swing:
         name, size, rate = summary.swing
-        unit = next(one.unit for one in summary.extents if one.name == name)
-        swing = f"{name} by {_quantity(size, unit)}, {rate:.3g} times a second"
+        swing = f"{name} by {_quantity(size, units[name])}, {rate:.3g} times a second"
+    yield f"{found.topology}: {summary.verdict}\n"
     rests_in_part = summary.verdict == "rests" and summary.unrecorded
-    words = (
-        RECORDED_REST
-        if rests_in_part
-        else _WORDS[summary.verdict].format(
+    words = RECORDED_REST if rests_in_part else _WORDS[summary.verdict]
+    yield from sentences(
+        words.format(
             position="recorded position" if summary.unrecorded else "position",
             settled=_quantity(summary.settled or 0.0, "s"),
             swing=swing,
@@ -110,42 +122,9 @@ def played_text(found: Played) -> str:
             stopped_at=_quantity(summary.stopped_at or 0.0, "s"),
         )
     )
-    lines = [f"{found.topology}: {summary.verdict}", ""]
-    lines += wrapped(words, "  ", "  ")
-    rows = []
-    if summary.largest_force and (summary.largest_force[1] or summary.verdict != "rests"):
-        name, size, at = summary.largest_force
-        rows.append(("largest force", f"{_quantity(size, 'N')}, {name} at {_quantity(at, 's')}"))
-    rows += [("beyond limit", text) for text in _beyond(summary.broken)]
-    if summary.overshoot:
-        rows.append(("overshoot", f"{100 * summary.overshoot[1]:.3g} %, {summary.overshoot[0]}"))
-    for name, distance in summary.copies:
-        if not distance and summary.verdict == "rests":
-            continue
-        unit = next(one.unit for one in summary.extents if one.name.endswith(f".{name}"))
-        rows.append(("copies", f"{name} differs by {_quantity(distance, unit)} between peers at the end"))
-    if any(one for _, one in summary.work):
-        done = ", ".join(f"{part} {_quantity(one, 'J')}" for part, one in summary.work)
-        rows.append(("work put in", f"{done} by held forces"))
-    rows.append(("recorded", f"{summary.rows} rows of {summary.signals} signals until {summary.end:g} s"))
-    if found.provenance.method != EXACT:
-        rows.append(("method", _method(found.provenance)))
-    if found.error:
-        rows.append(("error", error_text(found.error)))
-    lines.append("")
-    for title, text in rows:
-        lines += labelled(title, text, 15)
-    return "\n".join(lines)
-
-
-def _beyond(broken: Sequence[Broken]) -> list[str]:
-    """Return which limits were broken, in their order, each with when and by how much."""
-    lines = [
-        f"{one.signal} from {_quantity(one.first_s, 's')} on: at most {_quantity(one.most, one.unit)} "
-        f"at {_quantity(one.at_s, 's')}, beyond {one.limit} by {_quantity(one.most - one.value, one.unit)}"
-        for one in broken[:MOST_LIMITS]
-    ]
-    return lines + ([f"and {len(broken) - MOST_LIMITS} more"] if len(broken) > MOST_LIMITS else [])
+    yield ""
+    for title, text in _facts(found, units):
+        yield from labelled((title, text), width=15)
 
 
 def _quantity(value: float, unit: str) -> str:
@@ -174,11 +153,11 @@ def error_text(estimate: ErrorEstimate) -> str:
     return f"{about}{size}, {worst.relative:.1g} of its range ({estimate.compared})"
 
 
-def played_document(found: Played) -> dict[str, Any]:
+def played_document(found: Played) -> Plain:
     """Return what `apc simulate --json` prints."""
     summary = found.summary
 
-    def keyed(values: Sequence[Any] | None, *keys: str) -> dict[str, Any] | None:
+    def keyed(values: Sequence[Any] | None, *keys: str) -> Plain | None:
         return None if values is None else dict(zip(keys, values, strict=True))
 
     return {
@@ -195,25 +174,25 @@ def played_document(found: Played) -> dict[str, Any]:
         "work_J": dict(summary.work),
         "rows": summary.rows,
         "end_s": summary.end,
-        "signals": [document(one, {"settled": ..., "settled_s": one.settled}) for one in summary.extents],
+        "signals": [record(one, {"settled": ..., "settled_s": one.settled}) for one in summary.extents],
         "error_estimate": None if found.error is None else _error_document(found.error),
         "provenance": provenance_document(found.provenance),
     }
 
 
-def _error_document(found: ErrorEstimate) -> dict[str, Any]:
+def _error_document(found: ErrorEstimate) -> Plain:
     signals = [
-        document(one, {"at": ..., "span": ..., "time_s": one.at, "range": one.span}) for one in found.signals
+        record(one, {"at": ..., "span": ..., "time_s": one.at, "range": one.span}) for one in found.signals
     ]
     return {"kind": found.kind, "compared_with": found.compared, "signals": signals}
 
 
-def provenance_document(found: Provenance) -> dict[str, Any]:
+def provenance_document(found: Provenance) -> Plain:
     """Return what made a result as plain data."""
     instead = {
         "texts": ...,
         "sha256": found.texts,
-        "tolerances": {one.state: document(one, {"state": ...}) for one in found.tolerances},
+        "tolerances": {one.state: record(one, {"state": ...}) for one in found.tolerances},
         "parameters": {name: {"value": value, "unit": unit} for name, value, unit in found.parameters},
         "timings": ...,
         "timings_s": dict(found.timings),
@@ -387,33 +366,34 @@ def _finish(ax: Any, curves: int) -> None:
     )
 
 
-def ensemble_text(ensemble: Ensemble) -> str:
-    """Return what many runs amount to, in words of at most 80 columns."""
+def ensemble_text(ensemble: Ensemble) -> Lines:
+    """Yield what many runs amount to, in words of at most 80 columns."""
     from apc.simulation.ensemble import share_interval
 
     n = len(ensemble.runs)
     duration = f"{float(ensemble.duration):g} s, seed {ensemble.seed}"
-    lines = [f"{ensemble.topology[:40]}: {counted(n, 'run')} of {duration}"]
+    yield f"{ensemble.topology[:40]}: {counted(n, 'run')} of {duration}"
     shares = []
     for verdict, count in ensemble.verdicts:
         low, high = share_interval(count, n)
         told = f"{100 * count / n:.3g} % (95 % sure: {100 * low:.3g} % to {100 * high:.3g} %)"
         shares.append((verdict, str(count), told))
+    yield from table(shares, "<><")
+    yield ""
     rows: list[tuple[str, ...]] = [("", "mean", "± error", "5 %", "median", "95 %", "most")]
     for name, label in LABELS.items():
         one = ensemble.statistics(name)
         if one is not None:
             error = f"± {one.standard_error:.1g}" if one.count > 1 else ""
             rows.append((label, f"{one.mean:.3g}", error, *(f"{v:.3g}" for v in (*one.quantiles, one.high))))
-    lines += [*table(shares, "<><"), "", *table(rows, "<>>>>>>")]
+    yield from table(rows, "<>>>>>>")
     settled = ensemble.statistics("settled")
     if settled is not None and settled.count < n:
-        lines.append(f"  settled at: of the {settled.count} runs that settle")
+        yield f"  settled at: of the {settled.count} runs that settle"
     if ensemble.mean_square is not None:
-        lines += note(_beside(ensemble, ensemble.mean_square))
+        yield from notes(_beside(ensemble, ensemble.mean_square))
     if ensemble.interrupted:
-        lines.append("  interrupted: there were to be more runs")
-    return "\n".join(lines)
+        yield "  interrupted: there were to be more runs"
 
 
 def _beside(ensemble: Ensemble, found: MeanSquare) -> str:
@@ -437,7 +417,7 @@ def _beside(ensemble: Ensemble, found: MeanSquare) -> str:
     return f"{told}what moves the others is a force that goes on, which that verdict is not about"
 
 
-def ensemble_document(found: Ensemble) -> dict[str, Any]:
+def ensemble_document(found: Ensemble) -> Plain:
     """Return what many runs amount to as plain data."""
     from apc.simulation.ensemble import QUANTILES, share_interval
 
@@ -446,7 +426,7 @@ def ensemble_document(found: Ensemble) -> dict[str, Any]:
         verdict: {"runs": count, "share": count / n, "share_95": list(share_interval(count, n))}
         for verdict, count in found.verdicts
     }
-    instead: dict[str, Any] = {
+    instead: Plain = {
         "duration": ...,
         "duration_s": found.duration,
         "runs": n,
@@ -454,9 +434,36 @@ def ensemble_document(found: Ensemble) -> dict[str, Any]:
         "verdicts": shares,
     }
     for name in LABELS:
-        one = found.statistics(name)
+        instead[name] = one = found.statistics(name)
         if one is not None:
             quantiles = dict(zip(map(str, QUANTILES), one.quantiles, strict=True))
-            one = document(one, {"count": ..., "runs": one.count, "quantiles": quantiles})
-        instead[name] = one
+            instead[name] = record(one, {"count": ..., "runs": one.count, "quantiles": quantiles})
     return record(found, instead)
+
+
+def _facts(found: Played, units: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    """Yield what a run amounts to, each fact with its label; `units` are those of its signals by name."""
+    summary = found.summary
+    if summary.largest_force and (summary.largest_force[1] or summary.verdict != "rests"):
+        name, size, at = summary.largest_force
+        yield "largest force", f"{_quantity(size, 'N')}, {name} at {_quantity(at, 's')}"
+    for one in summary.broken[:MOST_LIMITS]:
+        most, beyond = (_quantity(value, one.unit) for value in (one.most, one.most - one.value))
+        when = f"{one.signal} from {_quantity(one.first_s, 's')} on: at most {most} at"
+        yield "beyond limit", f"{when} {_quantity(one.at_s, 's')}, beyond {one.limit} by {beyond}"
+    if len(summary.broken) > MOST_LIMITS:
+        yield "beyond limit", f"and {len(summary.broken) - MOST_LIMITS} more"
+    if summary.overshoot:
+        yield "overshoot", f"{100 * summary.overshoot[1]:.3g} %, {summary.overshoot[0]}"
+    for name, distance in summary.copies:
+        if distance or summary.verdict != "rests":
+            unit = next(unit for signal, unit in units.items() if signal.endswith(f".{name}"))
+            yield "copies", f"{name} differs by {_quantity(distance, unit)} between peers at the end"
+    if any(one for _, one in summary.work):
+        done = ", ".join(f"{part} {_quantity(one, 'J')}" for part, one in summary.work)
+        yield "work put in", f"{done} by held forces"
+    yield "recorded", f"{summary.rows} rows of {summary.signals} signals until {summary.end:g} s"
+    if found.provenance.method != EXACT:
+        yield "method", _method(found.provenance)
+    if found.error:
+        yield "error", error_text(found.error)

@@ -20,7 +20,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import counted, enumerated, in_hertz, measured, with_unit, wrapped
 from apc.frame.overrides import Override, apply
 from apc.present.analysis import range_document, range_text
-from apc.present.forms import MEANT, labelled, notes, quantity, record, table
+from apc.present.forms import MEANT, Lines, Plain, labelled, notes, quantity, record, table
 from apc.present.pictures import COLOURS, new_figure
 from apc.present.region_picture import draw_panel
 from apc.regions.panels import Panel
@@ -41,10 +41,11 @@ TYPED, BUYS = 12, 3
 SETTLED = 0.02
 
 
-def tuning_text(found: Tuning) -> str:
-    """Return the gains, what is proved of them and what binds, in at most 80 columns."""
-    meant = [MEANT[found.criterion]] if found.criterion in MEANT else []
-    lines = [*wrapped(_sentence(found), "", "  "), *notes([*meant, *found.left_out, *found.notes]), ""]
+def tuning_text(found: Tuning) -> Lines:
+    """Yield the gains, what is proved of them and what binds, in at most 80 columns."""
+    yield from wrapped(_sentence(found), "", "  ")
+    yield from notes(MEANT.get(found.criterion, ""), *found.left_out, *found.notes)
+    yield ""
     rows = [("gain", "value", "before rounding", "chosen from")]
     rows += [
         (
@@ -55,24 +56,25 @@ def tuning_text(found: Tuning) -> str:
         )
         for one in found.gains
     ]
-    lines += [*table(rows), ""]
+    yield from table(rows)
+    yield ""
     if found.met:
         value = measured(found.best, found.error, found.unit)
         if _is_felt(found):  # found without knowing how far any better one may be
             value = quantity(found.best, found.unit, BUYS + 1)
-        best = f"{value}, the best of {found.looked:,} points"
-        lines += labelled("before rounding", best)
+        yield from labelled(("before rounding", f"{value}, the best of {found.looked:,} points"))
     if found.bounded:
         better = f"no gains in these ranges do better by {100 * float(SHARE):.3g} %"
-        lines += labelled("no others", f"{better}, proved in {found.bounded:,} cells")
-    lines += labelled("margin", _margin(found)) if found.met else []
-    lines += _proof_lines(found)
+        yield from labelled(("no others", f"{better}, proved in {found.bounded:,} cells"))
+    if found.met:
+        yield from labelled(("margin", _margin(found)))
+    yield from _proof_lines(found)
     if found.binding:
-        lines += ["", "  what binds" if found.met else "  what is in the way"]
-        lines += [line for one in found.binding for line in _binding_lines(found, one)]
+        yield "\n  what binds" if found.met else "\n  what is in the way"
+        for one in found.binding:
+            yield from _binding_lines(found, one)
     elif any(one.parameter == found.aim and one.value in (one.low, one.high) for one in found.gains):
-        lines += ["", f"  nothing binds {found.aim} but the end of its range"]
-    return "\n".join(lines)
+        yield f"\n  nothing binds {found.aim} but the end of its range"
 
 
 def _sentence(found: Tuning) -> str:
@@ -116,44 +118,40 @@ def _radius(found: Tuning) -> str:
     return "a mean-square radius" if found.criterion == "mean-square" else "a spectral radius"
 
 
-def _proof_lines(found: Tuning) -> list[str]:
-    """Return what was proved, and of what it was not."""
+def _proof_lines(found: Tuning) -> Lines:
+    """Yield what was proved, and of what it was not."""
     proved = [one for one in found.proofs if one.proof.stable]
     cells = sum(one.proof.cells for one in proved)
-    lines = []
     if proved:
         told = counted(cells, "cell" if found.over else "analysis", ",d").replace("analysiss", "analyses")
         many = f"for each of {len(proved)} numbers of peers, " if proved[0].counts else ""
-        lines += labelled("proved", f"{many}{proved[0].proof.verdict} ({told})")
+        yield from labelled(("proved", f"{many}{proved[0].proof.verdict} ({told})"))
     left: dict[str, list[str]] = {}
     for one in found.proofs:
         if not one.proof.stable:
-            share = (
-                f"{100 * one.proof.open_share:.3g} % of the box is left open" if one.proof.open_share else ""
-            )
+            open_share = 100 * one.proof.open_share
+            share = [f"{open_share:.3g} % of the box is left open"] if open_share else []
             open_verdict = [] if one.proof.notes else [one.proof.verdict]
-            said = ", ".join([*open_verdict, *filter(None, [share]), *one.proof.notes])
+            said = ", ".join([*open_verdict, *share, *one.proof.notes])
             left.setdefault(said, []).append(", ".join(f"{label} {number}" for label, number in one.counts))
     for said, where in left.items():
-        lines += labelled("not proved", "; ".join([", ".join(filter(None, where)), said]).removeprefix("; "))
+        yield from labelled(("not proved", "; ".join(filter(None, [", ".join(filter(None, where)), said]))))
     if found.met and not found.proofs:
-        lines += labelled("not proved", "the time was up before any proof")
-    return lines
+        yield from labelled(("not proved", "the time was up before any proof"))
 
 
 def _where(one: Binding) -> str:
     return ", ".join(f"{label} {quantity(value, unit)}" for label, value, unit in one.where)
 
 
-def _binding_lines(found: Tuning, one: Binding) -> list[str]:
-    where = _where(one)
+def _binding_lines(found: Tuning, one: Binding) -> Lines:
     mode = f"{one.shape} mode at {in_hertz(one.frequency_hz)}" if one.shape else ""
     other = "what is felt" if found.felt else found.aim if _is_felt(found) else "stability"
-    lines = wrapped(": ".join(filter(None, [where, mode])) or other, "    ", "      ")
+    yield from wrapped(": ".join(filter(None, [_where(one), mode])) or other, "    ", "      ")
     for label, value, unit, better in one.buys if found.met and found.aim not in (RADIUS, SETTLING) else ():
         buys = quantity(better, found.unit, BUYS)
-        lines += wrapped(f"1 % less of {label} = {quantity(value, unit)} buys {buys}", "      ", "        ")
-    return lines
+        text = f"1 % less of {label} = {quantity(value, unit)} buys {buys}"
+        yield from wrapped(text, "      ", "        ")
 
 
 def tuning_picture(found: Tuning, ax: Any = None) -> Any:
@@ -186,7 +184,7 @@ def _draw_gains(found: Tuning, ax: Any) -> None:
     draw_panel(ax, f"{found.topology}{more}", Panel("", tuple(regions), (1,) * len(regions), ()))
     (now, best) = np.array([(one.now, float(one.value)) for one in found.gains]).T
     ax.annotate("", best, now, arrowprops={"arrowstyle": "->", "color": "0.3"})
-    whole: dict[str, Any] = {"clip_on": False, "zorder": 5}  # where an end of a range is best, too
+    whole: Plain = {"clip_on": False, "zorder": 5}  # where an end of a range is best, too
     ax.plot(*now, "o", color="0.3", label="now", **whole)
     ax.plot(*best, "*", color="black", markersize=11, label="found", **whole)
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, frameon=False, fontsize=8)
@@ -215,27 +213,29 @@ def _draw_struck(found: Tuning, ax: Any) -> None:
     ax.grid(linewidth=0.4, alpha=0.5)
 
 
-def front_text(found: Front) -> str:
-    """Return the designs as a table, those at the ends and at the knee named, in at most 80 columns."""
-    last = len(found.designs) - 1
+def front_text(found: Front) -> Lines:
+    """Yield the designs as a table, those at the ends and at the knee named, in at most 80 columns."""
     best = "largest" if found.larger else "least"
-    title = f"{found.topology}: the {best} {found.aim} for each bound on {found.against}"
-    names = {found.knee: "knee", 0: "least felt", last: best}  # an end is no knee
+    yield from wrapped(
+        f"{found.topology}: the {best} {found.aim} for each bound on {found.against}", "", "  "
+    )
+    yield from notes(MEANT.get(found.criterion, ""), *found.left_out, *found.notes)
+    yield ""
     names_of = [name for name, _, _ in found.designs[0].gains]
     apart = found.aim not in names_of  # what is best is in no column of the gains
     heads = ["felt", best] if apart else [found.against]  # the title names both
-    knee = labelled("knee", f"{quantity(found.designs[found.knee].felt, found.against_unit, 5)} felt")
-    if apart:  # there is no room for names
-        names = {}
+    # An end is no knee; beside a column of what is best there is no room for names.
+    names = {} if apart else {found.knee: "knee", 0: "least felt", len(found.designs) - 1: best}
     rows = [(*heads, *names_of, "", "")]
     for place, one in enumerate(found.designs):
         gains = (quantity(value, unit, TYPED) for _, value, unit in one.gains)
         proved = "" if one.proved else "not proved"
         value = [quantity(one.value, found.unit, 4)] * apart
         rows.append((quantity(one.felt, found.against_unit, 5), *value, *gains, names.get(place, ""), proved))
-    meant = [MEANT[found.criterion]] if found.criterion in MEANT else []
-    said = notes([*meant, *found.left_out, *found.notes])
-    return "\n".join([*wrapped(title, "", "  "), *said, "", *table(rows), *[line for line in knee if apart]])
+    yield from table(rows)
+    if apart:
+        knee = quantity(found.designs[found.knee].felt, found.against_unit, 5)
+        yield from labelled(("knee", f"{knee} felt"))
 
 
 def front_picture(found: Front, ax: Any = None) -> Any:
@@ -254,7 +254,7 @@ def front_picture(found: Front, ax: Any = None) -> Any:
     return ax
 
 
-def tuning_document(found: Tuning) -> dict[str, Any]:
+def tuning_document(found: Tuning) -> Plain:
     """Return the gains, what is proved of them and what binds as plain data."""
     proofs = [
         {"counts": dict(one.counts), "verdict": one.proof.verdict, "stable": one.proof.stable}

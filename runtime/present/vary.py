@@ -1,7 +1,8 @@
-"""Critical values, margins, sensitivities, sweeps and many analyses as text, plain data and tables.
+"""What may be set; critical values, margins, sensitivities, sweeps, many analyses: as text, data and tables.
 
-Takes: results of `vary` and `sweeps`. Gives: their texts, documents and tables.
-Guarantees: a number is shown to the digits that its error leaves known.
+Takes: results of `vary` and `sweeps`, `Parameters`. Gives: their texts, documents and tables.
+Guarantees: a number is shown to the digits that its error leaves known; what may be set stands in the unit
+that `--set` takes it in.
 Does not: compute, but for the root locus that a picture of a critical value is.
 """
 
@@ -16,11 +17,23 @@ from numpy.typing import NDArray
 
 from apc.compiler.words import counted, in_hertz, known_digits, measured, with_unit, wrapped
 from apc.optional import need
-from apc.present.forms import MEANT, as_shown, document, note, notes, quantity, record, table
+from apc.present.forms import (
+    MEANT,
+    Lines,
+    Plain,
+    as_shown,
+    document,
+    notes,
+    quantity,
+    record,
+    sentences,
+    table,
+)
 
 if TYPE_CHECKING:
     import pandas
 
+    from apc.frame.settable import Parameters, Settable
     from apc.sweeps.sweep import Sweep
     from apc.vary.critical import Critical
     from apc.vary.crossing import Crossing
@@ -33,9 +46,13 @@ DIGITS = 3  # of a change
 
 NONE_TOLD = "what moves the radius most: no change of it can be told from rounding"
 
+HOW = (
+    '--set NAME="VALUE UNIT" sets one, in every command that analyses; words, as of a type, stand in the file'
+)
 
-def critical_text(found: Critical) -> str:
-    """Return where a scene's verdict changes with a parameter."""
+
+def critical_text(found: Critical) -> Lines:
+    """Yield where a scene's verdict changes with a parameter."""
     unit = found.unit
     now = quantity(found.present, unit)
     if found.groups:
@@ -46,30 +63,33 @@ def critical_text(found: Critical) -> str:
     if not said:
         wording = ("value scanned", "number looked at") if found.counted else ("", "")
         said = found.verdict.replace(*wording)
-    meant = [MEANT[found.criterion]] if found.criterion in MEANT else []
-    lines = wrapped(f"{found.topology}: {said}")
-    lines += [*notes([*meant, *found.left_out, f"{found.parameter} is now {now}"]), ""]
+    yield from wrapped(f"{found.topology}: {said}")
+    meant = MEANT.get(found.criterion, "")
+    yield from notes(meant, *found.left_out, f"{found.parameter} is now {now}")
+    yield ""
     if not found.enters:
-        return "\n".join(lines)
+        return
     if found.counted:
-        return "\n".join([*lines, *_count_lines(found)])
+        yield from _count_lines(found)
+        return
     for one in found.crossings:
         exact = f"{quantity(one.value, unit, 15)}, exact"
         by, shown = as_shown(one.value, unit)
         value = measured(one.value * by, one.error * by, shown) if one.error else exact
-        lines.append(f"  {value}")
+        yield f"  {value}"
         kind = "jump, " if one.kind == "jump" else ""
         turns = "" if math.isnan(one.frequency_hz) else f", {in_hertz(one.frequency_hz)}"
-        lines.append(f"    {kind}stable {one.stable_side} it{turns}, {one.proof}")
-    lines += [*[""] * bool(found.crossings), f"  scanned {_span(found.scanned, unit)}"]
-    lines.append(f"  {counted(found.looked, 'value')} looked at: two crossings near to each other could hide")
+        yield f"    {kind}stable {one.stable_side} it{turns}, {one.proof}"
+    if found.crossings:
+        yield ""
+    yield f"  scanned {_span(found.scanned, unit)}"
+    yield f"  {counted(found.looked, 'value')} looked at: two crossings near to each other could hide"
     if found.left_open:
         parts = ", ".join(_span(one, unit) for one in found.left_open[:SHOWN])
         rest = f" and {len(found.left_open) - SHOWN} more" if len(found.left_open) > SHOWN else ""
-        lines += wrapped(f"the verdict is left open {parts}{rest}", "  ", "  ")
+        yield from sentences(f"the verdict is left open {parts}{rest}")
     if not found.whole:
-        lines.append("  an eigenvalue keeps near to the boundary: more crossings could hide")
-    return "\n".join(lines)
+        yield "  an eigenvalue keeps near to the boundary: more crossings could hide"
 
 
 def _stable_ranges(found: Critical) -> str:
@@ -105,28 +125,31 @@ def _span(ends: tuple[float, float], unit: str) -> str:
     return f"from {quantity(ends[0], unit)} to {quantity(ends[1], unit)}"
 
 
-def _count_lines(found: Critical) -> list[str]:
-    """Return which numbers of peers are stable, and how many were looked at."""
+def _count_lines(found: Critical) -> Lines:
+    """Yield which numbers of peers are stable, and how many were looked at."""
     first, last = map(int, found.scanned)
-    rows, begin = [], first
-    for crossing in found.crossings:
-        end = math.floor(crossing.boundary)
-        rows.append((begin, end, crossing.stable_side == "below"))
-        begin = end + 1
-    if rows:
-        rows.append((begin, last, not rows[-1][-1]))
-    lines = []
-    for low, high, stable in rows:
-        name = f"{low:,d}" if low == high else f"{low:,d} to {high:,d}"
-        lines.append((name, "stable" if stable else "unstable"))
+    sides = [crossing.stable_side for crossing in found.crossings]
+    ends = [math.floor(crossing.boundary) for crossing in found.crossings]
+    lines = [
+        (f"{low:,d}" if low == high else f"{low:,d} to {high:,d}", "stable" if stable else "unstable")
+        for low, high, stable in zip(
+            [first, *(end + 1 for end in ends)],
+            [*ends, last],
+            [*(side == "below" for side in sides), sides[-1:] == ["above"]],
+            strict=True,
+        )
+        if sides
+    ]
+    if lines:
+        yield from table(lines)
+        yield ""
     looked = (
         f"every number from {first:,d} to {last:,d} was looked at"
         if found.looked == last - first + 1
         else f"{found.looked} numbers from {first:,d} to {last:,d} were looked at, those on either side of a "
         "change among them; a change and back between two could hide"
     )
-    listed = [*table(lines), ""] if lines else []
-    return [*listed, *wrapped(looked, "  ", "  ")]
+    yield from sentences(looked)
 
 
 def critical_picture(found: Critical, ax: Any) -> Any:
@@ -137,15 +160,16 @@ def critical_picture(found: Critical, ax: Any) -> Any:
     return locus_picture(root_locus(found.system, found), ax)
 
 
-def critical_document(found: Critical) -> dict[str, Any]:
+def critical_document(found: Critical) -> Plain:
     """Return where a scene's verdict changes with a parameter as plain data."""
     return record(found, {"groups": dict(found.groups)})
 
 
-def margins_text(found: Margins) -> str:
-    """Return the table of the margins, of at most 80 columns."""
+def margins_text(found: Margins) -> Lines:
+    """Yield the table of the margins, of at most 80 columns."""
     if not found.rows:
-        return "\n".join(note(f"margins {found.note}"))
+        yield from notes(f"margins {found.note}")
+        return
     width = max(len(one.parameter) for one in found.rows)
     ends = []
     for one in found.rows:
@@ -153,28 +177,26 @@ def margins_text(found: Margins) -> str:
         by, shown = as_shown(value, one.unit)
         ends.append("" if one.value is None else with_unit(known_digits(value * by, error * by, 7), shown))
     wide = max(16, *map(len, ends))
-    lines = [f"  {'may grow':<{width}}  from           {'to':<{wide}} times  at"]
+    yield f"  {'may grow':<{width}}  from           {'to':<{wide}} times  at"
     for one, end in zip(found.rows, ends, strict=True):
-        start = f"  {one.parameter:<{width}}  {quantity(one.present, one.unit, 5):<14}"
+        times = "–" if one.factor is None else f"{one.factor:.4g}"
+        at = in_hertz(math.nan if one.frequency_hz is None else one.frequency_hz)
+        told = f"{end:<{wide}} {times:>5}  {at}{', jump' if one.kind == 'jump' else ''}"
         if one.note:
-            lines.append(f"{start} not looked for: {one.note}")
+            told = f"not looked for: {one.note}"
         elif one.value is None:
-            lines.append(f"{start} none found up to {quantity(one.scanned, one.unit, 5)}")
-        else:
-            times = "–" if one.factor is None else f"{one.factor:.4g}"
-            at = in_hertz(math.nan if one.frequency_hz is None else one.frequency_hz)
-            jump = ", jump" if one.kind == "jump" else ""
-            lines.append(f"{start} {end:<{wide}} {times:>5}  {at}{jump}")
-    return "\n".join([*lines, *note(found.note)])
+            told = f"none found up to {quantity(one.scanned, one.unit, 5)}"
+        yield f"  {one.parameter:<{width}}  {quantity(one.present, one.unit, 5):<14} {told}"
+    yield from notes(found.note)
 
 
-def margins_document(found: Margins) -> dict[str, Any]:
+def margins_document(found: Margins) -> Plain:
     """Return the margins as plain data."""
     return {"margins": document(found.rows), "note": found.note}
 
 
-def sensitivities_text(found: Sensitivities) -> str:
-    """Return the table "what moves it most", of at most 80 columns."""
+def sensitivities_text(found: Sensitivities) -> Lines:
+    """Yield the table "what moves it most", of at most 80 columns."""
     # Eigenvalues that share the radius often change alike, and then one row tells it.
     same: dict[tuple[str, str, str], list[str]] = {}
     for row in found.rows:
@@ -184,12 +206,14 @@ def sensitivities_text(found: Sensitivities) -> str:
             same.setdefault(key, []).append(str(row.mode + 1))
     if not same:
         told = found.note if len(found.active) < 2 else ""
-        return "\n".join(note(told or NONE_TOLD))
+        yield from notes(told or NONE_TOLD)
+        return
     rows: list[tuple[str, ...]] = [("what moves it most", f"{'value':<15}", "per percent")]
     for (*cells, change), modes in list(same.items())[:SHOWN]:
         which = f"  mode {', '.join(modes)}" if len(modes) < len(found.active) else ""
         rows.append((*cells, change + which))
-    return "\n".join([*table(rows), *note(found.note)])
+    yield from table(rows)
+    yield from notes(found.note)
 
 
 def _change(value: float, error: float) -> str:
@@ -198,7 +222,7 @@ def _change(value: float, error: float) -> str:
     return f"{value:+.{min(max(known, 1), DIGITS) - 1}e}"
 
 
-def sensitivities_document(found: Sensitivities) -> dict[str, Any]:
+def sensitivities_document(found: Sensitivities) -> Plain:
     """Return the derivatives as plain data."""
     return {
         "spectral_radius": found.radius,
@@ -208,17 +232,16 @@ def sensitivities_document(found: Sensitivities) -> dict[str, Any]:
     }
 
 
-def analyses_text(found: Analyses) -> str:
-    """Return many analyses in a few lines: what varied, the verdicts."""
-    lines = [f"{found.topology}: {found.verdict.size:,} points"]
-    lines += notes(found.left_out)
+def analyses_text(found: Analyses) -> Lines:
+    """Yield many analyses in a few lines: what varied, the verdicts."""
+    yield f"{found.topology}: {found.verdict.size:,} points"
+    yield from notes(*found.left_out)
     for name, values in zip(found.parameters, found.values, strict=True):
-        lines.append(f"  {name}: {values.min():g} … {values.max():g}")
-    counts = (Counter(one.ravel().tolist()) for one in (found.verdict, found.message))
-    return "\n".join([*lines, *_verdict_lines(*counts)])
+        yield f"  {name}: {values.min():g} … {values.max():g}"
+    yield from _verdict_lines(*(Counter(one.ravel().tolist()) for one in (found.verdict, found.message)))
 
 
-def analyses_document(found: Analyses) -> dict[str, Any]:
+def analyses_document(found: Analyses) -> Plain:
     """Return many analyses as plain data, a list a column."""
     columns = {heading: column.tolist() for heading, column in _analyses_columns(found).items()}
     return {"topology": found.topology, "left_out": list(found.left_out), **document(columns)}
@@ -243,31 +266,28 @@ def _analyses_columns(found: Analyses) -> dict[str, NDArray[Any]]:
     return {heading: column.ravel() for heading, column in every.items()}
 
 
-def _verdict_lines(verdicts: Counter[str], messages: Counter[str]) -> list[str]:
-    """Return how many points have each verdict, and what most of those at fault say."""
-    counts = sorted(verdicts.items(), key=lambda item: (-item[1], item[0]))
-    lines = [f"  {count:>10,} × {verdict}" for verdict, count in counts]
+def _verdict_lines(verdicts: Counter[str], messages: Counter[str]) -> Lines:
+    """Yield how many points have each verdict, and what most of those at fault say."""
+    for verdict, count in sorted(verdicts.items(), key=lambda item: (-item[1], item[0])):
+        yield f"  {count:>10,} × {verdict}"
     said = Counter({text: count for text, count in messages.items() if text})
     for text, count in said.most_common(1):
-        lines += note(f"at {count:,} of them: {text}")
-    return lines
+        yield from notes(f"at {count:,} of them: {text}")
 
 
-def sweep_text(found: Sweep) -> str:
-    """Return a sweep in a few lines: where the rows are, what was swept, the verdicts."""
+def sweep_text(found: Sweep) -> Lines:
+    """Yield a sweep in a few lines: where the rows are, what was swept, the verdicts."""
     where = f" → {found.out}" if found.out else ""
-    lines = [f"{found.topology}: {found.points:,} points{where}"]
-    lines += notes(found.made_of["left_out"])
+    yield f"{found.topology}: {found.points:,} points{where}"
+    yield from notes(*found.made_of["left_out"])
     for axis in found.grid.axes:
-        ends = f"{float(axis.values[0]):g} … {float(axis.values[-1]):g}"
-        lines.append(
-            f"  {axis.free.label}: {with_unit(ends, axis.unit)}, {counted(len(axis.values), 'value')}"
-        )
-    lines += _verdict_lines(found.counts, found.messages)
-    return "\n".join([*lines, *(f"  note: {one}" for one in found.notes)])
+        ends = with_unit(f"{float(axis.values[0]):g} … {float(axis.values[-1]):g}", axis.unit)
+        yield f"  {axis.free.label}: {ends}, {counted(len(axis.values), 'value')}"
+    yield from _verdict_lines(found.counts, found.messages)
+    yield from (f"  note: {one}" for one in found.notes)
 
 
-def sweep_document(found: Sweep) -> dict[str, Any]:
+def sweep_document(found: Sweep) -> Plain:
     """Return what a sweep is and how it came out, without its rows, as plain data."""
     return {
         **found.made_of,
@@ -281,3 +301,30 @@ def sweep_document(found: Sweep) -> dict[str, Any]:
 def sweep_table(found: Sweep) -> pandas.DataFrame:
     """Return a sweep as a pandas table, with the headings as its columns."""
     return need("pandas", "data").DataFrame(dict(zip(found.headings, found.columns, strict=True)))
+
+
+def parameters_text(found: Parameters) -> Lines:
+    """Yield a line a number: name, value, limits, and what it is."""
+    yield f"{found.topology}: what may be set\n"
+    rows = [(one.name, _value(one), _limits(one), _told(one)) for one in found.rows]
+    yield from table([("name", "value", "limits", ""), *rows], later=6)
+    yield ""
+    yield from sentences(HOW)
+
+
+def _value(one: Settable) -> str:
+    if one.low == one.high:
+        return quantity(one.low, one.unit, 9)
+    return with_unit(f"{one.low:.4g} to {one.high:.4g}", one.unit)
+
+
+def _limits(one: Settable) -> str:
+    low = "" if one.minimum is None else f"{'>' if one.open_minimum else '≥'} {one.minimum:.9g}"
+    high = "" if one.maximum is None else f"≤ {one.maximum:.9g}"
+    return ", ".join(limit for limit in (low, high) if limit)
+
+
+def _told(one: Settable) -> str:
+    fixed = f"not to be set: {one.fixed}" if one.fixed else ""
+    follows = f"follows: {one.follows}" if one.follows else ""
+    return "; ".join(part for part in (one.about, follows, fixed) if part)

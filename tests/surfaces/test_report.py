@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import html
 import json
 import re
 import shutil
@@ -118,7 +119,7 @@ def test_sections_that_a_scene_cannot_fill_say_why(cli: Cli) -> None:
     why = {one.key: one.refused for one in report.scenes[0].sections if one.refused}
     assert why["region"] == "the scene has fewer than two stiffnesses, and says no studies: region:"
     assert why["network"] == "loss: there is no link"
-    text = report_page(report).replace("&#x27;", "'")
+    text = html.unescape(report_page(report))
     assert all(f"Not here: {reason}" in text for reason in why.values())
 
 
