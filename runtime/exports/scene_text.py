@@ -1,6 +1,6 @@
 """Several peers in one C text, and the packets between them; or one peer that hears from outside.
 
-Takes: what the peers of a scene do in a frame. Gives: `CScene`, `c_scene`, `one_peer`; `scene_source`;
+Takes: what the peers of a scene do in a frame. Gives: `CScene`, `c_scene`, `one_peer`; `shared`;
 `Variable`.
 Guarantees: time counts in whole quanta; of what happens at once all sends come first, then what is heard,
 then ticks, as everywhere; a value is looked at as it is just before an instant's ticks, as in a row of
@@ -33,7 +33,6 @@ from apc.exports.peer_step import (
     sites_of,
 )
 from apc.exports.pushed import FORCE_ON
-from apc.exports.texts import filled
 from apc.exports.words import identifier, unique
 from apc.network.channel import luck_key
 from apc.network.timetable import Luck, luck_of
@@ -217,17 +216,11 @@ def _links(plan: Plan, quantum: Fraction) -> tuple[Link, ...]:
     return tuple(found)
 
 
-def scene_source(scene: CScene) -> str:
-    """Return the text that plays a scene; the peers' codes are in texts of their own.
+def shared(scene: CScene) -> dict[str, Any]:
+    """Return what the template `scene.c` is of, the text that plays a scene beside the peers' own texts.
 
     It has `static void begin(model *m)` and `static void run(model *m, long long until)`, which goes until an
     instant has come and what is sent at it has gone out.
-    """
-    return filled("scene.c", **shared(scene))
-
-
-def shared(scene: CScene) -> dict[str, Any]:
-    """Return what the texts of a scene are of.
 
     Of each site there are its code, its peers' numbers, and the links that it has, with its line and where
     each entry of its packets is among the link's channels.

@@ -14,9 +14,11 @@ from __future__ import annotations
 import functools
 import json
 import math
+import textwrap
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
+from xml.sax.saxutils import quoteattr
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
@@ -37,7 +39,8 @@ def _templates() -> Environment:
         undefined=StrictUndefined,
         autoescape=False,  # no text of it is read by a browser
     )
-    made.filters.update(number=number, comment=comment, row=row, members=_members, json=json.dumps)
+    made.filters |= {"number": number, "comment": comment, "row": row, "members": _members}
+    made.filters |= {"attribute": quoteattr, "json": json.dumps, "fill": textwrap.fill, "quotable": quotable}
     return made
 
 
@@ -56,6 +59,11 @@ def comment(text: str) -> str:
     """Return a text that can stand in a comment of C."""
     shown = "".join(c if c.isascii() and c.isprintable() else "?" for c in text)
     return shown.replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?")
+
+
+def quotable(text: str) -> str:
+    """Return a text that can't end the text of Python it stands in."""
+    return text.replace("\\", "/").replace('"', "'")
 
 
 def _members(listed: str) -> str:
