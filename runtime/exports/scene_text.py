@@ -129,15 +129,19 @@ def _looked_at(peer: Peer, member: str, prefix: str) -> list[Variable]:
     """Return what can be looked at of a peer that a member of `model` is."""
     found = []
     for signal in peer.signals:
-        moving, given = signal.role == "state", signal.name.startswith(FORCE_ON)
+        moving = signal.role == "state"
         start = peer.start[signal.place[0]] if moving else 0.0
         own = f"{member}.{memory(peer, signal)}"
-        name = f"{FORCE_ON}{prefix}{signal.name.removeprefix(FORCE_ON)}" if given else prefix + signal.name
-        found.append(Variable(name, signal.unit, own, given=given, moving=moving, start=start))
-    units, names = parameter_units(peer), peer.kind.parameters
+        if not signal.name.startswith(FORCE_ON):
+            found.append(Variable(prefix + signal.name, signal.unit, own, moving=moving, start=start))
+    units = parameter_units(peer)
     for k, place in enumerate(peer.settable):
-        name, start = names[place], float(peer.parameters[place])
-        found.append(Variable(prefix + name, units[name], f"{member}.p[{k}]", fixed=True, start=start))
+        name, start, own = peer.kind.parameters[place], float(peer.parameters[place]), f"{member}.p[{k}]"
+        if name.startswith(FORCE_ON):
+            name = f"{FORCE_ON}{prefix}{name.removeprefix(FORCE_ON)}"
+            found.append(Variable(name, "N", own, given=True, start=start))
+        else:
+            found.append(Variable(prefix + name, units[name], own, fixed=True, start=start))
     return found
 
 
