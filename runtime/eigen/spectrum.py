@@ -434,7 +434,8 @@ def angles_in_frame(system: ClosedSystem, values: Complexes, vectors: Complexes,
     """Return by how much modes turn in a frame (k,), in radians, with whole turns; NaN if it can't be told.
 
     The eigenvalue knows the angle up to whole turns; these are counted on the continuous state that takes
-    most part. Where none does, as in what only packets carry, the angle is the eigenvalue's.
+    most part, or else on what is remembered. Where neither takes part, as in what only packets carry, the
+    angle is the eigenvalue's.
 
     Parameters
     ----------
@@ -446,9 +447,12 @@ def angles_in_frame(system: ClosedSystem, values: Complexes, vectors: Complexes,
     angles = np.angle(values)
     if not system.motion or not len(values):
         return angles
-    motion = np.array(system.motion)
+    motion, every = np.array(system.motion), np.arange(len(values))
     dominant = motion[np.argmax(shares[motion], axis=0)]
-    moving = shares[dominant, np.arange(len(values))] > LEAST_SHARE
+    own = np.setdiff1d(np.arange(len(shares)), list(system.layout.places.values()))
+    rest = own[np.argmax(shares[own], axis=0)]
+    dominant = np.where(shares[dominant, every] > LEAST_SHARE, dominant, rest)
+    moving = shares[dominant, every] > LEAST_SHARE
     if not system.sites:
         return np.where(moving, np.nan, angles)
     site_of = np.searchsorted(system.offsets, dominant, side="right") - 1
