@@ -15,9 +15,10 @@ from math import floor, isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from apc.compiler.words import counted, in_hertz, measured, wrapped
+from apc.compiler.words import counted, in_hertz, wrapped
 from apc.present.forms import (
     LINEARIZED,
+    NEAR,
     document,
     labelled,
     listed,
@@ -25,6 +26,7 @@ from apc.present.forms import (
     notes,
     picked,
     quantity,
+    radius_text,
     record,
     table,
 )
@@ -125,7 +127,7 @@ def analysis_text(result: Analysis) -> str:
         words += "\nWhat it does in time is played: apc simulate"
     if not result.states_per_peer:
         words = "Nothing here is free to move."
-    radius = measured(result.spectral_radius, result.spectral_radius_error)
+    radius = radius_text(result.spectral_radius, result.spectral_radius_error, result.beyond)
     facts = (
         ("spectral radius", f"{radius} per frame of {_time(result.frame_s)}"),
         ("peers", f"{result.peers}, {result.states_per_peer} states each"),
@@ -185,7 +187,7 @@ def answer_text(found: Answer) -> str:
 
 def _in_short(found: Analysis) -> list[str]:
     """Return the verdict of the nominal network, beside that of the network as it is."""
-    radius = measured(found.spectral_radius, found.spectral_radius_error)
+    radius = radius_text(found.spectral_radius, found.spectral_radius_error, found.beyond)
     text = (
         f"With every packet on time: {found.verdict}, spectral radius {radius} per frame of "
         f"{found.frame_s * 1000:.6g} ms (apc analyze --nominal says all of it)."
@@ -268,13 +270,15 @@ def _cells(mode: Mode) -> tuple[str, ...]:
         mode.shape,
         str(mode.multiplicity),
         in_hertz(mode.frequency_hz) if mode.frequency_hz else "–",
-        "–" if isnan(mode.damping_ratio) else f"{mode.damping_ratio:.3g}",
+        "–" if isnan(mode.damping_ratio) else f"{mode.damping_ratio + 0.0:.3g}",
         _leading(mode),
     )
 
 
 def _magnitude(mode: Mode) -> str:
     """Return a magnitude to six digits behind the point, fewer where its error leaves them open."""
+    if mode.error < abs(mode.magnitude - 1) < 10.0**-DECIMALS / 2:
+        return f"1 {'−' if mode.magnitude < 1 else '+'} {abs(mode.magnitude - 1):.0e}"
     if mode.magnitude >= LARGE:
         return f"{mode.magnitude:.6e}"
     known = -math.floor(math.log10(mode.error)) - 1 if 0 < mode.error < math.inf else DECIMALS
@@ -384,7 +388,8 @@ def contact_modes_text(found: ContactModes) -> str:
         if mode.refusal:
             rows.append(("–", "–", "not analysed", mode.name))
             continue
-        radius = measured(mode.spectral_radius, max(mode.spectral_radius_error, SHOWN))
+        error = max(mode.spectral_radius_error, SHOWN if abs(mode.spectral_radius - 1) > NEAR else 0.0)
+        radius = radius_text(mode.spectral_radius, error, mode.beyond)
         frequency = in_hertz(mode.frequency_hz) if mode.frequency_hz else "–"
         verdict = mode.verdict.partition(" up to ")[0].partition(":")[0]
         rows.append((radius, frequency, verdict + "*" * mode.linearized, mode.name))
@@ -445,7 +450,7 @@ def conventions_text(found: Conventions) -> str:
         headline = "the same verdict under every convention"
     lines = [f"{found.topology}: {headline}", ""]
     for number, one in enumerate(found.outcomes, 1):
-        radius = measured(one.spectral_radius, one.spectral_radius_error)
+        radius = radius_text(one.spectral_radius, one.spectral_radius_error, one.beyond)
         lines.append(f"  {number}  {one.verdict or 'not analysed'}")
         lines.append(f"     spectral radius {radius}" if one.verdict else f"     {one.refusal}")
         lines += [f"     {departure}" for departure in one.departures or (DEFAULT,)]

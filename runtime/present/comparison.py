@@ -16,7 +16,7 @@ import numpy as np
 
 from apc.compiler.words import counted, known_digits, measured, with_unit, wrapped
 from apc.present.comparison_picture import comparison_picture  # noqa: F401 -- looked up
-from apc.present.forms import MEANT, notes, picked, quantity, reached, record, table
+from apc.present.forms import MEANT, notes, picked, quantity, radius_text, reached, record, table
 from apc.tables import Column, Row
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ def _verdict(one: Scheme, feet: dict[str, int]) -> tuple[str, str]:
     told = list(_why(one, "verdict"))
     if one.network is not None and one.network.mean_square_radius is not None:
         root, error = math.sqrt(one.network.mean_square_radius), one.network.error or 0.0
-        grown = measured(root, error / (2 * root) if root else error)
+        grown = radius_text(root, error / (2 * root) if root else error)
         told.append(
             "the radius is that with every packet on time; "
             f"mean squares are multiplied by {grown} squared a frame"
@@ -102,7 +102,8 @@ def _verdict(one: Scheme, feet: dict[str, int]) -> tuple[str, str]:
     if one.passive is not None:
         told.append("the radius is that with free hands")
     verdict = one.verdict + (", linearized" if one.analysis.linearized else "")
-    radius = measured(one.analysis.spectral_radius, one.analysis.spectral_radius_error)
+    found = one.analysis
+    radius = radius_text(found.spectral_radius, found.spectral_radius_error, found.beyond)
     return verdict, _marked(radius, told, feet)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.words import known_digits, measured, wrapped
-from apc.present.forms import LINEARIZED, document, labelled, note, notes, record, table
+from apc.present.forms import LINEARIZED, document, labelled, note, notes, radius_text, record, table
 from apc.present.pictures import COLOURS, new_figure
 from apc.tables import Column, Row
 
@@ -42,7 +42,7 @@ def passive_text(found: PassiveHands) -> str:
             "Take the velocity by a backward difference of samples, as VirtualWall does, or none (damping 0)."
         )
     lines += [line for text in told for line in wrapped(text, "  ", "  ")]
-    clamped = measured(found.clamped_radius, found.clamped_error)
+    clamped = radius_text(found.clamped_radius, found.clamped_error)
     moves = f"spectral radius {clamped}" if found.clamped_radius or found.clamped_error else "nothing moves"
     lines += ["", *labelled("devices clamped", moves)]
     lines += labelled("proof", found.proof) if found.proof else []

@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-from apc.compiler.words import measured, wrapped
-from apc.present.forms import LINEARIZED, labelled, notes, record
+from apc.compiler.words import wrapped
+from apc.present.forms import LINEARIZED, labelled, notes, radius_text, record
 
 if TYPE_CHECKING:
     from apc.moments.network import NetworkVerdict
@@ -33,9 +33,9 @@ def network_text(found: NetworkVerdict) -> str:
     if radius is not None:
         lines += [*wrapped(_WORDS[found.verdict.removeprefix("probably ")], "  ", "  "), ""]
         error, root = found.error or 0.0, math.sqrt(radius)
-        rooted = measured(root, error / (2 * root) if root else error)
+        rooted = radius_text(root, error / (2 * root) if root else error)
         facts = [
-            ("mean squares", f"multiplied by {measured(radius, error)} a frame"),
+            ("mean squares", f"multiplied by {radius_text(radius, error)} a frame"),
             ("their root", f"{rooted}, to compare with a spectral radius"),
         ]
     if found.rms_error_m is not None:
