@@ -91,6 +91,7 @@ def tune_command(
     from apc.frame.devices import FREE
     from apc.inputs import open_scene
     from apc.present.pictures import write_picture
+    from apc.present.tune import panels_of
     from apc.tuning.demands import held_as_studied, read_against, read_demands, read_seconds
     from apc.tuning.front import front
     from apc.tuning.tune import tune
@@ -116,6 +117,8 @@ def tune_command(
         over=over,
         criterion=criterion,
     )
+    if plot is not None and not against:  # what can't be drawn is refused before the search
+        panels_of(system, len(demands.free))
     if against:
         with status_line() as told:
             weighed = front(system, demands, read_against(against), seconds=read_seconds(time), told=told)
