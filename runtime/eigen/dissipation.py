@@ -77,7 +77,15 @@ def peak_gain(a: Floats, b: Floats, c: Floats, d: Floats) -> tuple[float, float]
 
 
 def gains_at(a: Floats, b: Floats, c: Floats, d: Floats, angles: Floats) -> Floats:
-    """Return ‖C (e^{jθ} − A)⁻¹ B + D‖₂ at angles θ (k,)."""
+    """Return ‖C (e^{jθ} − A)⁻¹ B + D‖₂ at some angles.
+
+    Parameters
+    ----------
+    a, b, c, d
+        The loop's matrices.
+    angles
+        θ (k,), in rad.
+    """
     return np.asarray(np.linalg.svd(_response(a, b, c, d, angles), compute_uv=False)[:, 0])
 
 

@@ -239,8 +239,16 @@ class Limits:
     ) -> Floats:
         """Return how far points (k, m + b) are from the demands on what is felt, and the level (k, q).
 
-        With `bounded` they are so far at least, with what rounding leaves open of what is felt. Where a gain
-        is the largest over all frequencies, a `view` takes it at one.
+        Parameters
+        ----------
+        setting
+            The number of peers and the delay.
+        points
+            The columns and the box (k, m + b).
+        bounded
+            Whether they are so far at least, with what rounding leaves open of what is felt.
+        view
+            One of `views`, which takes the largest gain at one frequency; without it, at all.
         """
         demands = view or self.demands
         aim = demands.aim
