@@ -26,6 +26,7 @@ _DIGITS = 18
 _WIDE = Context(prec=1500)
 _UP = Context(prec=1, rounding=ROUND_UP)
 
+_WORD = re.compile(r"\S*\(-?[\d.]+ [^\s()]+\)\S*|\S+")  # a quantity in parentheses stays whole: sent(-8 ms)
 _PIECE = re.compile(r"[^*/(,]+[*/(,]*|[*/(,]+")  # of a word, broken behind an operator
 
 
@@ -118,7 +119,7 @@ def wrapped(text: str, first: str = "", later: str = "") -> list[str]:
     """
     lines: list[str] = []
     line, between = first, ""
-    for word in text.split():
+    for word in _WORD.findall(text):
         whole = len(later) + len(word) <= WIDTH
         for piece in [word] if whole else _PIECE.findall(word):
             if line.strip() and len(line) + len(between) + len(piece) > WIDTH:

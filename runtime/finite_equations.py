@@ -1,21 +1,26 @@
 """Equations without a finite value, told as the user's mistake they are.
 
-Takes: a block of code that evaluates a scene's equations. Gives: `finite_equations`.
+Takes: a block of code that evaluates a scene's equations. Gives: `finite_equations`, `at_its_part`.
 Guarantees: a division by zero, a logarithm of a negative number or a loop that Newton's method does not solve
 becomes one `ApcError`; a mistake of numbers that know no scene is placed in this one; every other exception
 passes.
-Does not: find out which equation it was.
+Does not: find out which equation it was; a value that has a name leads to its part.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.source.nodes import Mapping
+from apc.compiler.source.source import parse_source
 
 SOMEWHERE = Place("the scene")  # of a mistake in numbers by themselves
+
+_PART = re.compile(r"(?:^|\bder\(|\bslope of )(\w+)[.\[]")  # of what is not finite
 
 # What Python's math module and CasADi's Newton solver say of a point where a function has no value.
 _NO_VALUE = ("math domain error", "rootfinder", "Evaluation failed", "Newton", "cannot convert NaN")
@@ -47,6 +52,28 @@ def finite_equations(scene: str) -> Iterator[None]:
         if any(words in str(error) for words in _NO_VALUE):
             raise _mistake(scene) from error
         raise
+
+
+def at_its_part(mistake: Mistake, topology: str, texts: Iterable[tuple[str, bytes]]) -> Mistake:
+    """Return a mistake of a value that is not finite where the topology names the part of it.
+
+    Parameters
+    ----------
+    mistake
+        The mistake; of another code it stays as it is.
+    topology, texts
+        The file of the topology, and the texts of a scene by their files.
+    """
+    text, part = dict(texts).get(topology), _PART.search(mistake.what)
+    if mistake.code != "E808" or part is None or text is None:
+        return mistake
+    root = parse_source(text, file=topology).root
+    for section in ("masses", "couplers", "hands", "links"):
+        node = root.get(section) if isinstance(root, Mapping) else None
+        for key, _ in node.entries if isinstance(node, Mapping) else ():
+            if key.text == part[1]:
+                return replace(mistake, place=key.place)
+    return replace(mistake, place=Place(topology))
 
 
 def _mistake(scene: str) -> ApcError:

@@ -274,7 +274,9 @@ def read_free(node: Node, what: str, others: Collection[str]) -> Binding:
     return Binding(parsed.value, None, parsed.unit.dimension, node.place)
 
 
-def resolve_in_order(waiting: Mapping[str, Binding], peers: int, mistakes: Mistakes) -> dict[str, Value]:
+def resolve_in_order(
+    waiting: Mapping[str, Binding], peers: int | None, mistakes: Mistakes
+) -> dict[str, Value]:
     """Settle named numbers that depend on each other, in the order in which they can be known.
 
     Parameters
@@ -282,7 +284,7 @@ def resolve_in_order(waiting: Mapping[str, Binding], peers: int, mistakes: Mista
     waiting
         The numbers as written, by name.
     peers
-        What the name `peers` stands for.
+        What the name `peers` stands for; None where that was reported as faulty.
     mistakes
         Takes E206 a name that isn't known, E209 a circle, and those of evaluating.
 
@@ -302,9 +304,11 @@ def resolve_in_order(waiting: Mapping[str, Binding], peers: int, mistakes: Mista
         chain = [*chain[first:], *chain[:first], chain[first]]
         mistakes.add("E209", waiting[chain[0]].place, f"parameters depend in a circle: {' → '.join(chain)}")
         return {}
-    settled = {"peers": Value(Fraction(peers), DIMENSIONLESS, None, Place(""))}
+    settled = {"peers": Value(Fraction(peers or 0), DIMENSIONLESS, None, Place(""))}
+    if peers is None:
+        settled.clear()
     for name in order:
-        if name in waiting and needs[name] & waiting.keys() <= settled.keys():
+        if name in waiting and needs[name] & {*waiting, "peers"} <= settled.keys():
             with mistakes:
                 settled[name] = _settled(name, waiting[name], settled)
     return {name: settled[name] for name in waiting if name in settled}

@@ -81,6 +81,8 @@ def read_graph(node: Node, numbers: NamedNumbers) -> Graph:
         items = pairs.items
     else:
         raise fault("E203", pairs.place, key, "a list of pairs or a .csv file", form(pairs), f"{key}: {hint}")
+    if "peers" in numbers.faulty:
+        raise AlreadyReportedError
     numbered = _peers(numbers.counts)
     found: dict[tuple[int, int], float] = {}
     for pair in items:

@@ -36,7 +36,9 @@ from apc.compiler.source.reading import Body, brief, fault, name_of
 _WORD = re.compile(r"[A-Za-z]\w*", re.ASCII)
 
 
-def read_named_numbers(root: Body, counts: Mapping[str, int], files: NamedFiles) -> NamedNumbers:
+def read_named_numbers(
+    root: Body, counts: Mapping[str, int], files: NamedFiles, *, complete: bool = True
+) -> NamedNumbers:
     """Read `parameters: {kt: 2000 N/m}`.
 
     Parameters
@@ -47,16 +49,18 @@ def read_named_numbers(root: Body, counts: Mapping[str, int], files: NamedFiles)
         How many peers each group has; the name `peers` stands for their sum.
     files
         Reads the topology's files, and takes mistakes.
+    complete
+        Whether every group's count is known; else what follows from `peers` adds no message.
     """
     waiting: dict[str, Binding] = {}
     section = root.section("parameters", "{kt: 2000 N/m}")
-    others = {key.text for key, _ in section}.union(PEERS)
+    others = {key.text for key, _ in section} | {"peers"}
     for key, value in section:
         with files.mistakes:
             name = name_of(key, "a parameter", words=RESERVED)
             waiting[name] = read_free(value, name, others)
-    values = resolve_in_order(waiting, sum(counts.values()), files.mistakes)
-    faulty = {key.text for key, _ in section} - values.keys()
+    values = resolve_in_order(waiting, sum(counts.values()) if complete else None, files.mistakes)
+    faulty = {key.text for key, _ in section} - values.keys() | (set() if complete else {"peers"})
     return NamedNumbers(values, faulty, counts, files)
 
 

@@ -111,7 +111,13 @@ def readable_library(folder: Path, text: str, place: Place, hint: str = "library
     try:
         files_below(folder, SUFFIX)
     except RefusedError as refused:
-        what, hint = f"the library folder {brief(text)} {refused.words}", hint * (refused.why == "large")
+        what, form = f"the library folder {brief(text)} {refused.words}", hint.rpartition(" ")[0]
+        hint *= refused.why == "large"
+        if refused.why == "missing" and folder.is_file():
+            what = f"the library {brief(text)} is a file, and a library is a folder"
+            hint = f"{form} {text.rpartition('/')[0] or '.'}"
+        elif refused.why == "missing" and folder != Path(text):
+            what += f": {folder} was looked for, as paths begin beside the topology"
         raise fault("E214", place, what, hint=hint) from None
     return folder
 
@@ -135,9 +141,11 @@ def build_scene(source: Source, library: Library) -> Scene:
             what = "the topology has no name" if key == "topology" else f"the topology has no {key} section"
             mistakes.add("E201", root.place, what, hint=f"{key}: {example}")
     bodies = read_counts(root, files)
-    counts = {name: group.count for name, group in bodies.items()}
+    named = [key.text for key, _ in root.section("peers", "{user: {count: 3}}")]
+    complete = len(bodies) == len(named)  # a group whose count is at fault is named all the same
+    counts = {name: bodies[name].count if name in bodies else 2 for name in (*bodies, *named)}
     mistakes.names = tuple(counts)
-    numbers = read_named_numbers(root, counts, files)
+    numbers = read_named_numbers(root, counts, files, complete=complete)
     clocks = read_clocks(root, numbers, {*numbers.values, *counts})
     sections = Parts(library, mistakes, {*numbers.values, *counts, *clocks})
     for section in SECTIONS:

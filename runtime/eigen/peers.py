@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.weights import exact_weight
+from apc.finite_equations import at_its_part
 from apc.frame.exact import evaluate_exact
 from apc.frame.exchange import Exchange, check_mean
 from apc.frame.jacobians import SiteJacobians, edge_name
@@ -455,12 +456,16 @@ def peer_groups(
     ------
     ApcError
         E801 a mean, maximum or minimum over nobody, E802 a mean whose weights add up to 0, E803 a maximum or
-        minimum that is not smooth at the start, E804 more different peers than one system can hold.
+        minimum that is not smooth at the start, E804 more different peers than one system can hold, E808 a
+        value that is not finite.
     """
     used = [jacobians[group.kind] for group in system.groups]
-    if all(site.parameters_suffice for site in used):
-        return _by_matrices(system, jacobians, schedules, numbers, exchange)
-    return _by_start(system, jacobians, schedules, numbers, exchange)
+    group = _by_matrices if all(site.parameters_suffice for site in used) else _by_start
+    try:
+        return group(system, jacobians, schedules, numbers, exchange)
+    except ApcError as error:
+        where = system.origin.topology, system.origin.texts
+        raise ApcError(at_its_part(one, *where) for one in error.mistakes) from None
 
 
 def _by_matrices(
