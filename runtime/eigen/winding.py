@@ -4,7 +4,7 @@ Takes: functions bounded in discs; circles; matrices that change little within d
 Gives: `Ball`, `Bounded`, `wind`, `determinant_ball`; `FIRST_ARCS`.
 Guarantees: a count is right: no zero is missed between samples; None says that no cover was found, as when a
 zero lies on the circle.
-Does not: know whose function it is (see `bordered`, `large.characteristic`).
+Does not: know whose function it is (see `large.characteristic`).
 
 Each arc of the circle lies in a disc about its middle, and within the disc the function differs from its
 value at the middle, f₀, by less than |f₀|: it has no zero there, and its argument keeps within ±π/2 of that

@@ -21,8 +21,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.bordered import wires_of
-from apc.eigen.closing import Coupling
+from apc.eigen.closing import Coupling, bounded_weight
 from apc.eigen.peers import PeerGroup
 from apc.frame.exchange import Exchange, check_mean
 from apc.frame.schedule import Heard, Schedule, Sent, Way
@@ -153,8 +152,40 @@ def of_loop(
             )
         )
     transfer = transfer_of([one.sites for one in members], n_s, n_r)
-    return characteristic_of(transfer, *wires_of(groups, coupling, doubts)), tuple(members)
+    return characteristic_of(transfer, *_wires_of(groups, coupling, doubts)), tuple(members)
 
 
 def _site_of(group: PeerGroup, _: int) -> LinearSite:
     return group.site
+
+
+def _wires_of(
+    sites: Sequence[PeerGroup], coupling: Coupling, doubts: Mapping[Way, float]
+) -> tuple[tuple[int, ...], Floats, Floats]:
+    """Return how what the sites of a loop send comes back to them, r = Σ_l W_l ζ^(−l) s.
+
+    Parameters
+    ----------
+    sites
+        The K sites.
+    coupling
+        What each hears of each, W (K, K) by way.
+    doubts
+        By how much each entry of a way's W may be off, where it isn't exact.
+
+    Returns
+    -------
+    The lags l, the weights W_l (l, n_r, n_s), and what these may be off by.
+    """
+    sent_starts = np.cumsum([0, *(len(group.schedule.sent) for group in sites)])
+    heard_starts = np.cumsum([0, *(len(group.schedule.heard) for group in sites)])
+    lags = sorted({heard.lag for group in sites for heard in group.schedule.heard})
+    weights = np.zeros((2, len(lags), int(heard_starts[-1]), int(sent_starts[-1])))
+    for g, group in enumerate(sites):
+        for line, heard in enumerate(group.schedule.heard):
+            for h, sender in enumerate(sites):
+                if heard.sent in sender.schedule.sent:
+                    row = sent_starts[h] + sender.schedule.sent.index(heard.sent)
+                    known = bounded_weight(coupling[heard.way][g][h], doubts.get(heard.way, 0.0))
+                    weights[:, lags.index(heard.lag), heard_starts[g] + line, row] = known
+    return tuple(lags), *weights

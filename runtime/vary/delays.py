@@ -8,7 +8,7 @@ Guarantees: pieces join on without a gap; events coincide at the values between 
 Does not: vary periods or phases: another period is another frame.
 
 Within a piece the schedule stays and its steps' durations are linear in the delay. (Over a link nothing
-changes within a piece at all, as a packet is read at ticks only: see `lags`.)
+changes within a piece at all, as a packet is read at ticks only.)
 """
 
 from __future__ import annotations

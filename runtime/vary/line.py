@@ -23,6 +23,7 @@ from apc.compiler.errors import ApcError, Place
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.eigenpairs import eigenvalues
 from apc.eigen.modes import split
+from apc.eigen.rigid import rigid_modes_here
 from apc.eigen.spectrum import DRIFTS, Spectrum, solve_spectrum
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
@@ -36,7 +37,6 @@ from apc.vary.delays import (
     delay_pieces,
     system_with_delay,
 )
-from apc.vary.lags import LateStretch, late_stretches
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -59,6 +59,10 @@ BESIDE = Fraction(1, 10**6)
 EVENTS = "events coincide there"
 BETWEEN = "analysed on either side; the verdict between them is left open"
 JUDGED = "both judged"
+
+# A spectral radius nearer to 1 than this in floats, in which a double eigenvalue is off by the root of their
+# rounding, is looked at again by an analysis.
+NEAR = 1e-6
 
 # Counts from the lowest on are each looked at, so many of them; then each is so many times the one before.
 EVERY, FURTHER = 32, 1.25
@@ -86,11 +90,6 @@ def _verdict(found: Spectrum | Analysis, stable: bool | None) -> Verdict:
 def sided(stable: bool | None) -> Verdict:
     """Return a verdict of which only the side is known."""
     return Verdict(stable, 0.5 if stable else 2.0, 0.0, (), "")
-
-
-def _inside(stretch: Piece | LateStretch) -> Fraction:
-    """Return a value within a stretch at which nothing coincides by accident."""
-    return stretch.low + INSIDE * (stretch.high - stretch.low)
 
 
 def spread(bottom: float, top: float, scale: float) -> Floats:
@@ -244,13 +243,15 @@ class AnalysedLine(OneStretch, _JudgedLine):
 class DelayLine(_JudgedLine):
     """A delay from `low` to `high`: between two coincidences of events what decides is continuous.
 
-    What happens exactly at `low` is a stretch of its own: events may coincide there.
+    What happens exactly at `low` is a stretch of its own: events may coincide there. `rigid` are the numbers
+    of rigid motions of each closed system, which no delay changes, by how many systems there are.
     """
 
     prepared: Prepared
     low: Fraction
     high: Fraction
     told: Callable[[Fraction], None] | None = None
+    rigid: dict[int, list[int]] = field(default_factory=dict)
 
     def _verdict(self, value: Fraction) -> Verdict:
         return analysed(system_with_delay(self.system, self.free, value), self.prepared)
@@ -263,43 +264,55 @@ class DelayLine(_JudgedLine):
     def stretches(self) -> Iterator[Stretch]:
         """Yield the value at which the line begins, then the stretches from one coincidence to the next."""
         yield self._constant(self.low, self.low, self.low)
-        late = self._late()
-        if late is not None:
-            for place, one in enumerate(late):
-                # A count in floats is believed where its neighbours agree; else an analysis decides.
-                sides = {other.stable for other in late[max(place - 1, 0) : place + 2]}
-                self._tell(one.high)
-                counted = one.stable if len(sides) == 1 else None
-                yield self._constant(one.low, one.high, _inside(one), counted=counted)
-            return
         for piece in delay_pieces(
             self.system, self.free, self.low, self.prepared, place=PLACE, high=self.high
         ):
             self._tell(piece.high)
             if piece.evaluator is None:
-                yield self._constant(piece.low, piece.high, _inside(piece))
+                inside = piece.low + INSIDE * (piece.high - piece.low)
+                yield self._constant(piece.low, piece.high, inside, piece.inside)
             else:
                 yield self._moving(piece, piece.evaluator)
-
-    def _late(self) -> Sequence[LateStretch] | None:
-        """Return, of a delay of packets only, whether each stretch is stable; else None."""
-        following = borders(self.system, self.free, place=PLACE)
-        return late_stretches(self.system, self.free, self.low, self.high, self.prepared, following)
 
     def _tell(self, high: Fraction) -> None:
         if self.told:
             self.told(min(high, self.high))
 
     def _constant(
-        self, low: Fraction, high: Fraction, inside: Fraction, *, counted: bool | None = None
+        self, low: Fraction, high: Fraction, inside: Fraction, there: CompiledSystem | None = None
     ) -> Stretch:
-        """Return a stretch within which nothing depends on the delay: one value stands for all."""
+        """Return a stretch within which nothing depends on the delay: the scene at a value stands for all."""
+        there = there or system_with_delay(self.system, self.free, inside)
+        point, high = np.array([float(low)]), min(high, self.high)
 
         def judge(_: Fraction) -> Verdict:
-            return self.judge(inside) if counted is None else sided(counted)
+            return self.judge(inside)
 
-        point, high = np.array([float(low)]), min(high, self.high)
-        return Stretch(low, high, point, float(high - low), partial(_one_by_one, judge), judge)
+        def look(_: Floats) -> tuple[Complexes, Complexes]:
+            radius = self._radius(there)
+            if abs(radius - 1) <= NEAR:
+                return _one_by_one(judge, point)
+            return np.array([[radius]], np.complex128), np.full((1, 1), np.nan, np.complex128)
+
+        return Stretch(low, high, point, float(high - low), look, judge)
+
+    def _radius(self, there: CompiledSystem) -> float:
+        """Return the spectral radius of the scene at a delay in floats, 1 where there is no matrix.
+
+        As many eigenvalues as are rigid, those nearest to 1, are left out.
+        """
+        try:
+            systems = split(*lifted_groups(there, prepared=self.prepared))
+        except ApcError:  # an analysis spares a matrix that is too large
+            return 1.0
+        if len(systems) not in self.rigid:
+            self.rigid[len(systems)] = [len(rigid_modes_here(one).names) for one in systems]
+        largest = 0.0
+        for one, count in zip(systems, self.rigid[len(systems)], strict=True):
+            values = np.linalg.eigvals(one.matrix)
+            moving = np.argsort(np.abs(values - 1))[count:]
+            largest = max(largest, float(np.abs(values[moving]).max(initial=0.0)))
+        return largest
 
     def _moving(self, piece: Piece, family: BatchEvaluator) -> Stretch:
         """Return a stretch in which events move with the delay."""
