@@ -87,7 +87,8 @@ def hard_text(found: HardReport) -> Lines:
     rows = [("scene", "error", "bound", "bound÷error", "time", "verdict")]
     for case in found.cases:
         loose = f"{case.looseness:.2g}" if math.isfinite(case.looseness) else NOTHING
-        mark = "FAILED" if case.failed else _short(case.verdict)
+        verdict = case.verdict.replace("stable up to a common translation", "stable*").partition(":")[0]
+        mark = "FAILED" if case.failed else verdict
         rows.append((case.name, _size(case.error), _size(case.bound), loose, _time(case.seconds), mark))
     yield from table(rows, "<>>>><")
     yield ""
@@ -103,11 +104,6 @@ def hard_text(found: HardReport) -> Lines:
         yield from notes(f"{scenes}; {undecided} left open, {unbounded} without a bound")
     else:
         yield from notes("every bound holds; every verdict is right")
-
-
-def _short(verdict: str) -> str:
-    words = {"stable up to a common translation": "stable*"}
-    return words.get(verdict, verdict.partition(":")[0])
 
 
 def scale_text(found: Scale) -> Lines:
