@@ -57,9 +57,9 @@ def show_command(
     if out is not None and out.suffix.lower() in PICTURES:
         from apc.compiler.view.listing import diagram_of
         from apc.present.graph import graph_picture
-        from apc.present.pictures import check_format, write_figure
+        from apc.present.pictures import check_picture, write_figure
 
-        check_format(out, "--out")
+        check_picture(out, "--out")
         write_figure(graph_picture(diagram_of(path)), out)
         tell(f"{out} is written", err=beside(out))
         return
