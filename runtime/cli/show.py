@@ -52,7 +52,7 @@ def show_command(
     if parameters:
         _show_parameters(file, wanted, out)
         return
-    path = Path(file) if file else find_input(compiled_too=False)
+    path = find_input(file, compiled_too=False)
     check_topology_outputs(path, {"--out": out})
     if out is not None and out.suffix.lower() in PICTURES:
         from apc.compiler.view.listing import diagram_of
