@@ -1,8 +1,8 @@
 """The words of messages and reports: numbers with their nouns and units, and lines that fit a terminal.
 
 Takes: numbers and texts.
-Gives: `WIDTH`, `cut`, `enumerated`, `counted`, `measured`, `known_digits`, `with_unit`, `in_hertz`,
-`time_left`, `wrapped`, `beside`.
+Gives: `WIDTH`, `cut`, `enumerated`, `counted`, `measured`, `known_digits`, `no_more`, `with_unit`,
+`in_hertz`, `time_left`, `wrapped`, `beside`.
 Guarantees: no digit is shown that its number's error leaves open; a line is at most `WIDTH` columns wide, but
 for a word that has no place to break it at.
 Does not: know what is told, or print.
@@ -14,7 +14,8 @@ import itertools
 import math
 import re
 from collections.abc import Sequence
-from decimal import ROUND_UP, Context, Decimal
+from decimal import ROUND_FLOOR, ROUND_UP, Context, Decimal
+from fractions import Fraction
 
 WIDTH = 80  # columns of a terminal as it opens
 
@@ -75,6 +76,12 @@ def known_digits(value: float, error: float, most: int) -> str:
         return f"{value:.{most}g}"
     digits = Decimal(value).adjusted() - Decimal(error).adjusted() if error else most
     return f"{value:.{min(max(digits, 1), most)}g}"
+
+
+def no_more(value: float | Fraction, digits: int = 6) -> str:
+    """Return a number to so many digits, none of them rounded up: what is proposed is then within a limit."""
+    down = Context(prec=digits, rounding=ROUND_FLOOR)
+    return f"{float(down.divide(*map(Decimal, Fraction(value).as_integer_ratio()))):.{digits}g}"
 
 
 def time_left(seconds: float, done: float, of: float) -> str:

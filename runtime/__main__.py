@@ -17,6 +17,8 @@ from contextlib import suppress
 # Every file a command reads or writes has its own message; these can only come from the terminal or a pipe.
 OUTPUT_ERRORS = (errno.ENOSPC, errno.EIO, errno.EDQUOT, errno.EFBIG)
 
+# Columns that lines are wrapped to on a narrower terminal, where nothing could be read otherwise.
+NARROWEST = 40
 
 # Objects made between two searches for garbage. The 50,000 to 100,000 that imports make all stay: Python's
 # own 700 has them looked through again and again, for a tenth of a short command's time.
@@ -61,11 +63,11 @@ def run(arguments: list[str]) -> int:
         sys.stdout.flush()
     except ApcError as error:
         for mistake in error.mistakes:
-            click.echo(str(mistake), err=True)
+            click.echo(_fitting(str(mistake)), err=True)
         return 1
     except click.ClickException as error:
         error.show(shown := io.StringIO())
-        click.echo(visible(shown.getvalue()), err=True, nl=False)
+        click.echo(_fitting(visible(shown.getvalue())), err=True, nl=False)
         return 2
     except (click.Abort, KeyboardInterrupt):
         click.echo("stopped", err=True)
@@ -90,6 +92,26 @@ def run(arguments: list[str]) -> int:
         click.echo(str(lacking(" ".join(["apc", *arguments[:1]]))), err=True)
         return 1
     return 0
+
+
+def _fitting(text: str) -> str:
+    """Return a text whose lines fit the terminal; into a pipe or file each stays one line.
+
+    What stands further in, a line of the source with its caret, stays as it is.
+    """
+    if not sys.stderr.isatty():
+        return text
+    import shutil
+    import textwrap
+
+    fit = textwrap.TextWrapper(
+        max(shutil.get_terminal_size().columns, NARROWEST),
+        subsequent_indent="  ",
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    lines = text.split("\n")
+    return "\n".join(line if line.startswith("    ") else fit.fill(line) for line in lines)
 
 
 def _silence_stdout() -> None:

@@ -639,8 +639,9 @@ def tune(
     free
         Ranges of the gains by name: {"coordination.stiffness": "10 N/m:5000 N/m"} or, in SI, (10, 5000).
     maximize, minimize
-        One of them: a gain, what hands feel ("feel.error at 1 Hz", "feel.damping", "feel.error_h2"), or a
-        weighted sum of these in SI; "spectral_radius" and "settling_time" may be small, too.
+        One of them: a gain, what hands feel ("feel.error at 1 Hz", "feel.damping", "feel.error_h2",
+        "feel.error_hinf"), or a weighted sum of these in SI; "spectral_radius" and "settling_time" may be
+        small, too.
     subject
         Demands beside stability, such as "decay=60 dB in 2 s".
     over
@@ -689,7 +690,7 @@ def front(
     model, free, maximize, minimize, subject, over, criterion, set
         As for `tune`.
     against
-        What is felt: "feel.impedance at 5 Hz", or transmitted, error, damping, error_h2.
+        What is felt: "feel.impedance at 5 Hz", or transmitted, error, damping, error_h2, error_hinf.
     points
         How many bounds, from the least that is felt to what the best of the aim is felt like.
     seconds

@@ -57,7 +57,7 @@ def with_last_unit(texts: Sequence[str]) -> list[str]:
 
 
 def option_values(
-    label: str, unit: str, texts: Sequence[str], place: Place, *, between: str = ":"
+    label: str, unit: str, texts: Sequence[str], place: Place, *, between: str = ":", rest: str = ""
 ) -> tuple[Fraction, ...]:
     """Read quantities in SI; one without a unit takes that of the last.
 
@@ -69,25 +69,31 @@ def option_values(
         As they were given.
     place
         Where.
-    between
-        What stands between two of them.
+    between, rest
+        What stands between two of them, and what behind the last, for the words to write.
 
     Raises
     ------
     ApcError
-        Those of `units.quantity`, with what is to be written in the place of one, or of all.
+        Those of `units.quantity`, with what is to be written in the place of all.
     """
     from apc.compiler.language.units import quantity
 
     if unit != "1" and all(_NUMBER.fullmatch(text) for text in texts):
-        hint = f"{label}={between.join(f'{text.strip()} {unit}' for text in texts)}"
+        hint = f"{label}={between.join(f'{text.strip()} {unit}' for text in texts)}{rest}"
         got = f"{between.join(texts)} (no unit)"
         raise ApcError(Mistake("E204", place, label, unit, got[:80], hint))
-    try:
-        return tuple(
-            Fraction(quantity(text, place, what=label, unit=unit).value) for text in with_last_unit(texts)
-        )
-    except ApcError as error:
-        # A hint of a key and its value is no range: what is to be written differently is the value.
-        mistakes = [replace(one, hint=one.hint.removeprefix(f"{label}: ")) for one in error.mistakes]
-        raise ApcError(mistakes) from None
+    values: list[Fraction] = []
+    mistakes: list[Mistake] = []
+    right: list[str] = []  # what is to be written of each
+    for text in with_last_unit(texts):
+        try:
+            values.append(Fraction(quantity(text, place, what=label, unit=unit).value))
+            right.append(text)
+        except ApcError as error:
+            mistakes += error.mistakes
+            right.append(error.mistakes[0].hint.partition(", or ")[0].removeprefix(f"{label}: "))
+    if mistakes:
+        hint = f"{label}={between.join(right)}{rest}" if all(right) else ""
+        raise ApcError(replace(mistakes[0], hint=hint))
+    return tuple(values)

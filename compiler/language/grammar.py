@@ -11,6 +11,7 @@ The grammar is expression.lark; Lark reads it.
 from __future__ import annotations
 
 import contextlib
+import re
 import unicodedata
 from collections.abc import Callable
 from dataclasses import replace
@@ -185,7 +186,11 @@ def _refuse_token(text: str, fault: UnexpectedToken) -> NoReturn:
         said = text[number.start_pos : token.end_pos]
         if not text[number.end_pos : token.start_pos].strip(" "):
             what = f"{cut(said)} is not a number, and units stand on parameters only"
-            hint = f"a parameter, with default: {number} {token}; of a name, {number}*name"
+            factors = re.match(r"[\w.]*(\s*[*/]\s*\w+)*", text[token.start_pos :])
+            product = f"{number}*{factors[0] if factors else token}"
+            if kinds[0] == "NAME" and token != "pi":
+                product = f"a parameter, with default: {number} {token}; of a name, {product}"
+            hint = product
             hint = hint if Fraction(number) else str(number)  # nothing is nothing in any unit
             with contextlib.suppress(ValueError):
                 hint = str(int(said, 0))  # 0x10 is 16

@@ -179,8 +179,12 @@ def quantity(text: str, place: Place, *, what: str, unit: str) -> Quantity:
     except ApcError as error:
         [mistake] = error.mistakes
         alone = not set("*/^") & set(text)  # it is all there is of the unit
-        if mistake.code == "E223" and alone and mistake.hint and not _is_of(mistake.hint, wanted.dimension):
-            raise ApcError(replace(mistake, hint=unit)) from None
+        if mistake.code == "E223" and mistake.hint:
+            meant = unit if alone and not _is_of(mistake.hint, wanted.dimension) else mistake.hint
+            if not place.line:  # of an option, whose value is written anew
+                name = mistake.what.removeprefix("there is no unit ").split(" ")[0]
+                meant = f"{what}: {text.strip().replace(name, meant)}"
+            raise ApcError(replace(mistake, hint=meant)) from None
         if mistake.code != "E221" or mistake.hint:
             raise
         example = f"{what}: 1 {unit}".removesuffix(" 1")

@@ -16,7 +16,7 @@ from graphlib import CycleError, TopologicalSorter
 from apc.compiler.errors import ApcError, Mistakes, Place, place_in
 from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension
 from apc.compiler.language.evaluation import evaluate
-from apc.compiler.language.expression import Expr, Name, format_expression, names, transform
+from apc.compiler.language.expression import FUNCTIONS, Expr, Name, format_expression, names, transform
 from apc.compiler.language.grammar import parse_expression
 from apc.compiler.language.unit_check import ANY, dimension_of
 from apc.compiler.language.unit_text import format_dimension, format_si
@@ -160,6 +160,7 @@ def read_binding(
                 told, hint = _misfit(tree, actual, dimension, unit)
                 raise fault("E204", place, what, unit, f"{brief(text)}, which {told}", f"{what}: {hint}")
             return Binding(None, tree, dimension, place)
+        _refuse_beside(text, place, what, names_known)
         _refuse_mixture(text, place, what, names_known)
         number = quantity(text, place, what=what, unit=unit).value
     return Binding(number, None, dimension, place)
@@ -188,6 +189,22 @@ def _refuse_computed(text: str, place: Place, what: str, unit: str) -> None:
             hint = f"{what}: {float(number):.9g} {match['unit']}"
     if hint:
         raise fault("E204", place, what, _NO_UNITS, brief(text), hint)
+
+
+# A number beside a word, and no sign between them.
+_BESIDE = re.compile(r"(?P<number>[+-]?[\d.]+(?:[eE][+-]?\d+)?)\s*(?P<rest>\(*(?P<word>[A-Za-z]\w*))")
+
+
+def _refuse_beside(text: str, place: Place, what: str, names_known: Collection[str]) -> None:
+    """Raise ApcError for a number beside a name, with no sign between them, as 2pi*f."""
+    beside = _BESIDE.match(text.strip())
+    if beside is None or beside["word"] not in {*names_known, "pi", *FUNCTIONS}:
+        return
+    with Mistakes():
+        parse_unit(beside["word"], place)
+        return
+    hint = f"{what}: {beside['number']}*{text.strip()[beside.start('rest') :]}"
+    raise fault("E204", place, what, _NO_UNITS, brief(text), hint)
 
 
 def _refuse_mixture(text: str, place: Place, what: str, names_known: Collection[str]) -> None:
@@ -247,11 +264,12 @@ def settle(binding: Binding, number_of: Callable[[tuple[str, ...]], Fraction]) -
     return Value(number, binding.dimension, binding.expression, binding.place)
 
 
-def read_free(node: Node, what: str) -> Binding:
-    """Read a number of any unit: a quantity, or an expression whose names are checked later."""
+def read_free(node: Node, what: str, others: Collection[str]) -> Binding:
+    """Read a number of any unit: a quantity, or an expression over others whose names are checked later."""
     text, place = text_of(node, what, f"{what}: 2000 N/m"), text_place(node)
     if not is_quantity(text):
         return Binding(None, _tree(text, place), DIMENSIONLESS, place)
+    _refuse_beside(text, place, what, others)
     parsed = parse_quantity(text, node.place)
     return Binding(parsed.value, None, parsed.unit.dimension, node.place)
 

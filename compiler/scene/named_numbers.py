@@ -50,10 +50,11 @@ def read_named_numbers(root: Body, counts: Mapping[str, int], files: NamedFiles)
     """
     waiting: dict[str, Binding] = {}
     section = root.section("parameters", "{kt: 2000 N/m}")
+    others = {key.text for key, _ in section}.union(PEERS)
     for key, value in section:
         with files.mistakes:
             name = name_of(key, "a parameter", words=RESERVED)
-            waiting[name] = read_free(value, name)
+            waiting[name] = read_free(value, name, others)
     values = resolve_in_order(waiting, sum(counts.values()), files.mistakes)
     faulty = {key.text for key, _ in section} - values.keys()
     return NamedNumbers(values, faulty, counts, files)

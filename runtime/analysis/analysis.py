@@ -80,7 +80,8 @@ class Analysis(Result):
     say why it was analysed as it was; `proof` says what ball arithmetic proved, "" where floats decided;
     `left_out` says what of the scene the answer does not look at. Of the rigid modes
     `translations` and `rotations` move something; the others are of what `unfelt` names, memories that
-    nothing reads at these values.
+    nothing reads at these values. `beyond` is how much larger than 1 the radius is, at least and at most,
+    where that was proved: closer to 1, maybe, than two floats.
     """
 
     shown_by = "analysis:analysis"
@@ -103,6 +104,7 @@ class Analysis(Result):
     translations: int = 0
     rotations: int = 0
     unfelt: tuple[str, ...] = ()
+    beyond: tuple[float, float] | None = None
 
     def plot(self, ax: Any = None, **look: Unpack[Look]) -> Any:
         """Draw the eigenvalues over the unit circle into a matplotlib Axes, or a figure's, as `look` says."""
@@ -283,6 +285,7 @@ def analyze(
         unfelt=stands.names,
         translations=stands.translations,
         rotations=stands.rotations,
+        beyond=spectrum.beyond,
     )
 
 

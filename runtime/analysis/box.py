@@ -130,11 +130,23 @@ def _parameter(system: CompiledSystem, free: Free) -> Parameter:
 def _check_limits(parameter: Parameter, low: Fraction, high: Fraction, name: str) -> None:
     """Refuse an empty range, and one beyond the parameter's bounds."""
     what, mistakes = f"the box of {name}", Mistakes()
+
+    def shown(*ends: Fraction | float) -> list[str]:
+        return [with_unit(f"{float(end):.9g}", parameter.unit).removesuffix(" 1") for end in ends]
+
     if not low < high:
-        ends = " to ".join(with_unit(f"{float(end):g}", parameter.unit) for end in (low, high))
-        mistakes.add("E833", _PLACE, what, expected="a low below the high", got=ends)
-    for end in (low, high):
-        check_bounds(replace(parameter, value=float(end), exact=None), what, mistakes, "E833", _PLACE)
+        mistakes.add("E833", _PLACE, what, expected="a low below the high", got=" to ".join(shown(low, high)))
+    for side, end in (("lower", low), ("upper", high)):
+        told = f"the {side} end of {what}"
+        check_bounds(replace(parameter, value=float(end), exact=None), told, mistakes, "E833", _PLACE)
+    if mistakes and low < high:
+        # What lies within the bounds; next to one that must not be met, a hundredth of the way.
+        least, most = float(parameter.minimum or 0.0), parameter.maximum
+        top = float(high) if most is None else min(float(high), most)
+        if parameter.minimum is not None and float(low) <= least:
+            low = Fraction(least + (top - least) / 100 if parameter.open_minimum else least)
+        hint = f"{name}={':'.join(shown(low, top))}" if low < top else ""
+        raise ApcError(replace(one, hint=hint) for one in mistakes.found)
     mistakes.raise_if_any()
 
 

@@ -51,6 +51,7 @@ class ContactMode:
     frequency_hz: float
     linearized: bool
     refusal: str
+    beyond: tuple[float, float] | None = None  # of 1, see `Analysis`
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,6 +154,7 @@ def contact_modes(system: CompiledSystem, *, prepared: Prepared | None = None) -
             frequency_hz=found.modes[0].frequency_hz if found.modes else 0.0,
             linearized=found.linearized,
             refusal="",
+            beyond=found.beyond,
         )
 
     modes = tuple(mode(name, setting) for setting, name in _settings(system, names, has).items())

@@ -76,6 +76,7 @@ class Outcome:
     spectral_radius_error: float
     frame_s: float
     refusal: str
+    beyond: tuple[float, float] | None = None  # of 1, see `Analysis`
 
     @property
     def words(self) -> str:
@@ -164,7 +165,7 @@ def conventions(
             return Outcome(tuple(orders), departures, start, "", None, nan, nan, frame_s, refusal)
         radius, error = found.spectral_radius, found.spectral_radius_error
         answer = found.verdict, found.stable, radius, error, found.frame_s
-        return Outcome(tuple(orders), departures, start, *answer, refusal="")
+        return Outcome(tuple(orders), departures, start, *answer, refusal="", beyond=found.beyond)
 
     def only(why: str) -> Conventions:
         first = replace(outcome([ORDER], readings[0], default, default.frame_s), departures=())

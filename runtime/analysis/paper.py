@@ -164,6 +164,7 @@ def analyze_paper(system: CompiledSystem) -> Analysis:
         stable=spectrum.stable,
         spectral_radius=spectrum.spectral_radius,
         spectral_radius_error=spectrum.spectral_radius_error,
+        beyond=spectrum.beyond,
         rigid_modes=len(rigid.names),
         translations=stands.translations,
         rotations=stands.rotations,

@@ -130,18 +130,20 @@ def make_plan(
             raise cannot_serve(system, method, arranged.notes[0])
         loops, found, notes = arranged.loops, arranged.method, arranged.notes
         packets = max(sum(sum(group.schedule.depths) for group in loop.sites) for loop in loops)
+        held = max(sum(len(group.schedule.carried) for group in loop.sites) for loop in loops)
         if method == "determinant":
             found = method
         elif method == "auto" and (
             max(sum(group.schedule.depths) for loop in loops for group in loop.sites) > LONG_LINES
-            or (packets > LONG_LINES and max(loop.states for loop in loops) > MOST_STATES)
+            or (packets + held > LONG_LINES and max(loop.states for loop in loops) > MOST_STATES)
         ):
             found = "determinant"
-            notes = (*notes, f"{packets:,} packets are on their way at a time, none of which is made a state")
+            on_the_way = f"{packets:,} packets are on their way at a time, none of which is made a state"
+            notes = (*notes, on_the_way if packets > LONG_LINES else "one matrix of all is too large")
     if found != "determinant":
         for loop in loops:
             if loop.states > MOST_STATES:
-                raise too_large(exchange, f"{exchange.peers:,} peers", loop.states)
+                raise too_large(exchange, f"{exchange.peers:,} peers", loop.states, auto=method == "auto")
         needed = (
             KEPT * sum(loop.states**2 for loop in loops) + AT_WORK * max(loop.states for loop in loops) ** 2
         )

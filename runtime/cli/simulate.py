@@ -26,7 +26,7 @@ from apc.cli.options import (
     tell,
 )
 from apc.cli.progress import progress_bar
-from apc.compiler.errors import ApcError
+from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import partial_name
 from apc.suffixes import check_suffix
 
@@ -142,8 +142,13 @@ class _Kept:
 def _check_rows(out: Path) -> None:
     """Refuse a file that can't be written, before anything is computed."""
     from apc.present import animation
+    from apc.present.pictures import FORMATS
     from apc.present.recording import SUFFIXES
 
+    if out.suffix.lower() in FORMATS:
+        what, known = "the suffix of --out", ", ".join((*SUFFIXES, *animation.SUFFIXES))
+        hint = f"--plot {out}"
+        raise ApcError(Mistake("E878", Place(str(out)), what, f"one of {known}", out.suffix, hint))
     if check_suffix(out, (*SUFFIXES, *animation.SUFFIXES), "--out") in animation.SUFFIXES:
         animation.check_animation(out)
 

@@ -43,13 +43,14 @@ def tune_command(
     minimize: str = option(
         "What is to be as small as can be: a gain; settling_time or spectral_radius (the same gains); "
         '"feel.error at 1 Hz", or feel.impedance, feel.transmitted; feel.damping of slow motions; '
-        "feel.error_h2, for white forces of 1 N rms; or a weighted sum in SI of gains and these, "
+        "feel.error_h2, for white forces of 1 N rms, feel.error_hinf, the largest gain at any frequency; or "
+        "a weighted sum in SI of gains and these, "
         '"feel.damping - 0.01*coordination.stiffness".',
         "AIM",
     ),
     subject: tuple[str, ...] = option(
         'Beside stability: "decay=60 dB in 2 s"; "feel.impedance at 5 Hz < 20 N*s/m", or feel.transmitted in '
-        "m/s/N, feel.error in m/N, feel.damping, feel.error_h2. May be repeated.",
+        "m/s/N, feel.error in m/N, feel.damping, feel.error_h2, feel.error_hinf. May be repeated.",
         "DEMAND",
     ),
     against: str = option(
@@ -90,6 +91,7 @@ def tune_command(
     from apc.frame.devices import FREE
     from apc.inputs import open_scene
     from apc.present.pictures import write_picture
+    from apc.present.tune import panels_of
     from apc.tuning.demands import held_as_studied, read_against, read_demands, read_seconds
     from apc.tuning.front import front
     from apc.tuning.tune import tune
@@ -115,6 +117,8 @@ def tune_command(
         over=over,
         criterion=criterion,
     )
+    if plot is not None and not against:  # what can't be drawn is refused before the search
+        panels_of(system, len(demands.free))
     if against:
         with status_line() as told:
             weighed = front(system, demands, read_against(against), seconds=read_seconds(time), told=told)

@@ -59,7 +59,8 @@ class Proof:
     `inside` says whether all eigenvalues but the rigid ones lie inside the unit circle, None if that is left
     open; `bits` with how many bits it was decided, or left open. `free` are the rigid modes, drifts included
     if there are any. Discs about `centres` (m,) with `radii` (m,) hold the eigenvalues of the matrix in
-    relative coordinates: k discs that hang together hold k of them.
+    relative coordinates: k discs that hang together hold k of them. `beyond` is how much larger than 1 the
+    largest of these is, at least and at most.
     """
 
     inside: bool | None
@@ -67,6 +68,7 @@ class Proof:
     free: RigidModes
     centres: Complexes
     radii: Floats
+    beyond: tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,11 +84,16 @@ class Discs:
     most: Floats
 
     @property
+    def beyond(self) -> tuple[float, float]:
+        """How much larger than 1 the largest root is, at least and at most."""
+        least = discs(self.centres, self.centres, self.radii, self.least).low
+        return max(float(least), -1.0), float(self.most.max(initial=-1.0))
+
+    @property
     def inside(self) -> bool | None:
         """Say whether all roots are inside the unit circle, None if that is open."""
-        if (self.most < 0).all():
-            return True
-        return False if discs(self.centres, self.centres, self.radii, self.least).low > 0 else None
+        least, most = self.beyond
+        return True if most < 0 else False if least > 0 else None
 
 
 def prove(system: ClosedSystem, free: RigidModes) -> Proof:
@@ -117,7 +124,9 @@ def prove(system: ClosedSystem, free: RigidModes) -> Proof:
         inside = False if False in verdicts else None if None in verdicts else True
         if inside is not None or (doubtful and bits >= DOUBTFUL):
             break
-    return Proof(inside, bits, free, centres, radii)
+    beyond = [one.beyond for one in found] or [(-1.0, -1.0)]
+    least, most = map(max, zip(*beyond, strict=True))
+    return Proof(inside, bits, free, centres, radii, (least, most))
 
 
 def _polynomials(matrix: Balls, free: RigidModes) -> list[Any]:

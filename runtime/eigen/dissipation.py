@@ -1,7 +1,7 @@
 """What a loop gives back of what it is given, at the worst frequency: its H∞ norm, its least real part.
 
 Takes: x⁺ = A x + B r, d = C x + D r, of floats or of floats with their radii.
-Gives: `peak_gain`, `least_real`; `proves_gain`, `proves_positive`; `is_positive`.
+Gives: `gains_at`, `peak_gain`, `least_real`; `proves_gain`, `proves_positive`; `is_positive`.
 Guarantees: what is proved holds for all matrices within the radii. No grid of frequencies decides anything.
 Does not: take out rigid motions, or weigh what comes in.
 
@@ -58,10 +58,6 @@ def peak_gain(a: Floats, b: Floats, c: Floats, d: Floats) -> tuple[float, float]
     if not d.size:
         return 0.0, 0.0
 
-    def least(a: Floats, b: Floats, angles: Floats) -> Floats:
-        gains = np.linalg.svd(_response(a, b, c, d, angles), compute_uv=False)[:, 0]
-        return np.asarray(-gains / 2)
-
     # The other outputs and inputs are none.
     p, m = d.shape
     wide_b, wide_c, wide_d = (
@@ -70,9 +66,19 @@ def peak_gain(a: Floats, b: Floats, c: Floats, d: Floats) -> tuple[float, float]
         np.pad(d, [(0, m), (p, 0)]),
     )
     lowest, angle = _lowest(
-        a, wide_b, wide_c, wide_d, np.zeros((p + m, p + m)), lambda a, b, at: least(a, b[:, p:], at)
+        a,
+        wide_b,
+        wide_c,
+        wide_d,
+        np.zeros((p + m, p + m)),
+        lambda a, b, at: -gains_at(a, b[:, p:], c, d, at) / 2,
     )
     return -2 * lowest, angle
+
+
+def gains_at(a: Floats, b: Floats, c: Floats, d: Floats, angles: Floats) -> Floats:
+    """Return ‖C (e^{jθ} − A)⁻¹ B + D‖₂ at angles θ (k,)."""
+    return np.asarray(np.linalg.svd(_response(a, b, c, d, angles), compute_uv=False)[:, 0])
 
 
 def least_real(a: Floats, b: Floats, c: Floats, d: Floats, weight: Floats) -> tuple[float, float]:

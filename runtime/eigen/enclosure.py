@@ -237,10 +237,11 @@ def discs(values: Complexes, centres: Complexes, radii: Floats, inner: Floats | 
         spread = np.where(touching, label[..., None, :], n).min(axis=-1, initial=n)
     together = label[..., :, None] == label[..., None, :]
     reach = np.abs(values[..., :, None] - centres[..., None, :]) + radii[..., None, :]
+    floor = 0.0 if inner is None else -np.inf
     inner = np.abs(centres) * (1 - 4 * UNIT) - radii if inner is None else inner
     least = np.where(together, inner[..., None, :], np.inf).min(axis=-1, initial=np.inf)
     return Enclosure(
-        low=np.maximum(least.max(axis=-1, initial=0.0), 0.0),
+        low=least.max(axis=-1, initial=floor),
         high=((np.abs(centres) + radii) * (1 + 4 * UNIT)).max(axis=-1, initial=0.0),
         errors=np.where(together, reach, 0.0).max(axis=-1, initial=0.0) * (1 + 4 * UNIT),
     )

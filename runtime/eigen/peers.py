@@ -260,14 +260,15 @@ def check_size(sites: Sequence[SiteJacobians], exchange: Exchange) -> None:
         raise too_large(exchange, f"{len(sites):,} different peers", states)
 
 
-def too_large(exchange: Exchange, what: str, states: int) -> ApcError:
-    """Return the refusal of a system of too many states."""
+def too_large(exchange: Exchange, what: str, states: int, *, auto: bool = False) -> ApcError:
+    """Return the refusal of a system of too many states, by the method `auto` or one that it may spare."""
+    spared = "" if auto else "; apc analyze --method auto needs no such matrix of linear ones"
     return ApcError(
         Mistake(
             "E804",
             Place(exchange.scene),
             f"{what} make one system of {states:,} states; the matrix of one may have {MOST_STATES:,}",
-            hint="fewer peers that differ; apc analyze --method auto needs no such matrix of linear ones",
+            hint=f"fewer peers that differ{spared}",
         )
     )
 

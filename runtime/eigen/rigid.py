@@ -348,7 +348,7 @@ def _ramp_equations(
     def euler(a: Matrix, b: Matrix, duration: Fraction) -> Matrix:
         return np.hstack([np.eye(len(a), dtype=np.int64) + a * number(duration), b * number(duration)])
 
-    def watch(g: int, _: int, moving: Matrix) -> None:
+    def watch(g: int, _: int, moving: Matrix, __: object) -> None:
         moved = np.hstack([sites[g].a, sites[g].b])
         equations.append(BALLS.multiply(moved, moving) - own[g])
 

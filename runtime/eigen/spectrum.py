@@ -115,7 +115,8 @@ class Spectrum:
     `spectral_radius` is per frame; `stable` is None when the verdict is undecided. The error bounds the
     radius from both sides, the verdict needs one: where hardly anything bounds it from below, a system can be
     stable by less than its error. `proof` says what ball arithmetic proved, "" where floats decided; `notes`
-    say what could not be proved.
+    say what could not be proved. `beyond` is how much larger than 1 the radius is, at least and at most,
+    where something was proved: it can be closer to 1 than floats are to each other.
     """
 
     modes: Sequence[Mode]
@@ -127,6 +128,7 @@ class Spectrum:
     stable: bool | None
     proof: str
     notes: tuple[str, ...]
+    beyond: tuple[float, float] | None = None
 
 
 def solve_spectrum(
@@ -188,7 +190,15 @@ def solve_spectrum(
         stable=stable,
         proof=_proof_in_words(solved, drifts),
         notes=tuple(notes),
+        beyond=_beyond(solved),
     )
+
+
+def _beyond(solved: Sequence[_Solved]) -> tuple[float, float] | None:
+    if not any(one.bits for one in solved):
+        return None
+    least, most = map(max, zip(*(one.beyond for one in solved), strict=True))
+    return least, most
 
 
 def mode_near(systems: Sequence[ClosedSystem], eigenvalue: complex) -> Mode:
@@ -203,7 +213,7 @@ class _Solved:
     """One closed system: its eigenvalues, each with its error, and bounds on its spectral radius.
 
     `inside` says whether all its eigenvalues but the rigid ones are inside the unit circle; `bits` with how
-    many bits that was proved, 0 for floats.
+    many bits that was proved, 0 for floats; `beyond` how much larger than 1 the radius is, at least and most.
     """
 
     free: RigidModes
@@ -215,6 +225,7 @@ class _Solved:
     high: float
     inside: bool | None
     bits: int
+    beyond: tuple[float, float]
 
     @property
     def whole(self) -> Eigenpairs:
@@ -285,7 +296,8 @@ def _solve(system: ClosedSystem, free: RigidModes) -> _Solved:
     matrix, error = relative_bounded(system.matrix, system.error, at)
     pairs, bounds = enclose_eigenvalues(matrix, error)
     inside = False if bounds.low > 1 else True if bounds.high < 1 else None  # NaN decides nothing
-    return _Solved(free, at, matrix, pairs, bounds, bounds.low, bounds.high, inside, 0)
+    low, high = bounds.low, bounds.high
+    return _Solved(free, at, matrix, pairs, bounds, low, high, inside, 0, (low - 1, high - 1))
 
 
 def _prove(system: ClosedSystem, estimate: _Solved) -> _Solved:
@@ -299,7 +311,8 @@ def _prove(system: ClosedSystem, estimate: _Solved) -> _Solved:
         inside, bits = estimate.inside, 0 if estimate.inside is not None else bits
     found = discs(proof.centres, proof.centres, proof.radii)
     low, high = max(estimate.low, float(found.low)), min(estimate.high, float(found.high))
-    proved = replace(estimate, low=low, high=high, inside=inside, bits=bits)
+    beyond = (max(estimate.beyond[0], proof.beyond[0]), min(estimate.beyond[1], proof.beyond[1]))
+    proved = replace(estimate, low=low, high=high, inside=inside, bits=bits, beyond=beyond)
     # A radius that floats know as well: the other eigenvalues a proof knows far better.
     if found.high - found.low > AS_SHARP * (estimate.high - estimate.low):
         return proved
@@ -434,7 +447,8 @@ def angles_in_frame(system: ClosedSystem, values: Complexes, vectors: Complexes,
     """Return by how much modes turn in a frame (k,), in radians, with whole turns; NaN if it can't be told.
 
     The eigenvalue knows the angle up to whole turns; these are counted on the continuous state that takes
-    most part. Where none does, as in what only packets carry, the angle is the eigenvalue's.
+    most part, or else on what is remembered. Where neither takes part, as in what only packets carry, the
+    angle is the eigenvalue's.
 
     Parameters
     ----------
@@ -446,9 +460,12 @@ def angles_in_frame(system: ClosedSystem, values: Complexes, vectors: Complexes,
     angles = np.angle(values)
     if not system.motion or not len(values):
         return angles
-    motion = np.array(system.motion)
+    motion, every = np.array(system.motion), np.arange(len(values))
     dominant = motion[np.argmax(shares[motion], axis=0)]
-    moving = shares[dominant, np.arange(len(values))] > LEAST_SHARE
+    own = np.setdiff1d(np.arange(len(shares)), list(system.layout.places.values()))
+    rest = own[np.argmax(shares[own], axis=0)]
+    dominant = np.where(shares[dominant, every] > LEAST_SHARE, dominant, rest)
+    moving = shares[dominant, every] > LEAST_SHARE
     if not system.sites:
         return np.where(moving, np.nan, angles)
     site_of = np.searchsorted(system.offsets, dominant, side="right") - 1

@@ -8,9 +8,6 @@ Does not: compute.
 
 from __future__ import annotations
 
-import json
-import textwrap
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,51 +15,14 @@ import numpy as np
 
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import write_file, write_text
-from apc.exports.words import identifier, words
+from apc.exports.texts import filled
+from apc.exports.words import Port, identifier, words
 from apc.optional import need
 
 if TYPE_CHECKING:
     from apc.exports.lifted import StateSpace
 
 LARGEST_MAT = 2**31 - 2**20  # bytes: a variable of a MAT-file of version 5 is less than 2 GiB
-
-_SCRIPT = '''\
-"""{title}
-
-{told}
-
-    from {module} import system          # a control.StateSpace
-    print(system.poles())
-"""
-
-import control
-
-dt = {dt!r}  # s, the sample time: a frame
-
-# The names as apc has them, with their units; python-control takes letters, digits and _ only.
-states = {states}
-inputs = {inputs}
-outputs = {outputs}
-
-A = {a}
-B = {b}
-C = {c}
-D = {d}
-
-made_by = {made_by}
-
-state_words = {state_words}
-input_words = {input_words}
-output_words = {output_words}
-
-system = control.StateSpace(
-    *(A, B, C, D, dt),
-    name={name},
-    states=state_words,
-    inputs=input_words,
-    outputs=output_words,
-)
-'''
 
 
 def as_control(found: StateSpace) -> Any:
@@ -79,24 +39,13 @@ def as_control(found: StateSpace) -> Any:
 
 def write_script(path: Path, found: StateSpace) -> None:
     """Write a Python script that makes a `control.StateSpace`. Raises ApcError (E601)."""
-    ports = {"states": found.states, "inputs": found.inputs, "outputs": found.outputs}
-    matrices = zip("abcd", found.matrices, strict=True)
-    text = _SCRIPT.format(
-        title=_quotable(f"{found.topology}, {found.what}, as a state space."),
-        told=_quotable("\n".join(textwrap.fill(one, 100) for one in (found.meaning, *found.notes))),
+    text = filled(
+        "control.jinja",
+        found=found,
         module=path.stem if path.stem.isidentifier() else "this_file",
-        dt=found.frame_s,
-        **{name: _listed(repr(row) for row in (matrix + 0.0).tolist()) for name, matrix in matrices},
-        **{
-            name: _listed(f"({json.dumps(one.name)}, {json.dumps(one.unit)})" for one in listed)
-            for name, listed in ports.items()
-        },
-        **{
-            f"{name.removesuffix('s')}_words": _listed(map(json.dumps, words(listed)))
-            for name, listed in ports.items()
-        },
-        made_by=json.dumps(found.made_by),
-        name=json.dumps(identifier(found.topology)),
+        named=_named(found),
+        words=words,
+        name=identifier(found.topology),
     )
     write_text(path, text.rstrip("\n"))
 
@@ -130,11 +79,16 @@ def write_npz(path: Path, found: StateSpace) -> None:
     write_file(path, write)
 
 
+def _named(found: StateSpace) -> list[tuple[str, tuple[Port, ...]]]:
+    """Return what a state space has by names, under the word for it."""
+    return [("states", found.states), ("inputs", found.inputs), ("outputs", found.outputs)]
+
+
 def _variables(found: StateSpace) -> dict[str, Any]:
     """Return what a file of arrays holds, by name."""
     variables: dict[str, Any] = dict(zip("ABCD", found.matrices, strict=True))
     variables["dt"] = found.frame_s
-    for name, ports in (("states", found.states), ("inputs", found.inputs), ("outputs", found.outputs)):
+    for name, ports in _named(found):
         variables[name] = [port.name for port in ports]
         variables[f"{name.removesuffix('s')}_units"] = [port.unit for port in ports]
     variables["cut"], variables["notes"] = found.cut, [found.meaning, *found.notes]
@@ -144,13 +98,3 @@ def _variables(found: StateSpace) -> dict[str, Any]:
         variables["free_units"] = [port.unit for port in found.free]
         variables["casadi_function"] = found.function.serialize()
     return variables
-
-
-def _listed(texts: Iterable[str]) -> str:
-    """Return texts as a list of Python, one a line; JSON's texts are texts of Python too."""
-    return f"[\n{''.join(f'    {text},' + chr(10) for text in texts)}]"
-
-
-def _quotable(text: str) -> str:
-    """Return a text that can't end the text it stands in."""
-    return text.replace("\\", "/").replace('"', "'")

@@ -1,13 +1,13 @@
-$title
-/* Reads, a row an instant: $reads.
-   Prints: time, $prints. */
-#include "$include"
+% include "title.c"
+/* Reads, a row an instant: ${read | map("last") | join(", ") | comment or "a line of any text"}.
+   Prints: time, ${shown | map("last") | join(", ") | comment}. */
+#include "${include}"
 #include <stdio.h>
 #include <stdlib.h>
 #include <time.h>
 
 int main(int count, char **words) {
-  $name peer;
+  ${name} peer;
   ${name}_in in = {0};
   ${name}_out out = {0};
   ${name}_start(&peer);
@@ -19,10 +19,13 @@ int main(int count, char **words) {
     printf("%g s an instant\n", (double)(clock() - begin) / CLOCKS_PER_SEC / (double)ticks);
     return 0;
   }
-  while ($condition) {
+  while ({% for form, own, label in read %}scanf("${form}", &in.${own}) == 1${" &&\n      " if not loop.last else ""}{% else %}!feof(stdin) && scanf("%*[^\n]") != EOF && getchar() != EOF{% endfor %}) {
     printf("%.17g", ${name}_time(&peer));
     ${name}_tick(&peer, &in, &out);
-$shown    printf("\n");
+% for form, own, label in shown
+    printf(" ${form}", ${own});
+% endfor
+    printf("\n");
     fflush(stdout);
   }
   return 0;

@@ -14,9 +14,9 @@ from typing import Any
 
 import casadi
 
-from apc.compiler.compiled import CompiledSystem, Hold, Kind, Parameter, Ports, Timing
+from apc.compiler.compiled import CompiledSystem, Hold, Kind, Parameter, Timing
 from apc.compiler.functions.exchange import NO_DELAY
-from apc.frame.devices import Device, coupled_directly, find_devices
+from apc.frame.devices import Device, coupled_directly, find_devices, rewritten
 from apc.frame.jacobians import jacobians
 from apc.frame.parameters import resolve
 
@@ -24,7 +24,7 @@ FORCE_ON = "force on "  # and the device
 
 
 def pushed(system: CompiledSystem) -> CompiledSystem:
-    """Return a scene with a force on each device: an output of the fastest clock that keeps its value.
+    """Return a scene with a force on each device: a parameter that the fastest clock puts out.
 
     Parameters
     ----------
@@ -34,83 +34,45 @@ def pushed(system: CompiledSystem) -> CompiledSystem:
     unit_of = {one.name: one.unit for one in system.parameters}
     numbers, direct = resolve(system), coupled_directly(system.kinds)
     periods = {one.name: numbers.timings[one.period] for one in system.clocks}
-    kinds, names = list(system.kinds), dict[str, None]()
+    kinds, added = list(system.kinds), dict[str, Parameter]()
     for place, group in enumerate(system.groups):
         kind = system.kinds[group.kind]
         if kinds[group.kind] is not kind or not kind.clocks:
             continue
         found = find_devices(jacobians(kind), numbers.parameters[place][0], unit_of, direct=direct)
-        devices = [one for one in found.values() if isinstance(one, Device)]
+        devices = {f"{FORCE_ON}{one.part}": one for one in found.values() if isinstance(one, Device)}
         fastest = min(range(len(kind.clocks)), key=lambda number: periods[kind.clocks[number].clock])
         if devices:
             kinds[group.kind] = _pushed(kind, devices, fastest)
-            names |= dict.fromkeys(f"{FORCE_ON}{one.part}" for one in devices)
+            added |= {name: Parameter(name, "N", 0.0, about="a force from outside") for name in devices}
     timings = {one.name: one for one in (Timing(NO_DELAY, Fraction(0)), *system.timings)}
-    added = (Parameter(name, "N", 0.0, about="a force from outside") for name in names)
     return replace(
         system,
         kinds=tuple(kinds),
-        parameters=(*system.parameters, *added),
-        timings=tuple(timings.values()) if names else system.timings,
+        parameters=(*system.parameters, *added.values()),
+        timings=tuple(timings.values()) if added else system.timings,
     )
 
 
-def _pushed(kind: Kind, devices: list[Device], fastest: int) -> Kind:
-    """Return a kind with a force on each of its devices, which a clock partition keeps."""
-    count, names = len(devices), tuple(f"{FORCE_ON}{one.part}" for one in devices)
-    sizes = len(kind.holds), len(kind.parameters)
+def _pushed(kind: Kind, devices: dict[str, Device], fastest: int) -> Kind:
+    """Return a kind with a force on each of its devices, by name, which a clock partition puts out."""
+    before = kind.clocks[fastest]
+    held, own, first = len(kind.holds), len(kind.parameters), len(before.outputs)
+    holds = (Hold(name, before.clock, first + place, NO_DELAY) for place, name in enumerate(devices))
 
-    def over(function: Any, memories: int = 0) -> tuple[list[Any], list[Any], Any, Any]:
-        """Return new inputs of a function, those it had, and what is pushed and remembered of pushes."""
-        x, _, *between, _, t = function.sx_in()
-        held = casadi.SX.sym("u", sizes[0] + count)
-        numbers = casadi.SX.sym("p", sizes[1] + count)
-        kept = casadi.SX.sym("m", between[0].numel() + memories) if memories else casadi.SX(0, 1)
-        new = [x, held, *between, numbers, t]
-        old = [x, held[: sizes[0]], *between, numbers[: sizes[1]], t]
-        if memories:
-            new[2], old[2] = kept, kept[: between[0].numel()]
-        return new, old, held[sizes[0] :], kept[kept.numel() - memories :]
+    def rates(x: Any, u: Any, p: Any, t: Any) -> Any:
+        old = x, u[:held], p[:own], t
+        found = casadi.vertsplit(kind.derivative(*old))
+        for one, force in zip(devices.values(), casadi.vertsplit(u[held:]), strict=True):
+            found[one.velocity] += one.symbolic(*old) * force
+        return casadi.vertcat(*found)
 
-    def again(function: Any, memories: int = 0, *, ticks: bool = False) -> Any:
-        """Return a function of the new inputs; one that ticks gives the pushes, too."""
-        new, old, _, kept = over(function, memories)
-        value = casadi.vertcat(function(*old), kept) if ticks else function(*old)
-        return casadi.Function(function.name(), new, [value], function.name_in(), function.name_out())
-
-    new, old, forces, _ = over(kind.derivative)
-    rates = casadi.vertsplit(kind.derivative(*old))
-    for one, force in zip(devices, casadi.vertsplit(forces), strict=True):
-        rates[one.velocity] += one.symbolic(*old) * force
-    named = kind.derivative.name_in(), kind.derivative.name_out()
-    derivative = casadi.Function(kind.derivative.name(), new, [casadi.vertcat(*rates)], *named)
-    clocks = []
-    for number, clock in enumerate(kind.clocks):
-        more = count * (number == fastest)
-        receives = tuple(
-            one if one.edge is None else replace(one, edge=again(one.edge, more)) for one in clock.receives
-        )
-        clock = replace(clock, tick=again(clock.tick, more, ticks=True), receives=receives)
-        if number == fastest:
-            places = tuple(range(len(clock.outputs), len(clock.outputs) + count))
-            clock = replace(
-                clock,
-                outputs=(*clock.outputs, *names),
-                units=(*clock.units, *("N",) * count),
-                memories=(*clock.memories, *places),
-                starts=(*clock.starts, *names),
-            )
-        clocks.append(clock)
-    own, first = clocks[fastest].clock, len(clocks[fastest].outputs) - count
-    return replace(
-        kind,
-        derivative=derivative,
-        clocks=tuple(clocks),
-        holds=(*kind.holds, *(Hold(name, own, first + k, NO_DELAY) for k, name in enumerate(names))),
-        parameters=(*kind.parameters, *names),
-        sends=tuple(replace(one, send=again(one.send)) for one in kind.sends),
-        ports=None if kind.ports is None else Ports(kind.ports.parts, again(kind.ports.port)),
-        limits=tuple(
-            one if one.value is None else replace(one, value=again(one.value)) for one in kind.limits
-        ),
-    )
+    larger = replace(kind, parameters=(*kind.parameters, *devices), holds=(*kind.holds, *holds))
+    whole = rewritten(larger, kind, lambda x, p: x, rates)
+    clock, inputs = whole.clocks[fastest], whole.clocks[fastest].tick.sx_in()
+    value = casadi.vertcat(clock.tick(*inputs), inputs[-2][own:])
+    tick = casadi.Function(before.tick.name(), inputs, [value], before.tick.name_in(), before.tick.name_out())
+    units = (*clock.units, *("N" for _ in devices))
+    clock = replace(clock, tick=tick, outputs=(*clock.outputs, *devices), units=units)
+    clocks = (*whole.clocks[:fastest], clock, *whole.clocks[fastest + 1 :])
+    return replace(whole, clocks=clocks)

@@ -1,17 +1,67 @@
-$includes
+% for code in scene.codes
+#include "${code.identifier}.h"
+% endfor
 #include <limits.h>
-$luck
-typedef struct {
-$members} model;
+% if lucky
+#include <math.h>
+#include <stdint.h>
 
-$links$sites
+typedef int64_t whole;
+${luck}
+% for link in lucky
+% include "way.h"
+% endfor
+% endif
+
+typedef struct {
+% for code, numbers, links in sites
+% set s = loop.index0
+  ${code.identifier} peer${s}[${numbers | length}];
+  ${code.identifier}_in in${s}[${numbers | length}];
+  ${code.identifier}_out out${s}[${numbers | length}];
+  int stage${s}[${numbers | length}]; /* at an instant: 0 come, 1 what it sends has gone out, 2 done */
+% endfor
+% for link in scene.links
+  double ${link.name}[${link.ring}][${scene.peers | length}][${link.channels | length}]; /* the newest packets */
+% if link.luck
+  ${link.name}_way ways_${link.name}[${link.ways | length}];
+% endif
+% endfor
+} model;
+
+% for link in scene.links
+% include "link.c"
+% include ("chance.c" if link.luck else "delay.c")
+% endfor
+% for code, numbers, links in sites
+% set s = loop.index0
+% include "site.c"
+% endfor
+
 static void begin(model *m) {
-$begin}
+% for one in sites
+  begin_${loop.index0}(m);
+% endfor
+% for link in lucky
+  begin_${link.name}(m);
+% endfor
+}
 
 static void run(model *m, long long until) {
   for (;;) {
     long long at = LLONG_MAX;
-$next    if (at > until) return;
-$move$send    if (at == until) return;
-$force  }
+% for one in sites
+    at = next_${loop.index0}(m, at);
+% endfor
+    if (at > until) return;
+% for verb in ("move", "send")
+% for one in sites
+    ${verb}_${loop.index0}(m, at);
+% endfor
+% endfor
+    if (at == until) return;
+% for one in sites
+    force_${loop.index0}(m, at);
+% endfor
+  }
 }

@@ -1,6 +1,6 @@
 """Several peers in one C text, and the packets between them; or one peer that hears from outside.
 
-Takes: what the peers of a scene do in a frame. Gives: `CScene`, `c_scene`, `one_peer`; `scene_source`;
+Takes: what the peers of a scene do in a frame. Gives: `CScene`, `c_scene`, `one_peer`; `shared`;
 `Variable`.
 Guarantees: time counts in whole quanta; of what happens at once all sends come first, then what is heard,
 then ticks, as everywhere; a value is looked at as it is just before an instant's ticks, as in a row of
@@ -11,7 +11,7 @@ Does not: know how a simulator calls it (see `fmu`).
 What a scene remembers is one struct, `model`, that can be copied: no pointer is in it. What goes on a way by
 chance is kept until it has come: then it is in effect if it was sent after what is (or came after it, as the
 link says), and what got lost is missed from when it should have come. What stands in every text is in
-`scene.c`, `site.c`, `link.c`, `delay.c`, `chance.c` and `way.h` beside this module.
+the templates `scene.c`, `site.c`, `link.c`, `delay.c`, `chance.c` and `way.h` beside this module.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
-from apc.exports.c_text import block, filled, memory, number, parameter_units, row
+from apc.exports.c_text import memory, parameter_units
 from apc.exports.peer_step import (
     MOST_HEARD,
     Peer,
@@ -129,15 +129,19 @@ def _looked_at(peer: Peer, member: str, prefix: str) -> list[Variable]:
     """Return what can be looked at of a peer that a member of `model` is."""
     found = []
     for signal in peer.signals:
-        moving, given = signal.role == "state", signal.name.startswith(FORCE_ON)
+        moving = signal.role == "state"
         start = peer.start[signal.place[0]] if moving else 0.0
         own = f"{member}.{memory(peer, signal)}"
-        name = f"{FORCE_ON}{prefix}{signal.name.removeprefix(FORCE_ON)}" if given else prefix + signal.name
-        found.append(Variable(name, signal.unit, own, given=given, moving=moving, start=start))
-    units, names = parameter_units(peer), peer.kind.parameters
+        if not signal.name.startswith(FORCE_ON):
+            found.append(Variable(prefix + signal.name, signal.unit, own, moving=moving, start=start))
+    units = parameter_units(peer)
     for k, place in enumerate(peer.settable):
-        name, start = names[place], float(peer.parameters[place])
-        found.append(Variable(prefix + name, units[name], f"{member}.p[{k}]", fixed=True, start=start))
+        name, start, own = peer.kind.parameters[place], float(peer.parameters[place]), f"{member}.p[{k}]"
+        if name.startswith(FORCE_ON):
+            name = f"{FORCE_ON}{prefix}{name.removeprefix(FORCE_ON)}"
+            found.append(Variable(name, "N", own, given=True, start=start))
+        else:
+            found.append(Variable(prefix + name, units[name], own, fixed=True, start=start))
     return found
 
 
@@ -216,117 +220,33 @@ def _links(plan: Plan, quantum: Fraction) -> tuple[Link, ...]:
     return tuple(found)
 
 
-def scene_source(scene: CScene) -> str:
-    """Return the text that plays a scene; the peers' codes are in texts of their own.
+def shared(scene: CScene) -> dict[str, Any]:
+    """Return what the template `scene.c` is of, the text that plays a scene beside the peers' own texts.
 
     It has `static void begin(model *m)` and `static void run(model *m, long long until)`, which goes until an
     instant has come and what is sent at it has gone out.
+
+    Of each site there are its code, its peers' numbers, and the links that it has, with its line and where
+    each entry of its packets is among the link's channels.
     """
-    members, sites = [], range(len(scene.codes))
+    sites = []
     for s, code in enumerate(scene.codes):
-        name, count = code.identifier, sum(site == s for site, _ in scene.peers)
-        members += [f"{name} peer{s}[{count}];", f"{name}_in in{s}[{count}];", f"{name}_out out{s}[{count}];"]
-        members.append(
-            f"int stage{s}[{count}]; /* at an instant: 0 come, 1 what it sends has gone out, 2 done */"
-        )
-    for link in scene.links:
-        size = f"[{link.ring}][{len(scene.peers)}][{len(link.channels)}]"
-        members.append(f"double {link.name}{size}; /* the newest packets */")
-        members += [f"{link.name}_way ways_{link.name}[{len(link.ways)}];"] if link.luck else []
-    lucky = [link for link in scene.links if link.luck]
-    luck = f"#include <math.h>\n#include <stdint.h>\n\ntypedef int64_t whole;\n{luck_text()}" if lucky else ""
-    luck += "".join(
-        filled("way.h", own=link.name, channels=len(link.channels), kept=link.kept) for link in lucky
-    )
-    return filled(
-        "scene.c",
-        includes="\n".join(f'#include "{code.identifier}.h"' for code in scene.codes),
-        luck=luck,
-        members=block(members),
-        links="".join(_link(link, scene.quantum) for link in scene.links),
-        sites="".join(_site(scene, s) for s in sites),
-        begin=block([*(f"begin_{s}(m);" for s in sites), *(f"begin_{link.name}(m);" for link in lucky)]),
-        next=block((f"at = next_{s}(m, at);" for s in sites), 4),
-        move=block((f"move_{s}(m, at);" for s in sites), 4),
-        send=block((f"send_{s}(m, at);" for s in sites), 4),
-        force=block((f"force_{s}(m, at);" for s in sites), 4),
-    )
-
-
-def _link(link: Link, quantum: Fraction) -> str:
-    """Return what keeps a link's packets, and brings them in effect."""
-    shared: dict[str, Any] = {
-        "own": link.name,
-        "phase": link.phase,
-        "period": link.period,
-        "channels": len(link.channels),
-        "ring": link.ring,
-        "count": len(link.ways) or 1,
-        "senders": row(sender for sender, _ in link.ways),
-        "delays": row(int(one / quantum) for one in link.delays),
+        lines = {line.link: line for line in code.lines}
+        linked = [
+            (
+                link,
+                lines[link.link],
+                [(link.channels.index(one.name), one.member) for one in lines[link.link].packet],
+            )
+            for link in scene.links
+            if link.link in lines
+        ]
+        sites.append((code, [peer for peer, (site, _) in enumerate(scene.peers) if site == s], linked))
+    return {
+        "scene": scene,
+        "sites": sites,
+        "lucky": [link for link in scene.links if link.luck],
+        "luck": luck_text(),
+        "quanta": lambda link: [int(one / scene.quantum) for one in link.delays],
+        "first": lambda link, numbers: map([one for _, one in link.ways].index, numbers),
     }
-    start = row(f"{{{row(map(number, values))}}}" for values in link.start)
-    packets = filled("link.c", **shared, peers=len(link.start), start=start)
-    if link.luck is None:
-        return packets + filled("delay.c", **shared)
-    law = link.luck.law
-    trace = [] if law.trace is None else law.trace.tolist()
-    numbers = {
-        name: number(getattr(law, name)) for name in ("bad", "one_minus_h", "one_minus_k", "r", "p", "jitter")
-    }
-    return packets + filled(
-        "chance.c",
-        **shared,
-        **numbers,
-        receivers=row(receiver for _, receiver in link.ways),
-        kept=link.kept,
-        key=row(f"{one}u" for one in link.key),
-        seconds=row(number(float(one)) for one in link.delays),
-        trace=row(map(number, trace)),
-        traced=int(bool(trace)),
-        rows=len(trace) or 1,
-        distribution=law.distribution.upper(),
-        quantum=number(float(quantum)),
-        newest=int(link.luck.newest),
-    )
-
-
-def _site(scene: CScene, s: int) -> str:
-    """Return what the peers of one code do at an instant."""
-    code = scene.codes[s]
-    numbers = [peer for peer, (site, _) in enumerate(scene.peers) if site == s]
-    posted: list[str] = []
-    heard: list[str] = []
-    for link in scene.links:
-        line = next((one for one in code.lines if one.link == link.link), None)
-        if line is None:
-            continue
-        members = [(link.channels.index(entry.name), entry.member) for entry in line.packet]
-        if line.sending >= 0:
-            posted += [
-                f"if (m->out{s}[i].{line.name}_sent) {{",
-                f"  double *to = m->{link.name}[newest_{link.name}(at) % {link.ring}][numbers[i]];",
-                *(f"  to[{k}] = m->out{s}[i].{line.name}.{own};" for k, own in members),
-                *([f"  draw_{link.name}(m, numbers[i], newest_{link.name}(at));"] if link.luck else []),
-                "}",
-            ]
-        if line.senders:
-            receivers, packet = [one for _, one in link.ways], f"m->in{s}[i].{line.name}[k]"
-            heard += [
-                f"for (int k = 0; k < {len(line.senders)}; k++) {{",
-                f"  static const int first[] = {{{row(map(receivers.index, numbers))}}};",
-                "  int missing;",
-                f"  const double *newest = heard_{link.name}(m, first[i] + k, at, &missing);",
-                *(f"  {packet}.{own} = newest[{k}];" for k, own in members),
-                *([f"  {packet}.missing = missing;"] if line.missing else []),
-                "}",
-            ]
-    return filled(
-        "site.c",
-        s=s,
-        name=code.identifier,
-        count=len(numbers),
-        numbers=row(numbers),
-        posted=block(posted, 6),
-        heard=block(heard, 6),
-    )

@@ -1,43 +1,67 @@
-static void begin_$s(model *m) {
-  for (int i = 0; i < $count; i++) {
-    ${name}_start(&m->peer$s[i]);
-    ${name}_unheard(&m->in$s[i]);
-    m->stage$s[i] = 0;
+static void begin_${s}(model *m) {
+  for (int i = 0; i < ${numbers | length}; i++) {
+    ${code.identifier}_start(&m->peer${s}[i]);
+    ${code.identifier}_unheard(&m->in${s}[i]);
+    m->stage${s}[i] = 0;
   }
 }
 
-static long long next_$s(const model *m, long long at) {
-  for (int i = 0; i < $count; i++) {
-    const $name *p = &m->peer$s[i];
-    const long long next = m->stage$s[i] == 2 ? ${name}_next(p) : p->quanta;
+static long long next_${s}(const model *m, long long at) {
+  for (int i = 0; i < ${numbers | length}; i++) {
+    const ${code.identifier} *p = &m->peer${s}[i];
+    const long long next = m->stage${s}[i] == 2 ? ${code.identifier}_next(p) : p->quanta;
     if (next < at) at = next;
   }
   return at;
 }
 
-static void move_$s(model *m, long long at) {
-  for (int i = 0; i < $count; i++)
-    if (m->stage$s[i] == 2 && ${name}_next(&m->peer$s[i]) == at) {
-      ${name}_move(&m->peer$s[i]);
-      m->stage$s[i] = 0;
+static void move_${s}(model *m, long long at) {
+  for (int i = 0; i < ${numbers | length}; i++)
+    if (m->stage${s}[i] == 2 && ${code.identifier}_next(&m->peer${s}[i]) == at) {
+      ${code.identifier}_move(&m->peer${s}[i]);
+      m->stage${s}[i] = 0;
     }
 }
 
-static void send_$s(model *m, long long at) {
-  static const int numbers[$count] = {$numbers};
+static void send_${s}(model *m, long long at) {
+  static const int numbers[${numbers | length}] = {${numbers | row}};
   (void)numbers;
-  for (int i = 0; i < $count; i++)
-    if (m->stage$s[i] == 0 && m->peer$s[i].quanta == at) {
-      ${name}_send(&m->peer$s[i], &m->in$s[i], &m->out$s[i]);
-$posted      m->stage$s[i] = 1;
+  for (int i = 0; i < ${numbers | length}; i++)
+    if (m->stage${s}[i] == 0 && m->peer${s}[i].quanta == at) {
+      ${code.identifier}_send(&m->peer${s}[i], &m->in${s}[i], &m->out${s}[i]);
+% for link, line, members in links if line.sending >= 0
+      if (m->out${s}[i].${line.name}_sent) {
+        double *to = m->${link.name}[newest_${link.name}(at) % ${link.ring}][numbers[i]];
+% for k, own in members
+        to[${k}] = m->out${s}[i].${line.name}.${own};
+% endfor
+% if link.luck
+        draw_${link.name}(m, numbers[i], newest_${link.name}(at));
+% endif
+      }
+% endfor
+      m->stage${s}[i] = 1;
     }
 }
 
-static void force_$s(model *m, long long at) {
-  for (int i = 0; i < $count; i++)
-    if (m->stage$s[i] == 1 && m->peer$s[i].quanta == at) {
-$heard      ${name}_force(&m->peer$s[i], &m->in$s[i], &m->out$s[i]);
-      m->stage$s[i] = 2;
+static void force_${s}(model *m, long long at) {
+  for (int i = 0; i < ${numbers | length}; i++)
+    if (m->stage${s}[i] == 1 && m->peer${s}[i].quanta == at) {
+% for link, line, members in links if line.senders
+      for (int k = 0; k < ${line.senders | length}; k++) {
+        static const int first[] = {${first(link, numbers) | row}};
+        int missing;
+        const double *newest = heard_${link.name}(m, first[i] + k, at, &missing);
+% for k, own in members
+        m->in${s}[i].${line.name}[k].${own} = newest[${k}];
+% endfor
+% if line.missing
+        m->in${s}[i].${line.name}[k].missing = missing;
+% endif
+      }
+% endfor
+      ${code.identifier}_force(&m->peer${s}[i], &m->in${s}[i], &m->out${s}[i]);
+      m->stage${s}[i] = 2;
     }
 }
 

@@ -9,11 +9,13 @@ Does not: find modes (see `spectrum`).
 
 An eigenvalue e^{sT} of the frame's map knows Im s T up to whole turns. The motion itself knows them: a state
 x(t) of the mode, complex, goes around 0 by the angle Im s T within a frame. Where the eigenvalue and its
-vector are real, each change of sign is half a turn.
+vector are real, each change of sign is half a turn. What is remembered turns from tick to tick, by half a
+turn at most.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -24,7 +26,7 @@ from numpy.typing import NDArray
 from apc.frame.discretize import exponential_values
 from apc.frame.lift import follow
 from apc.frame.radius import FLOATS
-from apc.frame.schedule import Propagate, Schedule
+from apc.frame.schedule import Propagate, Schedule, Value
 from apc.frame.site import LinearSite, every_matrix, matrices_of
 
 Floats = NDArray[np.float64]
@@ -78,7 +80,7 @@ def turns(
     start, heard
         The states z at the frame's start (k, n_z), and what is heard r (k, n_r).
     states, values
-        Which continuous state is followed (k,), and the eigenvalues (k,).
+        Which entry of z is followed (k,), and the eigenvalues (k,).
     """
     found = np.full(len(values), np.nan)
     start, heard = _real_where_real(start, heard, values)
@@ -102,6 +104,7 @@ def turns(
             mine = every_matrix(site, partial(_some_of, some))
             course = _courses(mine, schedule, points, start[some], heard[some], states[some])
             angle, known = followed_closely(course, values[some], again=doubled > 0)
+            known |= states[some] >= len(site.kind.states)
             found[some[known]] = _of_eigenvalue(angle[known], values[some[known]])
             agreed[first : first + chunk] = known
         left = left[~agreed]
@@ -146,20 +149,23 @@ def _courses(
 ) -> Complexes:
     """Return the states followed at so many points of each step, and the end (points, k).
 
+    What is remembered is followed at its ticks, and stays where it ends.
+
     Rows of numbers are of all modes, their real parts and then the imaginary ones: one product serves all.
     """
-    count, n = len(states), sum(site.b.shape[-2:])
-    below = np.eye(n)[len(site.kind.states) :]
+    count, n, n_x = len(states), sum(site.b.shape[-2:]), len(site.kind.states)
+    below = np.eye(n)[n_x:]
     steps, fine = {}, {}
     for duration, number in points.items():
         step = exponential_values(site.a, site.b, float(duration * schedule.quantum) / number)
         power = np.concatenate([step, np.broadcast_to(below, (len(step), *below.shape))], axis=1)
-        fine[duration], steps[duration] = _followed(power, states, number)
+        fine[duration], steps[duration] = _followed(power, np.minimum(states, n_x - 1), number)
     one_site = _of_one(site)
     if one_site:
         site = every_matrix(site, lambda matrix: matrix[0])
         steps = {duration: step[0] for duration, step in steps.items()}
     parts: list[NDArray[Any]] = []
+    computed: Mapping[Value, Floats] = {}
 
     def rows_of(numbers: Complexes) -> Floats:
         return np.concatenate([numbers.real.T, numbers.imag.T], axis=1)
@@ -170,7 +176,9 @@ def _courses(
         halves = rows.reshape(len(rows), 2, count)
         return np.asarray(np.einsum("khn,nck->hck", matrix, halves).reshape(-1, 2 * count))
 
-    def watch(duration: int, moving: Floats) -> None:
+    def watch(duration: int, moving: Floats, so_far: Mapping[Value, Floats]) -> None:
+        nonlocal computed
+        computed = so_far
         # Each mode's rows times its own columns: (points, k, 2).
         columns = moving.reshape(n, 2, count).transpose(2, 0, 1)
         parts.append((fine[duration] @ columns).swapaxes(0, 1))
@@ -187,6 +195,12 @@ def _courses(
         except StopIteration as end:
             last = end.value.reshape(-1, 2, count)[states, :, np.arange(count)]
             path = np.concatenate([*parts, last[None]])
+            for mode in np.flatnonzero(states >= n_x):
+                one = schedule.carried[states[mode] - n_x]
+                ticks = [replace(one, index=one.index + i) for i in range(schedule.ticks[one.partition])]
+                told = [computed[tick].reshape(2, count)[:, mode] for tick in ticks if tick in computed]
+                path[:, mode] = last[mode]
+                path[: len(told), mode] = told
             return np.asarray(path[..., 0] + 1j * path[..., 1])
 
 

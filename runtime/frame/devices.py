@@ -463,7 +463,7 @@ def _without_hands(kind: Kind, units: tuple[str | None, ...]) -> Kind | None:
                 numbers[place] = casadi.SX(0)
         return kind.derivative(x, u, casadi.vertcat(*numbers), t)
 
-    found = _rewritten(replace(kind, hands=()), kind, lambda x, p: x, rates)
+    found = rewritten(replace(kind, hands=()), kind, lambda x, p: x, rates)
     x, u, p, t = found.derivative.sx_in()
     left = casadi.depends_on(found.derivative(x, u, p, t), casadi.vertcat(*(p[place] for place in own)))
     return None if left else found
@@ -568,7 +568,7 @@ def _with_hand(
         return casadi.vertcat(rate[:velocity], row, rate[velocity + 1 :])
 
     larger = replace(kind, parameters=(*kind.parameters, *names))
-    return _rewritten(larger, kind, lambda x, p: x, rates)
+    return rewritten(larger, kind, lambda x, p: x, rates)
 
 
 @functools.lru_cache(maxsize=64)
@@ -589,16 +589,16 @@ def _without(kind: Kind, position: int, velocity: int) -> Kind:
         return casadi.vertcat(*(rate[place] for place in kept))
 
     smaller = replace(kind, states=tuple(kind.states[place] for place in kept))
-    return _rewritten(smaller, kind, whole, rates)
+    return rewritten(smaller, kind, whole, rates)
 
 
-def _rewritten(
+def rewritten(
     kind: Kind,
     before: Kind,
     whole: Callable[[Any, Any], Any],
     rates: Callable[[Any, Any, Any, Any], Any],
 ) -> Kind:
-    """Return a kind of other states or parameters with its functions.
+    """Return a kind of other states, parameters or more holds with its functions.
 
     Parameters
     ----------
@@ -607,17 +607,18 @@ def _rewritten(
     whole
         Gives the states of before, from those of now and the parameters.
     rates
-        Gives the rates of now, from the states of before, holds, the parameters of now and the time.
+        Gives the rates of now, from the states of before, the holds and parameters of now and the time.
     """
-    x, p = casadi.SX.sym("x", len(kind.states)), casadi.SX.sym("p", len(kind.parameters))
-    states = whole(x, p)
+    sizes = len(kind.states), len(kind.holds), len(kind.parameters)
+    x, u, p = (casadi.SX.sym(name, size) for name, size in zip("xup", sizes, strict=True))
+    states, held, own = whole(x, p), len(before.holds), len(before.parameters)
 
     def again(function: Any, body: Callable[..., Any] | None = None) -> Any:
-        """Return a function (x, …, p, t) over the states and parameters of now."""
-        _, *between, _, t = function.sx_in()
-        value = (body or function)(states, *between, p if body else p[: len(before.parameters)], t)
+        """Return a function (x, u, …, p, t) over the states, holds and parameters of now."""
+        _, _, *between, _, t = function.sx_in()
+        value = body(states, u, p, t) if body else function(states, u[:held], *between, p[:own], t)
         named = function.name_in(), function.name_out()
-        return casadi.Function(function.name(), [x, *between, p, t], [value], *named)
+        return casadi.Function(function.name(), [x, u, *between, p, t], [value], *named)
 
     def receiving(one: Receive) -> Receive:
         return one if one.edge is None else replace(one, edge=again(one.edge))

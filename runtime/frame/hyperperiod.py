@@ -8,6 +8,7 @@ Does not: say what happens at an instant (see `scheduling`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -123,10 +124,20 @@ def _check_frame_length(
             f"the clocks' common period is {float(frame * quantum):.6g} s, {ticks} ticks "
             f"({clocks}); at most {MOST_TICKS} can be analysed"
         )
-        least = float(frame * quantum) / MOST_TICKS
-        alone = len(count) == 1 or frame == max(count.values())
         hint = "periods that are simple multiples of one another"
-        hint = f"a period of {1000 * least:.2g} ms or more for the fastest clock" if alone else hint
         odd = max(system.clocks, key=lambda clock: period.get(clock.name, Fraction(0)).denominator)
+        if frame == max(count.values()) and (fits := _fastest_that_fits(count, frame)):
+            fastest = min(count, key=lambda name: count[name])
+            odd = next(clock for clock in system.clocks if clock.name == fastest)
+            periods = (1000 * frame * quantum / ticks for ticks in fits)
+            short = (f"{float(ms):g} ms" for ms in periods if Fraction(f"{float(ms):.3g}") == ms)
+            hint = f"{fastest}: {next(short, f'{frame * quantum / fits[0]} s')}"
         place = Place(system.origin.topology, odd.line, odd.column)
         raise ApcError(Mistake("E805", place, what, hint=hint))
+
+
+def _fastest_that_fits(count: Mapping[str, int], frame: int) -> range:
+    """Return how often the fastest clock may tick in the frame of all others, the most first."""
+    others = [frame // number for number in sorted(count.values())[1:]]
+    step = math.lcm(*others)
+    return range((MOST_TICKS - sum(others)) // step * step, 0, -step)

@@ -31,8 +31,8 @@ from apc.frame.site import LinearSite, every_matrix
 
 Matrix = NDArray[Any]
 
-# What is shown each step: its duration in quanta, and what moves as it begins.
-Watch = Callable[[int, Matrix], None]
+# What is shown each step: its duration in quanta, what moves as it begins, and all computed until then.
+Watch = Callable[[int, Matrix, Mapping[Value, Matrix]], None]
 
 # Packets that a peer sends or hears in a frame, each a row or column of the frame's map and of the loop's.
 MOST_PACKETS = 1000
@@ -284,8 +284,9 @@ def follow(
     numbers
         What all is of.
     watch
-        Is shown each step before it is made: its duration in quanta, and the continuous states above what the
-        holds put out (n_x + n_u, columns). Without it, what comes again and again is played once.
+        Is shown each step before it is made: its duration in quanta, the continuous states above what the
+        holds put out (n_x + n_u, columns), and a table that what is computed is added to. Without it, what
+        comes again and again is played once.
 
     Yields
     ------
@@ -393,7 +394,7 @@ class _Playing:
             match event:
                 case Propagate(duration):
                     if self.watch is not None:
-                        self.watch(duration, moving)
+                        self.watch(duration, moving, value)
                     moving[..., :n_x, :] = self.multiply(self.steps[duration][..., :n_x, :], moving)
                 case Act(hold, one):
                     moving[..., n_x + hold, :] = value.get(one, at.nothing)

@@ -9,7 +9,6 @@ Does not: look at numbers other than times.
 
 from __future__ import annotations
 
-import decimal
 import functools
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,6 +18,7 @@ import numpy as np
 
 from apc.compiler.compiled import Clock, CompiledSystem, Kind, Link
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.words import no_more
 from apc.frame.exchange import Exchange, build_exchange
 from apc.frame.hyperperiod import ClockGrid, Times, times_in_use
 from apc.frame.liveness import Hearing, hearing_of, live_holds, live_outputs, live_receives
@@ -186,9 +186,8 @@ def _check_held(
             f"and do not act yet; at most {MOST_HELD:,} can be analysed"
         )
         left = MOST_HELD - (number - held[longest])
-        three = decimal.Context(prec=3, rounding=decimal.ROUND_FLOOR)
-        most = float(three.create_decimal_from_float(float(seconds * left / held[longest])))
-        fits = f"{longest.rpartition('.')[2]}: {most:g} s, or a slower clock" if left > 0 else ""
+        most = no_more(seconds * left / held[longest], 3)
+        fits = f"{longest.rpartition('.')[2]}: {most} s, or a slower clock" if left > 0 else ""
         hint = fits or "shorter delays of all forces, or a slower clock"
         raise ApcError(Mistake("E805", Place(system.origin.topology), what, hint=hint))
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.language.vectors import whole_and_index
+from apc.compiler.words import no_more
 from apc.frame.parameters import resolve
 from apc.option_value import option_value
 
@@ -152,7 +153,7 @@ def check_frequencies(system: CompiledSystem, found: Floats) -> None:
     """Refuse frequencies that no response is told of: ApcError E935."""
     most = _fastest(system) / 2
     place = Place(system.origin.topology)
-    hint = f"{most:.6g} Hz at most"
+    hint = f"{no_more(most)} Hz at most"
     if not found.size or not np.isfinite(found).all() or found.min() <= 0:
         got = "none" if not found.size else f"{found.min():.6g} Hz"
         raise ApcError(Mistake("E935", place, "a frequency", "above 0 Hz", got, "0.1 Hz"))

@@ -10,7 +10,7 @@ Does not: look at how a hand answers back (see `passivity`), or at packets that 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any, Unpack
 
@@ -69,13 +69,15 @@ class Extremes:
     """H∞ norms of one mode: of the velocity of devices, and of how far a copy is from the others, a newton.
 
     `on_ticks` with forces held, and motions read, at the instants at which something happens; `sampled_data`
-    with forces of any course. `of` is what moves; a copy's is None in a mode in which all move alike.
+    with forces of any course, whose largest gain is `gains` (k,) at each frequency that was asked for.
+    `of` is what moves; a copy's is None in a mode in which all move alike.
     """
 
     mode: str
     of: str
     on_ticks: Peak
     sampled_data: Peak
+    gains: Floats = field(compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,7 +199,7 @@ def feel(
         steady = verdict.stable is not False
         slow = _slow(answers) if "low_frequency" in beside else None
         viscosity = _viscosity(system, slow, port, other) if slow and "network_viscosity" in beside else None
-        hinf = _extremes(answers) if steady and "hinf" in beside else ()
+        hinf = _extremes(answers, found) if "hinf" in beside else ()
         h2 = _noise(system, answers) if steady and "h2" in beside else ()
     linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
     here, there = (
@@ -286,8 +288,8 @@ def _slow(felt: Responses) -> Slow | None:
     return best
 
 
-def _extremes(felt: Responses) -> tuple[Extremes, ...]:
-    """Return the H∞ norms of the modes that the pushed peer is in."""
+def _extremes(felt: Responses, frequency_hz: Floats) -> tuple[Extremes, ...]:
+    """Return the H∞ norms, and gains at frequencies (k,), of the modes that the pushed peer is in."""
     found, copy = [], felt.copies[felt.own]
     for number, site, _ in felt.parts:
         loop, basis = felt.loops[number], felt.bases[number]
@@ -295,8 +297,8 @@ def _extremes(felt: Responses) -> tuple[Extremes, ...]:
         if number and copy is not None:
             rows.append(("error", copy[1]))
         for name, row in rows:
-            peaks = (one(loop, site, site, row, basis) for one in (tick_peak, sampled_data_peak))
-            found.append(Extremes(loop.name, name, *peaks))
+            own = (loop, site, site, row, basis)
+            found.append(Extremes(loop.name, name, tick_peak(*own), *sampled_data_peak(*own, frequency_hz)))
     return tuple(found)
 
 

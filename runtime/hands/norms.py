@@ -23,7 +23,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.dissipation import peak_gain
+from apc.eigen.dissipation import gains_at, peak_gain
 from apc.eigen.relative import relative, relative_coordinates, relative_rows, with_doubt
 from apc.frame.discretize import UNIT, exponential_values
 from apc.frame.radius import RADII, radius_of, value_of, with_radius
@@ -61,26 +61,44 @@ def tick_peak(loop: Pushed, pushed: int, of: int, row: int, basis: Floats) -> Pe
     basis
         The rigid motions (n, d) of the mode.
     """
-    return _peak(loop, pushed, of, row, basis, np.zeros(1), np.ones(1))
+    return _peak(loop, pushed, of, row, basis, np.zeros(1), np.ones(1), np.zeros(0))[0]
 
 
-def sampled_data_peak(loop: Pushed, pushed: int, of: int, row: int, basis: Floats) -> Peak:
+def sampled_data_peak(
+    loop: Pushed, pushed: int, of: int, row: int, basis: Floats, frequency_hz: Floats
+) -> tuple[Peak, Floats]:
     """Return the norm of the same map from forces of any course to motions between ticks as well.
+
+    With its gains at frequencies (k,). Of these the norm is the largest where the mode is stable; it is
+    infinite where it is not.
 
     Parameters
     ----------
     loop, pushed, of, row, basis
         As for `tick_peak`.
+    frequency_hz
+        (k,), in Hz.
     """
     gauss = (np.polynomial.legendre.leggauss(nodes) for nodes in (NODES, NODES + MORE))
-    few, many = (_peak(loop, pushed, of, row, basis, (at + 1) / 2, share / 2) for at, share in gauss)
+    (few, _), (many, gains) = (
+        _peak(loop, pushed, of, row, basis, (at + 1) / 2, share / 2, frequency_hz) for at, share in gauss
+    )
     if not np.isfinite(many.norm):
-        return many
-    return replace(many, error=abs(many.norm - few.norm) + many.error)
+        return many, gains
+    return replace(many, error=abs(many.norm - few.norm) + many.error), gains
 
 
-def _peak(loop: Pushed, pushed: int, of: int, row: int, basis: Floats, at: Floats, weights: Floats) -> Peak:
-    """Return the norm with forces and motions taken at nodes (q,) of each interval, 0 to 1, by weight."""
+def _peak(
+    loop: Pushed,
+    pushed: int,
+    of: int,
+    row: int,
+    basis: Floats,
+    at: Floats,
+    weights: Floats,
+    frequency_hz: Floats,
+) -> tuple[Peak, Floats]:
+    """Return norm and gains with forces and motions at nodes (q,) of each interval, 0 to 1, by weight."""
     site, other, nodes = loop.sites[pushed], loop.sites[of], len(at)
     # A force of one value at its node and none at the others, as coefficients of σ^i/i!, σ from 0 to 1.
     powers = at[:, None] ** np.arange(nodes) / np.cumprod([1, *range(1, nodes)])
@@ -106,18 +124,21 @@ def _peak(loop: Pushed, pushed: int, of: int, row: int, basis: Floats, at: Float
             through[own, own] = scale * pushes / float(seconds) ** 0.5
     c = outputs @ value_of(loop.c)
     if _shows(basis, c):
-        return Peak(np.inf, 0.0, 0.0)
+        return Peak(np.inf, 0.0, 0.0), np.full(len(frequency_hz), np.inf)
     to = relative_coordinates(basis)
     b, c = relative_rows(value_of(loop.k) @ inputs, to), c[:, to.rest]
     a = relative(loop.m, with_doubt(to), RADII)
-    gain, angle = peak_gain(value_of(a), b, c, outputs @ value_of(loop.d) @ inputs + through)
+    d = outputs @ value_of(loop.d) @ inputs + through
+    turn = 2 * np.pi * float(loop.frame)
+    gains = gains_at(value_of(a), b, c, d, turn * frequency_hz)
+    gain, angle = peak_gain(value_of(a), b, c, d)
     if not np.isfinite(gain):
-        return Peak(np.inf, 0.0, 0.0)
+        return Peak(np.inf, 0.0, 0.0), gains
     # What the state's matrix is off by moves the gain there, to first order, by so much.
     still = np.exp(1j * angle) * np.eye(len(b)) - value_of(a)
     left, right = np.abs(np.linalg.solve(still.T, c.T)).T, np.abs(np.linalg.solve(still, b))
     off = float(np.linalg.norm(left @ radius_of(a) @ right, 2)) + ROUNDED * gain
-    return Peak(gain, off, angle / (2 * np.pi * float(loop.frame)))
+    return Peak(gain, off, angle / turn), gains
 
 
 def _lanes(site: Site, seconds: float, count: int) -> Floats:

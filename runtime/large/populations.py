@@ -19,7 +19,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import Feedback, close, lay_out
 from apc.eigen.peers import states_of
-from apc.eigen.spectrum import oscillation
+from apc.eigen.spectrum import LEAST_SHARE, oscillation
 from apc.frame.course import turns
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.lift import FrameMap, lift
@@ -178,10 +178,11 @@ def turned_by(
     z, heard, covector
         The peer's state (n,), what it hears (n_r,) and what weighs its state (n,).
     """
-    count = len(site.kind.states)
-    if not count:
+    if not len(z):
         return 0.0, 1.0
-    state = np.array([int(np.argmax(np.abs(covector[:count] * z[:count])))])
+    taking, count = np.abs(covector * z), len(site.kind.states)
+    moves = taking[:count].max(initial=0.0) > LEAST_SHARE * taking.sum()
+    state = np.array([int(np.argmax(taking[:count] if moves else taking))])
     site = every_matrix(site, lambda matrix: matrix[None])
     angle = turns(site, schedule, z[None], heard[None], state, np.array([value]))
     return oscillation(abs(value), float(angle[0]), float(schedule.frame_s))

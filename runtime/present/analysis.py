@@ -15,9 +15,10 @@ from math import floor, isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from apc.compiler.words import counted, in_hertz, measured, wrapped
+from apc.compiler.words import counted, in_hertz, wrapped
 from apc.present.forms import (
     LINEARIZED,
+    NEAR,
     Lines,
     Plain,
     document,
@@ -26,6 +27,7 @@ from apc.present.forms import (
     notes,
     picked,
     quantity,
+    radius_text,
     record,
     sentences,
     table,
@@ -131,7 +133,7 @@ def analysis_text(result: Analysis) -> Lines:
     yield ""
     yield from sentences(*words.splitlines())
     yield ""
-    radius = measured(result.spectral_radius, result.spectral_radius_error)
+    radius = radius_text(result.spectral_radius, result.spectral_radius_error, result.beyond)
     unfelt = f"{listed(result.unfelt, MOST_UNFELT)}, which nothing that moves reads at these values"
     yield from labelled(
         ("spectral radius", f"{radius} per frame of {quantity(result.frame_s, 's')}"),
@@ -188,7 +190,7 @@ def answer_text(found: Answer) -> Lines:
 
 def _in_short(found: Analysis) -> str:
     """Return the verdict of the nominal network, beside that of the network as it is."""
-    radius = measured(found.spectral_radius, found.spectral_radius_error)
+    radius = radius_text(found.spectral_radius, found.spectral_radius_error, found.beyond)
     text = (
         f"With every packet on time: {found.verdict}, spectral radius {radius} per frame of "
         f"{found.frame_s * 1000:.6g} ms (apc analyze --nominal says all of it)."
@@ -272,13 +274,15 @@ def _cells(mode: Mode) -> tuple[str, ...]:
         mode.shape,
         str(mode.multiplicity),
         in_hertz(mode.frequency_hz) if mode.frequency_hz else "–",
-        "–" if isnan(mode.damping_ratio) else f"{mode.damping_ratio:.3g}",
+        "–" if isnan(mode.damping_ratio) else f"{mode.damping_ratio + 0.0:.3g}",
         _leading(mode),
     )
 
 
 def _magnitude(mode: Mode) -> str:
     """Return a magnitude to six digits behind the point, fewer where its error leaves them open."""
+    if mode.error < abs(mode.magnitude - 1) < 10.0**-DECIMALS / 2:
+        return f"1 {'−' if mode.magnitude < 1 else '+'} {abs(mode.magnitude - 1):.0e}"
     if mode.magnitude >= LARGE:
         return f"{mode.magnitude:.6e}"
     known = -math.floor(math.log10(mode.error)) - 1 if 0 < mode.error < math.inf else DECIMALS
@@ -392,7 +396,8 @@ def contact_modes_text(found: ContactModes) -> Lines:
             rows.append(("–", "–", "not analysed", mode.name))
             refused.append(f"{mode.name}: not analysed: {mode.refusal}")
             continue
-        radius = measured(mode.spectral_radius, max(mode.spectral_radius_error, SHOWN))
+        error = max(mode.spectral_radius_error, SHOWN if abs(mode.spectral_radius - 1) > NEAR else 0.0)
+        radius = radius_text(mode.spectral_radius, error, mode.beyond)
         frequency = in_hertz(mode.frequency_hz) if mode.frequency_hz else "–"
         verdict = mode.verdict.partition(" up to ")[0].partition(":")[0]
         rows.append((radius, frequency, verdict + "*" * mode.linearized, mode.name))
@@ -452,7 +457,7 @@ def conventions_text(found: Conventions) -> Lines:
         headline = "the verdict depends on the conventions"
     yield f"{found.topology}: {headline}\n"
     for number, one in enumerate(found.outcomes, 1):
-        radius = measured(one.spectral_radius, one.spectral_radius_error)
+        radius = radius_text(one.spectral_radius, one.spectral_radius_error, one.beyond)
         yield f"  {number}  {one.verdict or 'not analysed'}"
         yield f"     spectral radius {radius}" if one.verdict else f"     {one.refusal}"
         yield from (f"     {departure}" for departure in one.departures or (DEFAULT,))

@@ -19,7 +19,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apc.compiler.words import counted, known_digits, measured, with_unit, wrapped
-from apc.present.forms import MEANT, Lines, Plain, notes, picked, quantity, reached, record, table
+from apc.present.forms import (
+    MEANT,
+    Lines,
+    Plain,
+    notes,
+    picked,
+    quantity,
+    radius_text,
+    reached,
+    record,
+    table,
+)
 from apc.present.pictures import COLOURS, new_figure
 from apc.tables import Column, Row, Tabled
 
@@ -125,7 +136,7 @@ def _verdict(one: Scheme, feet: dict[str, int]) -> tuple[str, str]:
     told = list(_why(one, "verdict"))
     if one.network is not None and one.network.mean_square_radius is not None:
         root, error = math.sqrt(one.network.mean_square_radius), one.network.error or 0.0
-        grown = measured(root, error / (2 * root) if root else error)
+        grown = radius_text(root, error / (2 * root) if root else error)
         told.append(
             "the radius is that with every packet on time; "
             f"mean squares are multiplied by {grown} squared a frame"
@@ -133,7 +144,8 @@ def _verdict(one: Scheme, feet: dict[str, int]) -> tuple[str, str]:
     if one.passive is not None:
         told.append("the radius is that with free hands")
     verdict = one.verdict + (", linearized" if one.analysis.linearized else "")
-    radius = measured(one.analysis.spectral_radius, one.analysis.spectral_radius_error)
+    found = one.analysis
+    radius = radius_text(found.spectral_radius, found.spectral_radius_error, found.beyond)
     return verdict, _marked(radius, told, feet)
 
 

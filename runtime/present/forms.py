@@ -1,8 +1,8 @@
 """The forms that all results share: plain data, JSON, notes, labelled lines and tables.
 
 Takes: frozen values, texts.
-Gives: `Plain`, `document`, `record`, `picked`, `reached`, `json_text`; `quantity`, `axis_label`, `listed`;
-`Lines`, `notes`, `sentences`, `labelled`, `table`; `MEANT`.
+Gives: `Plain`, `document`, `record`, `picked`, `reached`, `json_text`; `radius_text`, `quantity`,
+`axis_label`, `listed`; `Lines`, `notes`, `sentences`, `labelled`, `table`; `MEANT`.
 Guarantees: a document is made of what JSON has words for; the same value gives the same text; a line is at
 most 80 columns wide where its words allow it.
 Does not: know a result.
@@ -17,7 +17,7 @@ from dataclasses import fields, is_dataclass
 from fractions import Fraction
 from typing import Any
 
-from apc.compiler.words import with_unit, wrapped
+from apc.compiler.words import measured, with_unit, wrapped
 from apc.later import Later
 from apc.result import Result
 
@@ -32,6 +32,9 @@ Plain = dict[str, Any]
 
 # A text as its result has it: line by line, each at most 80 columns wide.
 Lines = Iterator[str]
+
+# What is nearer to 1 is told by its distance, to so many digits at most.
+NEAR, TOLD = 1e-6, 1e-4
 
 LINEARIZED = ", linearized at its start"
 
@@ -100,6 +103,25 @@ def json_text(found: Any, *, indent: int | None = 2) -> str:
     JSON has no word for what is no finite number: null stands in its place, as in `document`.
     """
     return json.dumps(document(found), ensure_ascii=False, allow_nan=False, indent=indent)
+
+
+def radius_text(radius: float, error: float, beyond: tuple[float, float] | None = None) -> str:
+    """Return a spectral radius with its error: near 1 by how far it is from it, "1 − 3.2e-15 ± 9e-16".
+
+    Parameters
+    ----------
+    radius, error
+        The radius and its error.
+    beyond
+        How much larger than 1 it is, at least and at most, where that is better known.
+    """
+    low, high = beyond or (radius - 1 - error, radius - 1 + error)
+    away, off = (low + high) / 2, (high - low) / 2
+    if not off < abs(away):
+        return measured(radius, error)
+    if abs(away) >= NEAR:
+        return measured(1 + away, off) if abs(radius - 1) <= error else measured(radius, error)
+    return f"1 {'−' if away < 0 else '+'} {measured(abs(away), max(off, abs(away) * TOLD))}"
 
 
 def quantity(value: float, unit: str, digits: int = 6) -> str:

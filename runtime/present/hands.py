@@ -14,7 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.words import known_digits, measured, wrapped
-from apc.present.forms import LINEARIZED, Lines, Plain, document, labelled, notes, record, sentences, table
+from apc.present.forms import (
+    LINEARIZED,
+    Lines,
+    Plain,
+    document,
+    labelled,
+    notes,
+    radius_text,
+    record,
+    sentences,
+    table,
+)
 from apc.present.pictures import COLOURS, new_figure
 from apc.tables import Column, Tabled
 
@@ -45,7 +56,7 @@ def passive_text(found: PassiveHands) -> Lines:
             "Take the velocity by a backward difference of samples, as VirtualWall does, or none (damping 0)."
         )
     yield ""
-    clamped = measured(found.clamped_radius, found.clamped_error)
+    clamped = radius_text(found.clamped_radius, found.clamped_error)
     moves = f"spectral radius {clamped}" if found.clamped_radius or found.clamped_error else "nothing moves"
     yield from labelled(("devices clamped", moves), ("proof", found.proof))
     if found.modes:
@@ -135,7 +146,7 @@ def feel_text(found: Feel) -> Lines:
     told += ["alias: the largest part that sampling moves to another frequency, beside that at this one"]
     yield ""
     yield from sentences("; ".join(told))
-    if found.hinf:
+    if found.hinf and found.stable is not False:
         yield "\n  Largest gain at any frequency (H∞), forces of any course:"
         yield from table([_extreme(one) for one in found.hinf])
     for one in found.h2:  # of a sample that is off by a mm, a µm is what a mm is of 1 N

@@ -14,8 +14,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from apc.compiler.words import counted, measured, wrapped
-from apc.present.forms import LINEARIZED, Lines, Plain, labelled, notes, record, sentences
+from apc.compiler.words import counted, wrapped
+from apc.present.forms import LINEARIZED, Lines, Plain, labelled, notes, radius_text, record, sentences
 
 if TYPE_CHECKING:
     from apc.moments.network import NetworkVerdict
@@ -39,9 +39,9 @@ def network_text(found: NetworkVerdict) -> Lines:
         yield from sentences(_WORDS[found.verdict.removeprefix("probably ")])
         yield ""
         error, root = found.error or 0.0, math.sqrt(radius)
-        rooted = measured(root, error / (2 * root) if root else error)
+        rooted = radius_text(root, error / (2 * root) if root else error)
         yield from labelled(
-            ("mean squares", f"multiplied by {measured(radius, error)} a frame"),
+            ("mean squares", f"multiplied by {radius_text(radius, error)} a frame"),
             ("their root", f"{rooted}, to compare with a spectral radius"),
         )
     if found.rms_error_m is not None:

@@ -13,10 +13,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
 from apc.answer import answer
 from apc.compiler.pipeline import compile_topology
 from apc.compiler.view.listing import diagram_of
-from apc.optional import need
 from apc.present.graph import graph_picture
 from apc.present.pictures import svg_image
 
@@ -29,22 +31,17 @@ def page(template: str, **told: Any) -> str:
     Raises
     ------
     ApcError
-        E875 Jinja or matplotlib is not installed.
+        E875 matplotlib is not installed.
     """
-    jinja = need("jinja2", "plot")
-    markup = need("markupsafe", "plot").Markup
-    every = jinja.Environment(
-        loader=jinja.PackageLoader("apc.present", ""), autoescape=True, undefined=jinja.StrictUndefined
+    every = Environment(loader=PackageLoader("apc.present", ""), autoescape=True, undefined=StrictUndefined)
+    return every.get_template(template).render(
+        **told, image=lambda figure, title: Markup(svg_image(figure, title))
     )
-    filled: str = every.get_template(template).render(
-        **told, image=lambda figure, title: markup(svg_image(figure, title))
-    )
-    return filled
 
 
-def inert(text: str) -> Any:
+def inert(text: str) -> Markup:
     """Return JSON that stands in a page as it is: no tag begins in it."""
-    return need("markupsafe", "plot").Markup(text.replace("<", "\\u003c"))
+    return Markup(text.replace("<", "\\u003c"))
 
 
 def gallery_page(topologies: Sequence[Path]) -> str:

@@ -31,6 +31,7 @@ from apc.tuning.bound import SHARE
 from apc.tuning.demands import RADIUS, SETTLING
 
 if TYPE_CHECKING:
+    from apc.compiler.compiled import CompiledSystem
     from apc.tuning.front import Front
     from apc.tuning.tune import Binding, Tuning
 
@@ -154,17 +155,22 @@ def _binding_lines(found: Tuning, one: Binding) -> Lines:
         yield from wrapped(text, "      ", "        ")
 
 
+def panels_of(system: CompiledSystem, gains: int) -> tuple[bool, bool]:
+    """Say whether a picture of so many gains has a stable region, and a strike: ApcError E996 if neither."""
+    two, moves = gains == 2, any(state.unit == "m/s" for kind in system.kinds for state in kind.states)
+    if not (two or moves):
+        what = "nothing moves in this scene, and a stable region is of two gains"
+        raise ApcError(Mistake("E996", Place("--plot"), what, hint='another --free "PATH=LO:HI"'))
+    return two, moves
+
+
 def tuning_picture(found: Tuning, ax: Any = None) -> Any:
     """Draw two gains over the stable regions, and what a strike comes to now and with the gains found.
 
     Into an Axes that is given only the first of them is drawn, of any other number of gains the second; the
     first Axes is returned.
     """
-    moves = any(state.unit == "m/s" for kind in found.scenes[0].kinds for state in kind.states)
-    two = len(found.ranges) == 2
-    if not (two or moves):
-        what = "nothing moves in this scene, and a stable region is of two gains"
-        raise ApcError(Mistake("E996", Place("--plot"), what, hint='another --free "PATH=LO:HI"'))
+    two, moves = panels_of(found.scenes[0], len(found.ranges))
     panels = [*[_draw_gains] * two, *[_draw_struck] * moves]
     axes = [ax] if ax else new_figure((5.0 * len(panels), 4.4)).subplots(1, len(panels), squeeze=False)[0]
     for draw, one in zip(panels, axes, strict=False):

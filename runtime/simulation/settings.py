@@ -24,6 +24,7 @@ from fractions import Fraction
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.words import no_more
 
 EXACT, RK4, SEMI_IMPLICIT, CVODES = "exact", "rk4", "semi-implicit", "cvodes"
 WHERE_NEEDED = "exact where linear"
@@ -157,7 +158,7 @@ def check_step(system: CompiledSystem, method: Method, fastest: Fraction, longes
     place, what = Place(system.origin.topology), f"the step of {method.name}"
     if method.step > fastest:
         expected = f"at most the period of the fastest clock, {_ms(fastest)}"
-        hint = f"--method {method.name}:{_ms(fastest).replace(' ', '')}"
+        hint = f"--method {method.name}:{no_more(1000 * fastest)}ms"
         raise ApcError(Mistake("E913", place, what, expected, _ms(method.step), hint))
     if longest / method.step > MOST_STEPS:
         expected = f"at least {_ms(longest / MOST_STEPS)}, a millionth of the time between two events"

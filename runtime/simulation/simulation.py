@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
+from apc.compiler.words import no_more
 from apc.finite_equations import finite_equations
 from apc.frame.ages import stamped
 from apc.frame.exchange import Exchange, build_exchange
@@ -214,7 +215,7 @@ def check_length(system: CompiledSystem, duration: Fraction, *, runs: int = 1) -
     longest = float(MOST_ROWS * row / runs)
     each = f" in each of {runs:,} runs" if runs > 1 else ""
     expected = f"at most {longest:.6g} s{each}: a row a tick, {MOST_ROWS:,} in all"
-    got, hint = f"{float(duration):.6g} s", f'--duration "{longest:.6g} s"'
+    got, hint = f"{float(duration):.6g} s", f'--duration "{no_more(longest)} s"'
     raise ApcError(Mistake("E915", Place(system.origin.topology), "the duration", expected, got, hint))
 
 

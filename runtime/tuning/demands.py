@@ -2,7 +2,7 @@
 
 Takes: a `CompiledSystem` and texts such as `coordination.stiffness=10 N/m:5000 N/m`.
 Gives: `Aim`, `Felt`, `Demands`, `read_demands`, `read_against`, `held_as_studied`, `read_seconds`; `PLACE`,
-`RADIUS`, `SETTLING`.
+`RADIUS`, `SETTLING`, `HINF`.
 Guarantees: what can't be meant is refused before anything is computed.
 Does not: compute.
 """
@@ -37,14 +37,19 @@ FREE, AIM, SUBJECT, OVER, AGAINST = (
 # What may be minimized beside a gain.
 RADIUS, SETTLING = "spectral_radius", "settling_time"
 
+# What is felt that has a frequency of its own: where it is largest.
+HINF = "error_hinf"
+
 # What hands feel, by its name in a demand: its unit, and whether it is at a frequency. `error_h2` is the rms
-# of a copy's error for white forces of 1 N rms at all hands.
+# of a copy's error for white forces of 1 N rms at all hands, `error_hinf` the largest gain of any mode from
+# forces of any course to it.
 FELT = {
     "impedance": ("N*s/m", True),
     "transmitted": ("m/s/N", True),
     "error": ("m/N", True),
     "damping": ("N*s/m", False),
     "error_h2": ("m/N", False),
+    HINF: ("m/N", False),
 }
 
 # A sign that stands in a name, and in no exponent.
@@ -119,6 +124,17 @@ class Demands:
     def measured(self) -> tuple[Felt, ...]:
         """All that has to be known of what hands feel: the demands, then the terms of the aim."""
         return (*self.felt, *(one for _, one in self.aim.terms if isinstance(one, Felt)))
+
+    def at_frequency(self, frequency_hz: float) -> Demands:
+        """Return the same with what is largest over all frequencies at one of them."""
+
+        def there(one: Felt) -> Felt:
+            return replace(one, frequency_hz=frequency_hz) if one.name == HINF else one
+
+        terms = tuple(
+            (weight, there(one) if isinstance(one, Felt) else one) for weight, one in self.aim.terms
+        )
+        return replace(self, felt=tuple(map(there, self.felt)), aim=replace(self.aim, terms=terms))
 
     @property
     def over(self) -> tuple[Range, ...]:

@@ -17,6 +17,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -32,7 +33,7 @@ from apc.eigen.eigenpairs import eigenvalues
 from apc.frame.overrides import Override, apply
 from apc.hands.feel import feel
 from apc.threads import load_pool
-from apc.tuning.demands import PLACE, SUBJECT, Demands, Felt
+from apc.tuning.demands import HINF, PLACE, SUBJECT, Demands, Felt
 from apc.vary.batch import BatchEvaluator, MatrixSource
 from apc.vary.delay_box import standing_delays
 from apc.vary.evaluator import evaluator_of_many
@@ -53,8 +54,12 @@ RESPONSES = {
     "transmitted": ("transmitted_admittance", "transmitted_bound"),
     "error": ("error_per_force", "error_bound"),
 }
-PART_OF = {"damping": "low_frequency", "error_h2": "h2"}
+PART_OF = {"damping": "low_frequency", "error_h2": "h2", HINF: "hinf"}
 TINY = 1e-300
+
+# The lowest frequency in Hz at which the largest gain is looked for, the first; how much larger than at those
+# known it has to be, as a share, for its own to be one of them.
+SLOWEST, LARGER = 1e-3, 1e-6
 
 # Points of a grid along each range of a box; how near to the top of what limits gains there it is followed.
 GRID, POWELL = 5, {"xtol": 1e-5, "ftol": 1e-12}
@@ -89,14 +94,16 @@ class Rows:
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """What limits the gains of a scene."""
+    """What limits the gains of a scene; after the time `until` of several points only the first is judged."""
 
     system: CompiledSystem
     prepared: Prepared
     demands: Demands
+    until: float = math.inf
     known: dict[int, MatrixSource] = field(default_factory=dict)
     samples: dict[Scenario, Floats] = field(default_factory=dict)
-    felt: dict[tuple[int, tuple[float, ...]], Floats] = field(default_factory=dict)
+    felt: dict[tuple[int, tuple[float, ...], int], Floats] = field(default_factory=dict)
+    frequencies: list[float] = field(default_factory=lambda: [SLOWEST])
 
     @cached_property
     def settings(self) -> list[tuple[tuple[Override, ...], CompiledSystem]]:
@@ -121,6 +128,11 @@ class Limits:
     def allowed(self) -> float:
         """What ln |λ| of a frame may be at most."""
         return math.log(self.demands.decay) * float(self.prepared.schedules[0].frame_s)
+
+    @property
+    def late(self) -> bool:
+        """Whether the time is up."""
+        return time.monotonic() > self.until
 
     @property
     def by_growth(self) -> bool:
@@ -153,12 +165,19 @@ class Limits:
 
     def worst(self, scenarios: Sequence[Scenario], chosen: Floats) -> Floats:
         """Return the largest value in each scenario (k, s) with columns (k, m)."""
-        found = np.empty((len(chosen), len(scenarios)))
-        for place, one in enumerate(scenarios):
-            points = np.hstack([chosen, np.tile(one.point, (len(chosen), 1))])
-            sizes = [_sizes(matrix) for matrix in self.family(one.setting).matrices(self._numbers(points))]
-            grown = np.max([np.full(len(chosen), NONE), *sizes], axis=0) - self.allowed
-            found[:, place] = np.max([grown, *self.asked(one.setting, points).T], axis=0)
+        found = np.full((len(chosen), len(scenarios)), BEYOND)
+        size = 1 if self.slow else len(chosen)
+        for begin in range(0, len(chosen), size):
+            if begin and self.late:
+                break
+            some = slice(begin, begin + size)
+            for place, one in enumerate(scenarios):
+                points = np.hstack([chosen[some], np.tile(one.point, (len(chosen[some]), 1))])
+                sizes = [
+                    _sizes(matrix) for matrix in self.family(one.setting).matrices(self._numbers(points))
+                ]
+                grown = np.max([np.full(len(points), NONE), *sizes], axis=0) - self.allowed
+                found[some, place] = np.max([grown, *self.asked(one.setting, points).T], axis=0)
         return found
 
     def _numbers(self, points: Floats) -> Floats:
@@ -190,13 +209,42 @@ class Limits:
         point = low + np.clip(top.x, 0, 1) * (high - low)
         return Scenario(setting, tuple(point.tolist())), -float(top.fun) - self.allowed
 
-    def asked(self, setting: int, points: Floats, *, bounded: bool = False) -> Floats:
+    @property
+    def views(self) -> list[Demands]:
+        """The demands with what is largest over all frequencies at each of those known: smooth limits all."""
+        if all(one.name != HINF for one in self.demands.measured):
+            return [self.demands]
+        return [self.demands.at_frequency(one) for one in self.frequencies]
+
+    def heard(self, scenarios: Sequence[Scenario], chosen: Floats) -> bool:
+        """Add frequencies at which gains are larger, with columns (m,), than at those known; say if any are.
+
+        Notes
+        -----
+        The exchange method for a limit at every frequency (Hettich and Kortanek, SIAM Rev. 35 (1993) 380).
+        """
+        before = len(self.frequencies)
+        for one in scenarios:
+            point = np.append(chosen, one.point)[None]
+            known = np.max([self.asked(one.setting, point, view=view) for view in self.views], axis=0)
+            peaks = self.measured(one.setting, self._numbers(point), self.demands)[0, :, 2]
+            if (self.asked(one.setting, point) > known + LARGER).any():
+                named = zip(self.demands.measured, np.maximum(peaks, SLOWEST).tolist(), strict=True)
+                new = [peak for felt, peak in named if felt.name == HINF]
+                self.frequencies.extend(peak for peak in new if peak not in self.frequencies)
+        return len(self.frequencies) > before
+
+    def asked(
+        self, setting: int, points: Floats, *, bounded: bool = False, view: Demands | None = None
+    ) -> Floats:
         """Return how far points (k, m + b) are from the demands on what is felt, and the level (k, q).
 
-        With `bounded` they are so far at least, with what rounding leaves open of what is felt.
+        With `bounded` they are so far at least, with what rounding leaves open of what is felt. Where a gain
+        is the largest over all frequencies, a `view` takes it at one.
         """
-        demands, aim = self.demands, self.demands.aim
-        felt = self.measured(setting, self._numbers(points))
+        demands = view or self.demands
+        aim = demands.aim
+        felt = self.measured(setting, self._numbers(points), demands)
         off = felt[..., 1] if bounded else np.zeros(felt.shape[:2])
         count = len(demands.felt)
         found = np.log(np.maximum(felt[:, :count, 0] + off[:, :count], TINY))
@@ -204,38 +252,43 @@ class Limits:
         if aim.level or aim.fixed is not None:
             level = points[:, len(demands.free)] if aim.fixed is None else np.full(len(points), aim.fixed)
             weights = [abs(weight) for weight, one in aim.terms if isinstance(one, Felt)]
-            beyond = (-1 if aim.larger else 1) * (self.sums(setting, points) - level) + off[
-                :, count:
-            ] @ weights
+            short = (-1 if aim.larger else 1) * (self.sums(setting, points, demands) - level)
+            beyond = short + off[:, count:] @ weights
             found = np.column_stack([found, beyond / aim.scale])
         return np.asarray(np.clip(np.nan_to_num(found, nan=BEYOND), NONE, BEYOND))
 
-    def sums(self, setting: int, points: Floats) -> Floats:
+    def sums(self, setting: int, points: Floats, view: Demands | None = None) -> Floats:
         """Return the weighted sum that is the aim (k,) at points (k, m + b), NaN where nothing is known."""
-        felt = iter(self.measured(setting, self._numbers(points))[:, len(self.demands.felt) :, 0].T)
-        terms = self.demands.aim.terms
-        parts = [weight * (next(felt) if isinstance(one, Felt) else points[:, one]) for weight, one in terms]
+        demands = view or self.demands
+        felt = iter(self.measured(setting, self._numbers(points), demands)[:, len(demands.felt) :, 0].T)
+        parts = [
+            weight * (next(felt) if isinstance(one, Felt) else points[:, one])
+            for weight, one in demands.aim.terms
+        ]
         total = np.asarray(np.sum(parts, axis=0))
         return np.where(np.isfinite(total), total, np.nan)
 
-    def measured(self, setting: int, numbers: Floats) -> Floats:
-        """Return what is felt with gains and box (k, n), and what it may be off by (k, q, 2).
+    def measured(self, setting: int, numbers: Floats, view: Demands) -> Floats:
+        """Return what is felt with gains and box (k, n), what it may be off by, and at how many Hz (k, q, 3).
 
         It is infinite where nothing is felt, or nothing can be said.
         """
-        asked = self.demands.measured
-        found = np.full((len(numbers), len(asked), 2), np.inf)
+        views = (self.demands, *self.views)
+        asked = list(dict.fromkeys(one for demands in views for one in demands.measured))
+        found = np.full((len(numbers), len(asked), 3), np.inf)
         _, scene = self.settings[setting]
         free = [one.free for one in (*self.demands.free, *self.demands.box)]
         for row, point in zip(found, map(tuple, numbers.tolist()) if asked else (), strict=False):
-            if (setting, point) not in self.felt:
+            if (setting, point, len(asked)) not in self.felt:
+                if row is not found[0] and self.late:
+                    break
                 pairs = zip(free, map(Fraction, point), strict=True)
                 with contextlib.suppress(ApcError):
                     changed = apply(scene, [Override(*pair) for pair in pairs])
                     row[:] = felt_in(changed, asked, self.prepared)
-                self.felt[setting, point] = row.copy()
-            row[:] = self.felt[setting, point]
-        return found
+                self.felt[setting, point, len(asked)] = row.copy()
+            row[:] = self.felt[setting, point, len(asked)]
+        return found[:, [asked.index(one) for one in view.measured]]
 
     def sampled(self, scenario: Scenario, chosen: Floats) -> Floats:
         """Return the largest value in a scenario (k,) with columns (k, m), the same whenever it is asked."""
@@ -264,9 +317,10 @@ class Limits:
                 for pair in family.slopes(at, self._numbers(along)):
                     values, slopes, found = _largest(*pair)
                     parts.append((values - self.allowed, slopes, found, place))
-            asked = self.asked(one.setting, moved)
-            if asked.shape[1]:
-                parts.append((*_differences(asked, inwards), place))
+            for view in self.views:
+                asked = self.asked(one.setting, moved, view=view)
+                if asked.shape[1]:
+                    parts.append((*_differences(asked, inwards), place))
         counts = [len(values) for values, *_ in parts]
         return Rows(
             np.concatenate([values for values, *_ in parts]),
@@ -277,8 +331,10 @@ class Limits:
         )
 
 
-def felt_in(system: CompiledSystem, asked: Sequence[Felt], prepared: Prepared) -> list[tuple[float, float]]:
-    """Return each of what is asked about the hands of a scene, with what it may be off by.
+def felt_in(
+    system: CompiledSystem, asked: Sequence[Felt], prepared: Prepared
+) -> list[tuple[float, float, float]]:
+    """Return each of what is asked about the hands of a scene, what it may be off by, and at how many Hz.
 
     Parameters
     ----------
@@ -296,10 +352,11 @@ def felt_in(system: CompiledSystem, asked: Sequence[Felt], prepared: Prepared) -
     """
     hertz = [one.frequency_hz for one in asked if not math.isnan(one.frequency_hz)] or [1.0]
     beside = {PART_OF[one.name] for one in asked if one.name in PART_OF}
-    told = feel(system, hertz, unstable=not beside, beside=beside, prepared=prepared)
+    # Beside what is stable, too, the slopes of a search want what is felt wherever there is something to say.
+    told = feel(system, hertz, unstable="h2" not in beside, beside=beside, prepared=prepared)
     found = []
     for one in asked:
-        value, off = 0.0, 0.0
+        value, off, hz = 0.0, 0.0, one.frequency_hz
         if one.name in RESPONSES:
             response, bound = (getattr(told, name) for name in RESPONSES[one.name])
             value = abs(complex(response[hertz.index(one.frequency_hz)]))
@@ -308,9 +365,16 @@ def felt_in(system: CompiledSystem, asked: Sequence[Felt], prepared: Prepared) -
             value, off = told.low_frequency.damping, told.low_frequency.errors[1]
         elif one.name == "error_h2" and told.h2 and told.h2[0].error_m is not None:
             value, off = told.h2[0].error_m, told.h2[0].errors[0] or 0.0
+        elif one.name == HINF:
+            for mode in (mode for mode in told.hinf if mode.of == "error"):
+                peak = mode.sampled_data
+                own = (peak.norm, peak.error, peak.frequency_hz)
+                if not math.isnan(one.frequency_hz):
+                    own = (float(mode.gains[hertz.index(one.frequency_hz)]), peak.error, one.frequency_hz)
+                value, off, hz = max((value, off, hz), own)
         if value == 0:
             raise ApcError(Mistake("E996", SUBJECT, f"of {one.label} nothing is felt in this scene"))
-        found.append((value, off))
+        found.append((value, off, hz))
     return found
 
 

@@ -26,8 +26,8 @@ from apc.tuning.limits import Limits, Rows, Scenario
 Floats = NDArray[np.float64]
 
 # Points looked at to begin with: of matrices, of one number that takes milliseconds, and of what is felt.
-# For each end of a range there are so much fewer.
-POINTS, SLOW_POINTS, FELT_POINTS, FACES = 2048, 256, 96, 8
+# For each end of a range there are so much fewer; of one range that takes long so many at most.
+POINTS, SLOW_POINTS, FELT_POINTS, FACES, LINE = 2048, 256, 96, 8, 48
 
 # Of these so many at a time are looked at in all scenarios, and so often.
 LOOK, SLOW_LOOK, LOOKS = 64, 8, 4
@@ -76,6 +76,10 @@ class Optimum:
     rows: Rows
     multipliers: Floats
     looked: int
+
+
+class TimeUp(Exception):
+    """No time is left to look at another point."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +136,7 @@ class Search:
 
     def at(self, start: Floats) -> Optimum:
         """Return what there is at shares of the ranges, as if it were the best."""
-        return self._optimum(start, self._remembered(), 0.0)
+        return self._optimum(start, self._remembered({}), 0.0)
 
     def rough(self, start: Floats) -> Optimum:
         """Return where one descent from shares of the ranges ends."""
@@ -194,6 +198,8 @@ class Search:
         """Points (k, m) spread evenly over the ranges, every other one by ratios, and over their ends."""
         demands = self.limits.demands
         count = FELT_POINTS if demands.measured else SLOW_POINTS if self.limits.slow else POINTS
+        if self.limits.slow:
+            count = min(count, LINE ** len(demands.free))
         even = _even(count, len(self._low))
         top = self._low + self._width
         near = np.where(self._low > 0, self._low, SMALLEST * self._width)
@@ -244,7 +250,8 @@ class Search:
     def _descended(self, start: Floats) -> Optimum:
         """Return where a descent ends."""
         optimize = load_pool("scipy.optimize")
-        rows_of = self._remembered()
+        known: dict[bytes, Rows] = {}
+        rows_of = self._remembered(known)
         size, spare = len(start), self.column is None
         here = np.append(start, rows_of(start).values.max()) if spare else start
         aim = np.zeros(len(here))
@@ -258,37 +265,42 @@ class Search:
             return np.column_stack([slopes, np.ones(len(slopes))]) if spare else slopes
 
         best, reach = self._optimum(start, rows_of, 0.0), 1.0
-        while reach > NEAREST:
-            near = np.clip([here[:size] - reach, here[:size] + reach], *self._ends).T.tolist()
-            ended = optimize.minimize(
-                lambda z: float(aim @ z),
-                here,
-                jac=lambda z: aim,
-                method="SLSQP",
-                bounds=[*near, *[(None, None)] * spare],
-                constraints=[{"type": "ineq", "fun": left, "jac": moves}],
-                options={"ftol": self._near, "maxiter": self.steps},
-            )
-            rough = np.clip(np.nan_to_num(ended.x[:size], nan=0.5), *self._ends)
-            for end in self._ends:
-                rough = np.where(np.abs(rough - end) < OPEN, end, rough)
-            found = self._polished(rough, rows_of)
-            (unmet, value), known = self._rank(found), self._rank(best)
-            far = (unmet, value + max(OPEN, self._near)) < known
-            if (unmet, value) < known:
-                best, here = found, np.append(rough, ended.x[size:])
-            if far and ended.success and reach == 1:
-                break
-            reach *= 1.0 if far and reach < 1 else SHORTER
+        try:
+            while reach > NEAREST:
+                near = np.clip([here[:size] - reach, here[:size] + reach], *self._ends).T.tolist()
+                ended = optimize.minimize(
+                    lambda z: float(aim @ z),
+                    here,
+                    jac=lambda z: aim,
+                    method="SLSQP",
+                    bounds=[*near, *[(None, None)] * spare],
+                    constraints=[{"type": "ineq", "fun": left, "jac": moves}],
+                    options={"ftol": self._near, "maxiter": self.steps},
+                )
+                rough = np.clip(np.nan_to_num(ended.x[:size], nan=0.5), *self._ends)
+                for end in self._ends:
+                    rough = np.where(np.abs(rough - end) < OPEN, end, rough)
+                found = self._polished(rough, rows_of)
+                (unmet, value), known_rank = self._rank(found), self._rank(best)
+                far = (unmet, value + max(OPEN, self._near)) < known_rank
+                if (unmet, value) < known_rank:
+                    best, here = found, np.append(rough, ended.x[size:])
+                if far and ended.success and reach == 1:
+                    break
+                reach *= 1.0 if far and reach < 1 else SHORTER
+        except TimeUp:
+            seen = [self._optimum(np.frombuffer(key), rows_of, 0.0) for key in known]
+            best = min(best, *seen, key=self._rank)
         return best
 
-    def _remembered(self) -> Callable[[Floats], Rows]:
-        """Return what gives the limits at shares (m,), once each."""
-        known: dict[bytes, Rows] = {}
+    def _remembered(self, known: dict[bytes, Rows]) -> Callable[[Floats], Rows]:
+        """Return what gives the limits at shares (m,), once each; it raises `TimeUp`, but of the first."""
 
         def rows_of(shares: Floats) -> Rows:
             key = np.ascontiguousarray(shares).tobytes()
             if key not in known:
+                if known and self.limits.late:
+                    raise TimeUp
                 known[key] = self.limits.rows(self.scenarios, self.gains(shares))
             return known[key]
 

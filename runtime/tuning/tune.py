@@ -40,7 +40,7 @@ from apc.result import Result
 from apc.threads import single_threaded
 from apc.tuning.bound import none_better
 from apc.tuning.demands import PLACE, Demands, Felt
-from apc.tuning.limits import RESPONSES, Limits, Scenario, felt_in
+from apc.tuning.limits import BEYOND, RESPONSES, Limits, Scenario, felt_in
 from apc.tuning.optimum import BINDS, Optimum, Search
 from apc.vary.crossing import Told
 from apc.vary.growth import MEAN_SQUARE, PASSIVE
@@ -223,7 +223,7 @@ class _Work:
     looked: int = 0
 
     def __post_init__(self) -> None:
-        self.limits = Limits(self.system, prepare(self.system), self.demands)
+        self.limits = Limits(self.system, prepare(self.system), self.demands, self.until)
         if self.demands.felt:  # what can't be felt anywhere is refused before anything is looked for
             felt_in(
                 self.system, [one for one in self.demands.felt if one.name in RESPONSES], self.limits.prepared
@@ -267,7 +267,7 @@ class _Work:
 
     @property
     def late(self) -> bool:
-        return time.monotonic() > self.until
+        return self.limits.late
 
     def done(self) -> Tuning:
         aim = self.demands.aim
@@ -299,6 +299,8 @@ class _Work:
             search = Search(self.limits, self.scenarios, column, sign)
             if not starts:
                 starts = begun = search.start(self.present, self.every)
+                for one in starts:
+                    self.limits.heard(self.scenarios, search.gains(one))
             found = search.best(starts)
             self.looked += found.looked
             bound = found.rows.scenario[found.multipliers > 0]
@@ -306,7 +308,7 @@ class _Work:
                 self.scenarios = [one for place, one in enumerate(self.scenarios) if place in bound]
             level = max(found.worst, 0.0 if column is not None else -math.inf)
             starts = [search.shares(found)]
-            if self._added(found.gains, level):
+            if self._added(found.gains, level) or self.limits.heard(self.scenarios, found.gains):
                 if not self.late:
                     continue
                 return search.at(begun[0]) if begun else found
@@ -387,7 +389,8 @@ class _Work:
             return replace(self.limits, demands=replace(self.demands, aim=fixed_level), samples={})
         others = tuple(one for place, one in enumerate(free) if place != column)
         fixed = apply(self.system, [Override(free[column].free, gains[column])])
-        return Limits(fixed, self.limits.prepared, replace(self.demands, free=others))
+        demands, heard = replace(self.demands, free=others), self.limits.frequencies
+        return Limits(fixed, self.limits.prepared, demands, self.until, frequencies=heard)
 
     def _middle(self, gains: Sequence[Fraction], column: int | None, found: Optimum) -> Floats:
         """Return the other gains where there is most room beside the one in a column."""
@@ -548,7 +551,7 @@ class _Work:
             allowed=self.limits.allowed,
             proofs=tuple(proofs),
             binding=tuple(self._binding(found, met=met)),
-            looked=self.looked + sum(map(len, self.limits.samples.values())),
+            looked=self.looked + sum(int((one != BEYOND).sum()) for one in self.limits.samples.values()),
             bounded=self._bounded(found, gains) if met else None,
             notes=(
                 *[why for why in (self._why(),) if why and not met],

@@ -27,7 +27,7 @@ from apc.analysis.analysis import Prepared, lifted_groups, prepared_at
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.multiples import common_divisor
-from apc.compiler.words import time_left
+from apc.compiler.words import no_more, time_left
 from apc.eigen.peers import states_of
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
@@ -174,7 +174,7 @@ def _count(
         f"from {float(low):.6g} to {float(high):.6g} (SI) events coincide at more than {MOST_PIECES:,} "
         f"values of {free.label}, the most that are searched"
     )
-    raise ApcError(Mistake("E846", place, what, hint=f"a range up to {float(at):.6g}"))
+    raise ApcError(Mistake("E846", place, what, hint=f"a range up to {no_more(at)} s"))
 
 
 @lru_cache(maxsize=KEPT)

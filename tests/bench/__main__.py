@@ -39,6 +39,7 @@ PARTS = {
     "play": ("Peers in real time", "tests.bench.play"),
     "simulate": ("Simulation", "tests.bench.simulate"),
     "hands": ("Hands", "tests.bench.hands"),
+    "tuning": ("Gains that do best", "tests.bench.tuning"),
 }
 
 

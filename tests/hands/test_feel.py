@@ -177,8 +177,10 @@ def test_noise_of_groups_whose_forces_switch_at_other_times(
 
 def test_an_unstable_scene_has_no_response_in_time_but_its_map_has_one() -> None:
     found = apc.feel(compiled(users(3, 1200)), [1.0], unstable=True)
-    assert found.notes and not found.hinf
     below = apc.feel(compiled(users(3, 1090)), [1.0])
+    assert found.notes and math.inf in [one.sampled_data.norm for one in found.hinf]
+    assert np.allclose([one.gains for one in found.hinf], [one.gains for one in below.hinf], rtol=0.2)
+    assert all((one.gains <= one.sampled_data.norm).all() for one in below.hinf)
     assert abs(found.impedance[0] / below.impedance[0] - 1) < 0.2
 
 

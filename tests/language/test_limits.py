@@ -9,6 +9,7 @@ import pytest
 
 import apc
 from apc.__main__ import run
+from apc.analysis.needs import needs
 from tests.topologies import AVERAGE, compiled, library, replaced, told
 
 DELAY = "delay: 8 ms}"
@@ -73,6 +74,7 @@ def test_the_delay_that_is_proposed_for_a_force_is_taken(asked: str, tmp_path: P
     [message] = late(asked)
     assert "values that are computed and do not act yet; at most 1,000 can be analysed" in message
     assert late(message.split("Write: delay: ")[1].split(",")[0]) == []
+    assert not needs(apc.compile(tmp_path / "scene.yaml")).refused
 
 
 def wrong(*pairs: tuple[str, str]) -> str:

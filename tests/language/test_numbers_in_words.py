@@ -9,7 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from apc.analysis.analysis import analyze
 from apc.compiler.words import known_digits, measured
+from apc.present.forms import radius_text
+from tests.topologies import OSCILLATOR, compiled
 
 
 @pytest.mark.parametrize(
@@ -33,6 +36,27 @@ def test_a_number_ends_with_the_digit_its_error_stands_in(value: float, error: f
     number, unit = expected.rsplit(" ", 1)
     shown, mark, off = number.partition(" ± ")
     assert measured(value, error, unit) == f"{shown} {unit}{mark}{off}"
+
+
+@pytest.mark.parametrize(
+    ("radius", "error", "beyond", "expected"),
+    [
+        (1 - 3.2e-15, 7e-16, None, "1 − 3.2e-15 ± 8e-16"),
+        (1 + 2.5e-8, 1e-15, None, "1 + 2.5000e-08 ± 3e-12"),
+        (1.0, 9e-16, None, "1.0000000000000000 ± 9e-16"),
+        (1.0, 0.5, (-0.5, -1e-3), "0.7 ± 3e-01"),
+        (0.75, 1e-3, (-0.3, -0.2), "0.750 ± 1e-03"),
+    ],
+)
+def test_a_radius_near_1_is_told_by_its_distance(
+    radius: float, error: float, beyond: tuple[float, float] | None, expected: str
+) -> None:
+    assert radius_text(radius, error, beyond) == expected
+
+
+def test_what_is_proved_of_a_radius_is_told_beyond_floats() -> None:
+    found = analyze(compiled(OSCILLATOR.format(stiffness="1", damping="1e-20")))  # e^(−5e-21) a second
+    assert found.stable and "radius  1 − 5.0000e-21 ± " in str(found)
 
 
 @given(st.floats(-1e12, 1e12), st.floats(1e-30, 1e9))

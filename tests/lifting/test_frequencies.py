@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +13,9 @@ import apc
 from apc.analysis.analysis import analyze, lifted_groups
 from apc.eigen.modes import split
 from apc.eigen.spectrum import angles_in_frame
+from tests.language import own
 from tests.sites import paper
-from tests.topologies import OSCILLATOR, SCENES, compiled
+from tests.topologies import OSCILLATOR, SCENES, compiled, library
 
 
 def numbers(hertz: float, ratio: float) -> dict[str, str]:
@@ -58,6 +60,16 @@ def test_what_folds_onto_the_real_axis_is_told_by_its_changes_of_sign(halves: in
     for mode in analyze(compiled(text)).modes:
         assert mode.frequency_hz == pytest.approx(halves / 2, rel=1e-6)
         assert mode.damping_ratio == pytest.approx(0.5 / math.hypot(damped, 0.5), rel=1e-6)
+
+
+def test_what_is_computed_from_itself_alone_turns_from_tick_to_tick(tmp_path: Path) -> None:
+    """It is −0.9 times what it was at each of ten ticks of a frame: five turns."""
+    law = own.component("s = -0.9*previous(s)", "flange.f = hold(s + 0*K*sample(flange.x))", variables="s=N:")
+    slow = "  slow: {type: SampledSpringDamper, a: device, b: ground, stiffness: 1 N/m, clock: late}\n"
+    text = own.scene(law).replace("clocks: {", f"couplers:\n{slow}clocks: {{late: 10 ms, ")
+    flips = next(one for one in analyze(compiled(text, library(tmp_path, law))).modes if one.magnitude < 0.5)
+    assert flips.magnitude == pytest.approx(0.9**10, rel=1e-9)
+    assert flips.frequency_hz == pytest.approx(500, rel=1e-9)
 
 
 def test_what_a_mode_turns_hangs_on_no_phase_of_its_vector() -> None:

@@ -204,7 +204,12 @@ def test_delays_that_are_harmless_while_constant_are_unstable_by_turns() -> None
             "E833 the box of contact.stiffness wants a low below the high, got 5 N/m to 1 N/m",
         ),
         (AVERAGE, "contact.stiffness=-5 N/m:1 N/m", "E833"),
-        (AVERAGE, "device.mass=0 kg:1 kg", "E833"),
+        (
+            AVERAGE,
+            "device.mass=±200%",
+            "E833 the lower end of the box of device.mass wants more than 0 kg, got -0.1 kg. "
+            "Write: device.mass=0.003 kg:0.3 kg",
+        ),
         (AVERAGE, "contact.delay=±1%", "E831 contact.delay is a time, or sets one"),
         (AVERAGE, "contact.stiffness=900:1100", "E204"),
         (AVERAGE, "contact.stiffness=±1%|couplers.contact.stiffness=±2%", "E831"),

@@ -188,7 +188,10 @@ MANY = "E883 a sweep wants at most 10,000,000 points, got "
             {"contact.stiffness": "5 N/m, 1 N/m, 5 N/m"},
             "E881 the list of contact.stiffness wants different values, got 5 N/m twice.",
         ),
-        ({"contact.stiffness": "1 kg:2 kg"}, "E204 contact.stiffness wants N/m, got 1 kg. Write: 1 N/m"),
+        (
+            {"contact.stiffness": "1 kg:2 Kg:11:log"},
+            "E204 contact.stiffness wants N/m, got 1 kg. Write: contact.stiffness=1 N/m:2 N/m:11:log",
+        ),
         ({"user.count": "2.5:10"}, "E881 the range of user.count wants whole numbers, got 2.5 to 10."),
         ({"user.device.mass": "-1 kg:1 kg"}, "E624 user.device.mass wants more than 0 kg, got -1 kg."),
         (

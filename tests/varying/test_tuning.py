@@ -101,6 +101,10 @@ AIMS: dict[str, tuple[bool, Callable[[apc.Feel, float], float]]] = {
     "feel.error at 1 Hz": (False, lambda felt, _: abs(felt.error_per_force[0])),
     "feel.impedance at 5 Hz": (True, lambda felt, _: abs(felt.impedance[1])),
     "feel.error_h2": (False, lambda felt, _: felt.h2[0].error_m or np.nan),
+    "feel.error_hinf": (
+        False,
+        lambda felt, _: max(one.sampled_data.norm for one in felt.hinf if one.of == "error"),
+    ),
     "feel.damping - 0.01*coordination.stiffness": (
         False,
         lambda felt, stiffness: (

@@ -1,0 +1,39 @@
+% include "scene.c"
+
+% for type, what, flag in [("double", "real", false), ("int", "flag", true)]
+static ${type} *${what}(model *m, unsigned which) {
+  (void)m;
+  switch (which) {
+% for one in scene.variables
+% if one.flag == flag
+    case ${loop.index0}: return &m->${one.member};
+% endif
+% endfor
+    default: return 0;
+  }
+}
+
+% endfor
+/* Whether it comes from outside: such numbers are the first. */
+static int given(unsigned which) {
+  (void)which;
+  return ${"which < %du" % inputs if inputs else 0};
+}
+
+/* Whether it is a state or a parameter, which can be set until the scene begins. */
+static int moving(unsigned which) {
+  switch (which) {
+% for one in scene.variables
+% if not one.flag and (one.moving or one.fixed)
+    case ${loop.index0}: return 1;
+% endif
+% endfor
+    default: return 0;
+  }
+}
+
+#define QUANTA ${scene.quantum.denominator | float}
+#define SECONDS ${scene.quantum.numerator | float}
+#define GUID "${guid}"
+
+% include "fmi2.c"
