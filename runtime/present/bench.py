@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from apc.benchmark.bench import SAME, Bench, Comparison, Measured
 from apc.compiler.words import counted, wrapped
 from apc.present.forms import Lines, notes, record, table
-from apc.present.pictures import COLOURS, new_figure
+from apc.present.pictures import COLOURS, legend_below, new_figure
 
 if TYPE_CHECKING:
     from apc.benchmark.hard import HardReport
@@ -185,7 +185,7 @@ def _panel(ax: Any, found: Comparison) -> None:
         )
     if max(map(_drawn, points)) < SAME:
         ax.axhline(SAME, color="0.4", linewidth=0.8, linestyle=":", label="below are roundings")
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, fontsize=7, frameon=False)
+    legend_below(ax, -0.16, fontsize=7)
 
 
 def _drawn(one: Measured) -> float:

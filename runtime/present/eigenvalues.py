@@ -19,7 +19,7 @@ import numpy as np
 from apc.compiler.words import in_hertz
 from apc.optional import need
 from apc.present.forms import axis_label, quantity
-from apc.present.pictures import COLOURS, new_figure
+from apc.present.pictures import COLOURS, legend_below, new_figure
 
 if TYPE_CHECKING:
     from apc.analysis.analysis import Analysis
@@ -123,4 +123,4 @@ def _mark(ax: Any, values: Any, mark: str, colour: str, label: str) -> None:
 def _entitle(ax: Any, lines: Sequence[str]) -> None:
     ax.autoscale_view()
     ax.set_title("\n".join(one for line in lines for one in textwrap.wrap(line, LETTERS)), fontsize=9)
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), fontsize=8, frameon=False, ncols=2)
+    legend_below(ax)

@@ -26,7 +26,7 @@ from apc.present.forms import (
     sentences,
     table,
 )
-from apc.present.pictures import COLOURS, new_figure
+from apc.present.pictures import COLOURS, legend_below, new_figure
 from apc.tables import Column, Tabled
 
 if TYPE_CHECKING:
@@ -244,11 +244,11 @@ def feel_picture(found: Feel, kind: str = "bode", ax: Any = None) -> Any:
         phase.set_ylabel("phase of the impedance (°)")
         if np.abs(degrees).max() <= 90:
             phase.set_yticks(range(-90, 91, 45))
-    legend: Plain = {"fontsize": 8, "frameon": False, "ncols": 1 + nyquist}
     if ax is None:
-        size.figure.legend(*size.get_legend_handles_labels(), loc="outside lower center", **legend)
+        look: Plain = {"loc": "outside lower center", "fontsize": 8, "frameon": False, "ncols": 1 + nyquist}
+        size.figure.legend(*size.get_legend_handles_labels(), **look)
     else:
-        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), **legend)
+        legend_below(ax, -0.2, ncols=1 + nyquist)
     return size.figure
 
 

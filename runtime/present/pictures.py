@@ -1,7 +1,7 @@
 """What all pictures share: their formats, and how a figure becomes a file.
 
 Takes: a matplotlib Figure and a path.
-Gives: `COLOURS`, `LINES`, `colours_of`, `new_figure`; `FORMATS`, `RESULTS`, `check_picture`,
+Gives: `COLOURS`, `LINES`, `colours_of`, `new_figure`, `legend_below`; `FORMATS`, `RESULTS`, `check_picture`,
 `write_figure`, `write_picture`, `write_result`, `table_of`, `svg_text`, `svg_image`, `html_of`.
 Guarantees: the same figure gives the same bytes; a file is there whole or not at all; text in an SVG is text.
 Does not: draw, or need a display.
@@ -62,6 +62,12 @@ def new_figure(size: tuple[float, float]) -> Any:
         E875 matplotlib is not installed.
     """
     return need("matplotlib.figure", "plot").Figure(figsize=size, layout="constrained")
+
+
+def legend_below(ax: Any, place: float = -0.14, fontsize: float = 8, ncols: int = 2) -> None:
+    """Put the legend below an Axes, over nothing; `place` is in heights of the Axes, from its lower edge."""
+    look = {"ncols": ncols, "fontsize": fontsize, "frameon": False}
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, place), **look)
 
 
 def colours_of(count: int) -> list[Any]:
