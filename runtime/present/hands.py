@@ -245,8 +245,13 @@ def feel_picture(found: Feel, kind: str = "bode", ax: Any = None) -> Any:
         if np.abs(degrees).max() <= 90:
             phase.set_yticks(range(-90, 91, 45))
     if ax is None:
-        look: Plain = {"loc": "outside lower center", "fontsize": 8, "frameon": False, "ncols": 1 + nyquist}
-        size.figure.legend(*size.get_legend_handles_labels(), **look)
+        beneath: Plain = {
+            "loc": "outside lower center",
+            "fontsize": 8,
+            "frameon": False,
+            "ncols": 1 + nyquist,
+        }
+        size.figure.legend(*size.get_legend_handles_labels(), **beneath)
     else:
         legend_below(ax, -0.2, ncols=1 + nyquist)
     return size.figure
