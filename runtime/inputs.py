@@ -38,11 +38,13 @@ YAML_SUFFIXES = (".yaml", ".yml")
 _TOPOLOGY = re.compile(rb"^\xef?\xbb?\xbf?topology\s*:", re.MULTILINE)
 
 
-def find_input(*, compiled_too: bool) -> Path:
-    """Return the only topology of the working folder, or failing that, its only compiled model.
+def find_input(file: str | None = None, *, compiled_too: bool) -> Path:
+    """Return the file that is named, or the only topology of the working folder, or its only compiled model.
 
     Parameters
     ----------
+    file
+        What is named, if anything is.
     compiled_too
         Whether a compiled model serves.
 
@@ -51,6 +53,8 @@ def find_input(*, compiled_too: bool) -> Path:
     ApcError
         There is none, or there are several.
     """
+    if file:
+        return Path(file)
     here = Path()
     topologies = sorted(path for path in here.glob("*.yaml") if _is_topology(path))
     models = sorted(here.glob("*.apc")) if compiled_too else []
@@ -148,7 +152,7 @@ def open_scene(
     ApcError
         As `find_input`, `load_or_compile`, `check_outputs`, `overrides.parse_override` and `overrides.apply`.
     """
-    path = Path(file) if file else find_input(compiled_too=True)
+    path = find_input(file, compiled_too=True)
     system = load_or_compile(path)
     check_outputs(path, (name for name, _ in system.origin.texts), outputs or {})
     if hands != "free":

@@ -67,7 +67,7 @@ def bench_command(
     if counts is not None:
         if settings or plot:
             raise click.UsageError("--scale compiles anew: no --set or --plot with it")
-        _scale(Path(file) if file else find_input(compiled_too=False), counts, as_json)
+        _scale(find_input(file, compiled_too=False), counts, as_json)
         return
     from apc.benchmark.bench import bench
 

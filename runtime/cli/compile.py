@@ -34,7 +34,7 @@ def check_command(
     from apc.inputs import find_input
     from apc.present.analysis import warning_lines
 
-    path = Path(file) if file else find_input(compiled_too=False)
+    path = find_input(file, compiled_too=False)
     if found := check_definition(path):
         tell(f"{path}: no mistakes. {found}.")
         return
@@ -67,7 +67,7 @@ def compile_command(
     """
     from apc.inputs import check_model_name, compiled_already, find_input
 
-    path = Path(file) if file else find_input(compiled_too=False)
+    path = find_input(file, compiled_too=False)
     if until != "compiled":
         from apc.compiler.pipeline import run_stages
         from apc.compiler.view.stages import describe

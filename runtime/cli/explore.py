@@ -8,8 +8,6 @@ Does not: compute.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from apc.cli.options import WholeNumber, command, option, tell
 
 
@@ -49,7 +47,7 @@ def explore_command(
     from apc.explore.page import open_page, scene_of
     from apc.explore.server import bound, run
 
-    path = Path(file) if file else find_input(compiled_too=True)
+    path = find_input(file, compiled_too=True)
     system = open_scene(str(path), ())
     topology = path.with_suffix(".yaml")
     text = read_source(topology).text if topology.is_file() else None

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import inspect
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ import click
 
 from apc.compiler.digits import plain_int
 from apc.compiler.errors import ApcError, Mistake, Place, visible
-from apc.compiler.files import check_target, is_stdout
+from apc.compiler.files import is_stdout
 from apc.compiler.timings import part, record
 from apc.present.forms import json_text
 from apc.result import Result
@@ -67,32 +67,23 @@ def argument(**settings: Any) -> Any:
     return lambda parameter: click.Argument([parameter.name], **settings)
 
 
-def picture_option(told: str) -> Any:
-    """Return an option that names a picture to write."""
-    return option(told, callback=_drawable)
+def picture_option(told: str, more: Sequence[str] = ()) -> Any:
+    """Return an option that names a picture to write, or a file with a suffix of `more`."""
+
+    def check(_: click.Context, asked: click.Parameter, path: Path | None) -> Path | None:
+        if path is not None:
+            from apc.present.pictures import check_picture
+
+            check_picture(path, asked.opts[0], more)
+        return path
+
+    return option(told, callback=check)
 
 
 def result_option() -> Any:
     """Return the option `--out` of a result that can be drawn, tabulated, or written as JSON."""
     told = "Write a picture (.png .svg .pdf), a table (.csv .parquet) or .json."
-    return option(told, callback=_writable)
-
-
-def _drawable(_: click.Context, asked: click.Parameter, path: Path | None) -> Path | None:
-    if path is not None:
-        from apc.present.pictures import check_format
-
-        check_target(path)
-        check_format(path, asked.opts[0])
-    return path
-
-
-def _writable(_: click.Context, asked: click.Parameter, path: Path | None) -> Path | None:
-    if path is not None:
-        from apc.present.pictures import check_result_path
-
-        check_result_path(path)
-    return path
+    return picture_option(told, (".csv", ".parquet", ".json"))
 
 
 def seed_option(packets: str) -> Any:

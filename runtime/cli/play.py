@@ -64,7 +64,7 @@ def play_command(
     from apc.option_value import option_value
     from apc.simulation.trajectory import duration_of, parse_duration
 
-    path = Path(file) if file else find_input(compiled_too=True)
+    path = find_input(file, compiled_too=True)
     folder = out or Path(f"{path.stem}.run")
     system = open_scene(str(path), settings, told=note_aside)
     asked = parse_duration(duration) if duration is not None else None

@@ -52,14 +52,14 @@ def show_command(
     if parameters:
         _show_parameters(file, wanted, out)
         return
-    path = Path(file) if file else find_input(compiled_too=False)
+    path = find_input(file, compiled_too=False)
     check_topology_outputs(path, {"--out": out})
     if out is not None and out.suffix.lower() in PICTURES:
         from apc.compiler.view.listing import diagram_of
         from apc.present.graph import graph_picture
-        from apc.present.pictures import check_format, write_figure
+        from apc.present.pictures import check_picture, write_figure
 
-        check_format(out, "--out")
+        check_picture(out, "--out")
         write_figure(graph_picture(diagram_of(path)), out)
         tell(f"{out} is written", err=beside(out))
         return

@@ -28,7 +28,7 @@ from bokeh.plotting import figure
 
 from apc.compiler.words import counted
 from apc.explore.motion import MM, ROWS, Motion
-from apc.present.forms import Plain
+from apc.present.forms import Plain, axis_label
 
 # Colours that are distinct in print and for colour-blind eyes: Okabe and Ito, 2008, the lightest two of them
 # darkened until they stand out from white as graphics have to (WCAG 2.1, 1.4.11).
@@ -211,7 +211,7 @@ class RegionFigure:
             (self.plot.yaxis, self.plot.y_range, found["y"]),
         ):
             label, unit, low, high = which
-            axis.axis_label = label if unit == "1" else f"{label} [{unit.replace('*', '·')}]"
+            axis.axis_label = axis_label(label, unit)
             span.update(start=low, end=high)
         steps = (
             ("Between the edges of its cells the boundary is drawn straight.",) if found["stepped"] else ()

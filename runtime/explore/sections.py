@@ -16,13 +16,11 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apc.analysis.analysis import Analysis, Prepared, analyze, prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import in_hertz
-from apc.eigen.eigenpairs import eigenvalues
 from apc.eigen.spectrum import Mode
 from apc.explore.motion import motion_of
 from apc.explore.sliders import text_of
@@ -37,12 +35,12 @@ from apc.present.forms import Plain
 from apc.present.region_picture import drawn_points, stable_outlines
 from apc.processes import model_of_bytes
 from apc.regions.region import region
-from apc.threads import single_threaded
 from apc.tuning.demands import held_as_studied, read_demands
 from apc.tuning.tune import tune
 from apc.vary.critical import critical
-from apc.vary.evaluator import evaluator, reaches_count, reaches_time
+from apc.vary.evaluator import reaches_count, reaches_time
 from apc.vary.growth import MEAN_SQUARE
+from apc.vary.locus import eigenvalues_at
 from apc.vary.margins import margins
 
 # How far a boundary that is drawn may be off, relative to a coordinate: nobody sees less.
@@ -148,49 +146,28 @@ def _region(system: CompiledSystem, prepared: Prepared, asked: tuple[Range, Rang
 
 
 def _roots(system: CompiledSystem, prepared: Prepared, asked: tuple[Free, tuple[Fraction, ...]]) -> Plain:
-    """Return the eigenvalues at values of a slider: from matrices in rows, or one analysis after another."""
+    """Return the eigenvalues at values of a slider."""
     free, values = asked
-    if reaches_time(system, free) or reaches_count(system, free):
-        some = _thinned(values, FEW_ROOTS)
-        rows = [_eigenvalues(system, prepared, Override(free, one)) for one in some]
-    else:
-        some = _thinned(values, ROOTS)
-        with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
-            source = evaluator(system, [free], prepared=prepared)
-            matrices = source.matrices(np.array(some, np.float64)[:, None])
-            rows = [_roots_of([one[row] for one in matrices]) for row in range(len(some))]
-    found = np.concatenate(rows)
+    slow = reaches_time(system, free) or reaches_count(system, free)
+    some = _thinned(values, FEW_ROOTS if slow else ROOTS)
+    with finite_equations(system.name):
+        places, rows = eigenvalues_at(system, free, some, prepared=prepared)
+    found = np.concatenate([EMPTY, *rows])
+    texts = [text_of(one, unit_of(system, free.name)) for one in some]
     return {
         "real": found.real,
         "imag": found.imag,
-        "name": [
-            text_of(one, unit_of(system, free.name)) for one, row in zip(some, rows, strict=True) for _ in row
-        ],
+        "name": [texts[place] for place, row in zip(places, rows, strict=True) for _ in row],
         "slider": free.label,
-        "from": text_of(some[0], unit_of(system, free.name)),
-        "to": text_of(some[-1], unit_of(system, free.name)),
+        "from": texts[0],
+        "to": texts[-1],
     }
-
-
-def _roots_of(matrices: Sequence[NDArray[np.float64]]) -> NDArray[np.complex128]:
-    """Return the eigenvalues of all matrices that there are."""
-    known = (one[None] for one in matrices if np.isfinite(one).all())
-    return np.concatenate([EMPTY, *(eigenvalues(one, np.zeros_like(one))[0][0] for one in known)])
 
 
 def _thinned(values: Sequence[Fraction], most: int) -> list[Fraction]:
     """Return so many of the values at most, the first and the last among them."""
     places = np.unique(np.linspace(0, len(values) - 1, min(most, len(values))).astype(int))
     return [values[place] for place in places.tolist()]
-
-
-def _eigenvalues(system: CompiledSystem, prepared: Prepared, override: Override) -> NDArray[np.complex128]:
-    """Return the eigenvalues of an analysis; none where the value can't be."""
-    try:
-        found = analyze(apply(system, [override]), prepared=prepared)
-    except ApcError:
-        return EMPTY
-    return np.array([mode.eigenvalue for mode in found.modes], dtype=np.complex128)
 
 
 def _margins(system: CompiledSystem, prepared: Prepared, _: None) -> Plain:

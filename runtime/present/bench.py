@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from apc.benchmark.bench import SAME, Bench, Comparison, Measured
 from apc.compiler.words import counted, wrapped
 from apc.present.forms import Lines, notes, record, table
-from apc.present.pictures import COLOURS, new_figure
+from apc.present.pictures import COLOURS, legend_below, new_figure
 
 if TYPE_CHECKING:
     from apc.benchmark.hard import HardReport
@@ -87,7 +87,8 @@ def hard_text(found: HardReport) -> Lines:
     rows = [("scene", "error", "bound", "bound÷error", "time", "verdict")]
     for case in found.cases:
         loose = f"{case.looseness:.2g}" if math.isfinite(case.looseness) else NOTHING
-        mark = "FAILED" if case.failed else _short(case.verdict)
+        verdict = case.verdict.replace("stable up to a common translation", "stable*").partition(":")[0]
+        mark = "FAILED" if case.failed else verdict
         rows.append((case.name, _size(case.error), _size(case.bound), loose, _time(case.seconds), mark))
     yield from table(rows, "<>>>><")
     yield ""
@@ -103,11 +104,6 @@ def hard_text(found: HardReport) -> Lines:
         yield from notes(f"{scenes}; {undecided} left open, {unbounded} without a bound")
     else:
         yield from notes("every bound holds; every verdict is right")
-
-
-def _short(verdict: str) -> str:
-    words = {"stable up to a common translation": "stable*"}
-    return words.get(verdict, verdict.partition(":")[0])
 
 
 def scale_text(found: Scale) -> Lines:
@@ -189,7 +185,7 @@ def _panel(ax: Any, found: Comparison) -> None:
         )
     if max(map(_drawn, points)) < SAME:
         ax.axhline(SAME, color="0.4", linewidth=0.8, linestyle=":", label="below are roundings")
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, fontsize=7, frameon=False)
+    legend_below(ax, -0.16, fontsize=7)
 
 
 def _drawn(one: Measured) -> float:

@@ -63,14 +63,14 @@ LETTERS: dict[str, Any] = {
 }
 BOUNDARY = 1.0  # the spectral radius from which on a motion grows
 
-# The panels: title, where in a scheme the number is, in how many of its units it is drawn.
+# The panels: title, and where in a scheme the number is; how many of its units what is varied is drawn in.
 NUMBERS = (
-    ("spectral radius a frame", "analysis.spectral_radius", 1.0),
-    ("settles within 2 % in (s)", "analysis.settling_s", 1.0),
-    ("felt at 1 Hz (N·s/m)", "feel.impedance.0", 1.0),
-    ("felt at 10 Hz (N·s/m)", "feel.impedance.1", 1.0),
-    ("operations a tick", "effort.operations", 1.0),
-    ("numbers sent a second", "effort.sent", 1.0),
+    ("spectral radius a frame", "analysis.spectral_radius"),
+    ("settles within 2 % in (s)", "analysis.settling_s"),
+    ("felt at 1 Hz (N·s/m)", "feel.impedance.0"),
+    ("felt at 10 Hz (N·s/m)", "feel.impedance.1"),
+    ("operations a tick", "effort.operations"),
+    ("numbers sent a second", "effort.sent"),
 )
 REACHES = (
     ("largest stable stiffness (N/m)", "stiffness", 1.0),
@@ -122,12 +122,8 @@ def _meant(found: Comparison) -> Iterator[str]:
     """Yield what stable means, where it is not that motions die out."""
     if any(one.passive for one in found.schemes):
         yield MEANT["passive"]
-    elif any(one.criterion in MEANT for scheme in found.schemes for one in _criticals(scheme)):
+    elif any(reached(one, f"{key}.criterion") in MEANT for one in found.schemes for key, _ in VARIED):
         yield f"of a link that is, or becomes, unreliable: {MEANT['mean-square']}"
-
-
-def _criticals(one: Scheme) -> list[Critical]:
-    return [found for found in (one.stiffness, one.delay, one.loss) if found is not None]
 
 
 def _why(one: Scheme, key: str) -> tuple[str, ...]:
@@ -282,7 +278,7 @@ def comparison_picture(found: Comparison) -> Any:
         E875 matplotlib is not installed.
     """
     schemes = found.schemes
-    panels = [(title, [_number(one, path, scale) for one in schemes]) for title, path, scale in NUMBERS]
+    panels = [(title, [_number(reached(one, path)) for one in schemes]) for title, path in NUMBERS]
     reaches = [
         (title, [_reach_bar(getattr(one, key), scale) for one in schemes]) for title, key, scale in REACHES
     ]
@@ -306,9 +302,8 @@ def comparison_picture(found: Comparison) -> Any:
     return figure
 
 
-def _number(one: Scheme, path: str, scale: float) -> _Bar:
-    value = reached(one, path)
-    return _Bar(0.0, NONE) if value is None else _Bar(scale * abs(value), f"{scale * abs(value):.4g}")
+def _number(value: complex | None) -> _Bar:
+    return _Bar(0.0, NONE) if value is None else _Bar(abs(value), f"{abs(value):.4g}")
 
 
 def _reach_bar(found: Critical | None, scale: float) -> _Bar:

@@ -18,8 +18,8 @@ import numpy as np
 
 from apc.compiler.words import in_hertz
 from apc.optional import need
-from apc.present.forms import quantity
-from apc.present.pictures import COLOURS, new_figure
+from apc.present.forms import axis_label, quantity
+from apc.present.pictures import COLOURS, legend_below, new_figure
 
 if TYPE_CHECKING:
     from apc.analysis.analysis import Analysis
@@ -81,8 +81,7 @@ def locus_picture(found: Locus, ax: Any = None) -> Any:
     points = np.concatenate(found.eigenvalues)  # conjugates are among them
     colours = np.repeat(found.values, [len(one) for one in found.eigenvalues])
     drawn = ax.scatter(points.real, points.imag, c=colours, s=5, linewidths=0, cmap="viridis", zorder=3)
-    unit = "" if of.unit == "1" else f" [{of.unit.replace('*', '·')}]"
-    ax.figure.colorbar(drawn, ax=ax, label=f"{of.parameter}{unit}")
+    ax.figure.colorbar(drawn, ax=ax, label=axis_label(of.parameter, of.unit))
     _mark(ax, found.now, "x", COLOURS[2], f"now, {quantity(of.present, of.unit)}")
     for place, one in enumerate(of.crossings[:MOST_NAMED]):
         if not found.values.size or not found.values[0] <= one.value <= found.values[-1]:
@@ -124,4 +123,4 @@ def _mark(ax: Any, values: Any, mark: str, colour: str, label: str) -> None:
 def _entitle(ax: Any, lines: Sequence[str]) -> None:
     ax.autoscale_view()
     ax.set_title("\n".join(one for line in lines for one in textwrap.wrap(line, LETTERS)), fontsize=9)
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), fontsize=8, frameon=False, ncols=2)
+    legend_below(ax)

@@ -1,8 +1,8 @@
 """The forms that all results share: plain data, JSON, notes, labelled lines and tables.
 
 Takes: frozen values, texts.
-Gives: `Plain`, `document`, `record`, `picked`, `reached`, `json_text`; `radius_text`, `quantity`, `listed`;
-`Lines`, `notes`, `sentences`, `labelled`, `table`; `MEANT`.
+Gives: `Plain`, `document`, `record`, `picked`, `reached`, `json_text`; `radius_text`, `quantity`,
+`axis_label`, `listed`; `Lines`, `notes`, `sentences`, `labelled`, `table`; `MEANT`.
 Guarantees: a document is made of what JSON has words for; the same value gives the same text; a line is at
 most 80 columns wide where its words allow it.
 Does not: know a result.
@@ -133,6 +133,11 @@ def quantity(value: float, unit: str, digits: int = 6) -> str:
 def as_shown(value: float, unit: str) -> tuple[float, str]:
     """Return what a number is multiplied by to be shown, and the unit it then has: ms of a time below 1 s."""
     return (1e3, "ms") if unit == "s" and 0 < abs(value) < 1 else (1.0, unit)
+
+
+def axis_label(name: str, unit: str) -> str:
+    """Return what stands beside an axis: what it is of, and its unit."""
+    return name if unit == "1" else f"{name} [{unit.replace('*', '·')}]"
 
 
 def listed(names: Sequence[str], most: int = 6) -> str:

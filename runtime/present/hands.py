@@ -26,7 +26,7 @@ from apc.present.forms import (
     sentences,
     table,
 )
-from apc.present.pictures import COLOURS, new_figure
+from apc.present.pictures import COLOURS, legend_below, new_figure
 from apc.tables import Column, Tabled
 
 if TYPE_CHECKING:
@@ -216,13 +216,13 @@ def feel_picture(found: Feel, kind: str = "bode", ax: Any = None) -> Any:
 
     Into an `ax` of somebody's, of Bode's plot the magnitudes alone are drawn.
     """
-    size, phase = ax, None
-    if ax is None and kind == "nyquist":
-        size = new_figure((4.2, 4.0)).subplots()
-    elif ax is None:
-        size, phase = new_figure((5.2, 5.6)).subplots(2, 1, sharex=True)
+    nyquist, axes = kind == "nyquist", [ax]
+    if ax is None:
+        figure = new_figure((4.2, 4.0) if nyquist else (5.2, 5.6))
+        axes = figure.subplots(1 if nyquist else 2, 1, sharex=True, squeeze=False)[:, 0].tolist()
+    size, *phases = axes
     size.set_title(f"{found.topology}: felt at {found.at}", fontsize=9)
-    if kind == "nyquist":
+    if nyquist:
         size.plot(found.impedance.real, found.impedance.imag, color=COLOURS[0])
         for line in (size.axvline, size.axhline):
             line(0.0, color="#999999", linewidth=0.6)
@@ -237,18 +237,23 @@ def feel_picture(found: Feel, kind: str = "bode", ax: Any = None) -> Any:
                 look = {"color": COLOURS[place], "linestyle": ("-", "--", "-.")[place], "label": label}
                 size.loglog(found.frequency_hz, scale * np.abs(values), **look)
         size.set_ylabel("magnitude")
-        (phase or size).set_xlabel("frequency (Hz)")
-    if phase is not None:
+        axes[-1].set_xlabel("frequency (Hz)")
+    for phase in phases:
         degrees = np.degrees(np.angle(found.impedance))
         phase.semilogx(found.frequency_hz, degrees, color=COLOURS[0])
         phase.set_ylabel("phase of the impedance (°)")
         if np.abs(degrees).max() <= 90:
             phase.set_yticks(range(-90, 91, 45))
-    legend: Plain = {"fontsize": 8, "frameon": False, "ncols": 2 if kind == "nyquist" else 1}
     if ax is None:
-        size.figure.legend(*size.get_legend_handles_labels(), loc="outside lower center", **legend)
+        beneath: Plain = {
+            "loc": "outside lower center",
+            "fontsize": 8,
+            "frameon": False,
+            "ncols": 1 + nyquist,
+        }
+        size.figure.legend(*size.get_legend_handles_labels(), **beneath)
     else:
-        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), **legend)
+        legend_below(ax, -0.2, ncols=1 + nyquist)
     return size.figure
 
 

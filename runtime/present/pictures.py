@@ -1,7 +1,7 @@
 """What all pictures share: their formats, and how a figure becomes a file.
 
 Takes: a matplotlib Figure and a path.
-Gives: `COLOURS`, `LINES`, `colours_of`, `new_figure`; `FORMATS`, `check_format`, `check_result_path`,
+Gives: `COLOURS`, `LINES`, `colours_of`, `new_figure`, `legend_below`; `FORMATS`, `RESULTS`, `check_picture`,
 `write_figure`, `write_picture`, `write_result`, `table_of`, `svg_text`, `svg_image`, `html_of`.
 Guarantees: the same figure gives the same bytes; a file is there whole or not at all; text in an SVG is text.
 Does not: draw, or need a display.
@@ -14,7 +14,7 @@ from __future__ import annotations
 import base64
 import io
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from apc.result import Result
 
 FORMATS = (".png", ".svg", ".pdf")
+RESULTS = (*SUFFIXES, ".json")  # what a result that has a picture can be written as, too
 DPI = 150
 SVG = {"svg.hashsalt": "apc", "svg.fonttype": "none"}  # the same names inside it; text is text
 
@@ -63,6 +64,12 @@ def new_figure(size: tuple[float, float]) -> Any:
     return need("matplotlib.figure", "plot").Figure(figsize=size, layout="constrained")
 
 
+def legend_below(ax: Any, place: float = -0.14, fontsize: float = 8, ncols: int = 2) -> None:
+    """Put the legend below an Axes, over nothing; `place` is in heights of the Axes, from its lower edge."""
+    look = {"ncols": ncols, "fontsize": fontsize, "frameon": False}
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, place), **look)
+
+
 def colours_of(count: int) -> list[Any]:
     """Return as many colours as are asked for, no two alike: the style sheet's first ten, or a rainbow's."""
     if count <= 10:
@@ -71,25 +78,19 @@ def colours_of(count: int) -> list[Any]:
     return [rainbow(0.03 + 0.94 * place / (count - 1)) for place in range(count)]
 
 
-def check_format(path: Path, option: str = "--plot") -> None:
-    """Refuse a picture that can't be drawn: E878 no such format, E875 matplotlib is not installed."""
-    check_suffix(path, FORMATS, option)
-    need("matplotlib", "plot")
-
-
-def check_result_path(path: Path) -> str:
-    """Refuse a file that can be no picture, table or JSON, or not be written here; return its suffix.
+def check_picture(path: Path, option: str = "--plot", more: Sequence[str] = ()) -> str:
+    """Refuse a file that can be no picture, or what has a suffix of `more`; return its suffix.
 
     Raises
     ------
     ApcError
         E878 the suffix, E601 the place, E887 or E875 a library that is missing.
     """
-    suffix = check_suffix(path, (*FORMATS, *SUFFIXES, ".json"), "--out")
-    check_target(path)
+    suffix = check_suffix(path, (*FORMATS, *more), option)
     if suffix in SUFFIXES:
-        check_table_path(path, "--out")
-    elif suffix in FORMATS:
+        check_table_path(path, option)
+    check_target(path)
+    if suffix in FORMATS:
         need("matplotlib.figure", "plot")
     return suffix
 
@@ -144,9 +145,9 @@ def write_result(path: Path, found: Result, draw: Callable[[], Any]) -> None:
     Raises
     ------
     ApcError
-        As `check_result_path`.
+        As `check_picture`.
     """
-    suffix = check_result_path(path)
+    suffix = check_picture(path, "--out", RESULTS)
     if suffix in FORMATS:
         write_picture(draw, path)
     elif suffix in SUFFIXES:

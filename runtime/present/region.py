@@ -92,21 +92,17 @@ def _point(curve: Curve, place: int) -> str:
 def region_document(found: Region) -> Plain:
     """Return what `apc region --json` prints of one region."""
     names = ("topology", "tolerance", "stable_area", "stable_area_error", "cell", "criterion", "left_out")
+    each = ("points", "handles", "error", "mode", "frequency_hz", "closed", "smooth")
     return {
         **picked(found, *names),
         "x": range_document(found.x),
         "y": range_document(found.y),
         "coarse": [number for number, one in enumerate(found.curves) if one in found.coarse],
-        "boundary": [_curve_document(curve) for curve in found.curves],
+        "boundary": [{**picked(curve, *each), "stable_side": "left"} for curve in found.curves],
         "area_unit": _product(found.x.unit, found.y.unit),
         "finest_cell": found.finest,
         "origin": dict(found.system.origin.digests),
     }
-
-
-def _curve_document(curve: Curve) -> Plain:
-    names = ("points", "handles", "error", "mode", "frequency_hz", "closed", "smooth")
-    return picked(curve, *names) | {"stable_side": "left"}
 
 
 def _product(x: str, y: str) -> str:

@@ -21,13 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.optional import need
-from apc.present.forms import MEANT
+from apc.present.forms import MEANT, axis_label
 from apc.present.pictures import COLOURS, LINES, new_figure
 from apc.regions.curves import between
 from apc.regions.panels import Panel
 
 if TYPE_CHECKING:
-    from apc.frame.names import Range
     from apc.regions.panels import Panels
     from apc.regions.region import Region
 
@@ -103,7 +102,7 @@ def draw_panel(ax: Any, title: str, panel: Panel) -> None:
     regions, gains = panel.regions, panel.gains
     x, y = regions[0].x, regions[0].y
     ax.set(xlim=(float(x.low), float(x.high)), ylim=(float(y.low) * gains[0], float(y.high) * gains[0]))
-    ax.set(xlabel=_label(x), ylabel=_label(y))
+    ax.set(xlabel=axis_label(x.free.label, x.unit), ylabel=axis_label(y.free.label, y.unit))
     ax.tick_params(direction="in", top=True, right=True)
     meant = [MEANT[one.criterion].removesuffix(" as it is") for one in regions if one.criterion in MEANT]
     said = []
@@ -128,11 +127,6 @@ def draw_panel(ax: Any, title: str, panel: Panel) -> None:
     left_out = [note for one in regions for note in one.left_out]
     texts = dict.fromkeys([title, *meant, *said, *hatched, *left_out])
     ax.set_title("\n".join(line for text in texts for line in textwrap.wrap(text, 48)), fontsize=8.5)
-
-
-def _label(axis: Range) -> str:
-    unit = axis.unit.replace("*", "·")
-    return axis.free.label if unit == "1" else f"{axis.free.label} [{unit}]"
 
 
 def _draw(ax: Any, found: Region, gain: int, place: int, curves: Sequence[Floats], name: str) -> None:

@@ -267,8 +267,7 @@ def _panels(signals: Sequence[Signal]) -> dict[str, list[int]]:
     found: dict[str, list[int]] = {}
     for place, one in enumerate(signals):
         found.setdefault(one.unit, []).append(place)
-    known = [unit for unit in QUANTITIES if unit in found]
-    return {unit: found[unit] for unit in [*known, *(unit for unit in found if unit not in known)]}
+    return {unit: found[unit] for unit in dict.fromkeys([*QUANTITIES, *found]) if unit in found}
 
 
 def paths_of(signals: Sequence[Signal]) -> list[tuple[int, int]]:
@@ -324,11 +323,9 @@ def _identical(values: Floats, places: Sequence[int]) -> list[list[int]]:
     off = ROUNDING * float(np.ptp(values[:, places]))
     for place in places:
         same = (one for one in found if np.abs(values[:, place] - values[:, one[0]]).max() <= off)
-        curve = next(same, None)
-        if curve is None:
-            found.append([place])
-        else:
-            curve.append(place)
+        if (curve := next(same, None)) is None:
+            found.append(curve := [])
+        curve.append(place)
     return found
 
 

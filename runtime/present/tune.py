@@ -21,7 +21,7 @@ from apc.compiler.words import counted, enumerated, in_hertz, measured, with_uni
 from apc.frame.overrides import Override, apply
 from apc.present.analysis import range_document, range_text
 from apc.present.forms import MEANT, Lines, Plain, labelled, notes, quantity, record, table
-from apc.present.pictures import COLOURS, new_figure
+from apc.present.pictures import COLOURS, legend_below, new_figure
 from apc.present.region_picture import draw_panel
 from apc.regions.panels import Panel
 from apc.regions.region import Region, region
@@ -193,7 +193,7 @@ def _draw_gains(found: Tuning, ax: Any) -> None:
     whole: Plain = {"clip_on": False, "zorder": 5}  # where an end of a range is best, too
     ax.plot(*now, "o", color="0.3", label="now", **whole)
     ax.plot(*best, "*", color="black", markersize=11, label="found", **whole)
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, frameon=False, fontsize=8)
+    legend_below(ax)
 
 
 def _draw_struck(found: Tuning, ax: Any) -> None:

@@ -1,6 +1,6 @@
 """Where the eigenvalues of a scene go as one of its numbers grows: the root locus, in the plane of z.
 
-Takes: a `CompiledSystem` and a `Critical` of it. Gives: `Locus`, `root_locus`.
+Takes: a `CompiledSystem` and a `Critical` of it. Gives: `Locus`, `root_locus`; `eigenvalues_at`.
 Guarantees: every point is an eigenvalue of the frame with that value, what is rigid at every value left out,
 every packet on time; a value that the scene can't have is left out.
 Does not: prove anything; the crossings are those of `critical`.
@@ -8,20 +8,23 @@ Does not: prove anything; the crossings are those of `critical`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import analyze, prepare
+from apc.analysis.analysis import Prepared, analyze, prepare
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Place
 from apc.compiler.timings import part
 from apc.eigen.eigenpairs import eigenvalues as eigenvalues_of
 from apc.frame.names import Free, find
-from apc.frame.overrides import apply
-from apc.vary.evaluator import evaluator_of_many, overrides_at, reaches_time
+from apc.frame.overrides import Override, apply
+from apc.threads import single_threaded
+from apc.vary.evaluator import evaluator_of_many, reaches_count, reaches_time
 
 if TYPE_CHECKING:
     from apc.vary.critical import Critical
@@ -62,40 +65,53 @@ def root_locus(system: CompiledSystem, found: Critical) -> Locus:
     values = np.linspace(low, high, POINTS)
     if found.counted:
         values = np.unique(np.round(values))
-    here = analyze(system)
+    prepared = prepare(system)
+    here = analyze(system, prepared=prepared)
     now = np.array([mode.eigenvalue for mode in here.modes])
-    if found.counted or reaches_time(system, free):
-        values, eigenvalues = _one_by_one(system, free, values)
-    else:
-        values, eigenvalues = _at_once(system, free, values)
-    return Locus(found, here.frame_s, values, eigenvalues, now)
+    places, eigenvalues = eigenvalues_at(system, free, values.tolist(), prepared=prepared)
+    return Locus(found, here.frame_s, values[places], eigenvalues, now)
 
 
-def _at_once(
-    system: CompiledSystem, free: Free, values: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], tuple[NDArray[np.complex128], ...]]:
-    """Return the values of a parameter that have eigenvalues, and these, by all matrices in one go."""
-    with np.errstate(all="ignore"):
-        family = evaluator_of_many(system, [free], Place(free.label), prepared=prepare(system))
-        matrices = family.matrices(values[:, None])
-    known = np.all([np.isfinite(one).all(axis=(1, 2)) for one in matrices], axis=0) & np.isfinite(values)
+def eigenvalues_at(
+    system: CompiledSystem, free: Free, values: Sequence[Fraction | float], *, prepared: Prepared
+) -> tuple[list[int], tuple[NDArray[np.complex128], ...]]:
+    """Return which values of a parameter have eigenvalues, by their places, and the eigenvalues of each.
+
+    Parameters
+    ----------
+    system
+        The compiled scene, all other numbers as they are.
+    free
+        The parameter; of a time or a number of peers, with which the frame itself is another, each value is
+        analysed by itself.
+    values
+        Its values, SI.
+    prepared
+        From `analysis.prepare`, of this system with any numbers.
+    """
+    if reaches_count(system, free) or reaches_time(system, free):
+        return _one_by_one(system, free, values, prepared)
+    with single_threaded(), np.errstate(all="ignore"):
+        family = evaluator_of_many(system, [free], Place(free.label), prepared=prepared)
+        matrices = family.matrices(np.array(values, np.float64)[:, None])
+    known = np.all([np.isfinite(one).all(axis=(1, 2)) for one in matrices], axis=0)
     chosen = [one[known] if len(one) > 1 else one for one in matrices]
     listed = [eigenvalues_of(one, np.zeros_like(one))[0] for one in chosen]
-    count = int(known.sum())
-    every = np.concatenate([np.broadcast_to(one, (count, one.shape[1])) for one in listed], axis=1)
-    return values[known], tuple(every.astype(np.complex128))
+    places = np.flatnonzero(np.broadcast_to(known, len(values))).tolist()
+    every = np.concatenate([np.broadcast_to(one, (len(places), one.shape[1])) for one in listed], axis=1)
+    return places, tuple(every.astype(np.complex128))
 
 
 def _one_by_one(
-    system: CompiledSystem, free: Free, values: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], tuple[NDArray[np.complex128], ...]]:
-    """Return the same of a time or a number of peers, with which the frame itself is another."""
-    kept, eigenvalues = [], []
-    for value in values.tolist():
+    system: CompiledSystem, free: Free, values: Sequence[Fraction | float], prepared: Prepared
+) -> tuple[list[int], tuple[NDArray[np.complex128], ...]]:
+    """Return the same by an analysis each."""
+    places, eigenvalues = [], []
+    for place, value in enumerate(values):
         try:
-            modes = analyze(apply(system, overrides_at(system, [free], [value]))).modes
+            modes = analyze(apply(system, [Override(free, Fraction(value))]), prepared=prepared).modes
         except ApcError:
             continue  # a delay, for one, that an order of events allows no more
-        kept.append(value)
-        eigenvalues.append(np.array([mode.eigenvalue for mode in modes]))
-    return np.array(kept), tuple(eigenvalues)
+        places.append(place)
+        eigenvalues.append(np.array([mode.eigenvalue for mode in modes], np.complex128))
+    return places, tuple(eigenvalues)
