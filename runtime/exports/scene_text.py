@@ -26,7 +26,6 @@ from apc.exports.peer_step import (
     MOST_HEARD,
     Peer,
     first_packet,
-    group_of,
     lines_of,
     peer_of,
     refused,
@@ -193,7 +192,9 @@ def _links(plan: Plan, quantum: Fraction) -> tuple[Link, ...]:
     for name, (link, channels) in zip(unique(map(identifier, used)), used.items(), strict=True):
         clock = clocks[exchange.links[link].clock]
         period, phase = (int(timings[one] / quantum) for one in (clock.period, clock.phase))
-        delays = [timings[exchange.delay(link, *(group_of(plan, one) for one in way))] for way in ways[link]]
+        delays = [
+            timings[exchange.delay(link, *(exchange.group_of(one) for one in way))] for way in ways[link]
+        ]
         lucks = [
             (luck_of(plan.system, timings, exchange, route, quantum), route)
             for route in plan.routes

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import heapq
 import math
-import re
 import select
 import socket
 from collections import Counter
@@ -61,7 +60,6 @@ AHEAD = 1024  # packets whose luck is drawn at once
 # Datagrams read before the clock is looked at again, and all that a late tick reads: some tenths of a
 # millisecond, whatever comes.
 AT_ONCE = 32
-PEER = re.compile(r"(?P<group>[A-Za-z_][A-Za-z0-9_]*)\[(?P<place>[0-9]{1,9})\]\Z")
 
 
 def live_scene(system: CompiledSystem) -> CompiledSystem:
@@ -527,7 +525,7 @@ class _Emulated:
     def _source(self, link: _OfLink, other: int) -> PacketSource:
         loop, exchange = self.loop, self.loop.exchange
         way, declared = (loop.own, other), loop.system.links[link.place]
-        of, to = (int(np.searchsorted(exchange.starts, one, side="right")) - 1 for one in way)
+        of, to = map(exchange.group_of, way)
         delay = self.timings[exchange.delay(link.name, of, to)]
         law = ChannelLaw(0.0, 1.0, 1.0, 0.0, float(delay), 0.0, "uniform", None)
         if declared.channel is not None:
@@ -550,13 +548,11 @@ def number_of(exchange: Exchange, name: str, option: str) -> int:
     ApcError
         E970 there is no such peer.
     """
-    found = PEER.match(name)
-    group = exchange.groups.index(found["group"]) if found and found["group"] in exchange.groups else -1
-    place = int(found["place"]) if found else 0
-    if group >= 0 and 1 <= place <= exchange.starts[group + 1] - exchange.starts[group]:
-        return int(exchange.starts[group]) + place - 1
-    names = [exchange.peer_name(one) for one in range(min(exchange.peers, 4))]
-    expected = f"one of {', '.join(names)}{', …' if exchange.peers > len(names) else ''}"
+    every = [exchange.peer_name(one) for one in range(exchange.peers)]
+    if name in every:
+        return every.index(name)
+    names = every[:4]
+    expected = f"one of {', '.join(names)}{', …' if len(every) > 4 else ''}"
     near = nearest(name, [f"{one}[1]" for one in exchange.groups]) or names[0]
     hint = f'{option} "{near}{"=HOST:PORT" if option == "--to" else ""}"'
     raise ApcError(Mistake("E970", Place(option), "a peer", expected, cut(name) or "nothing", hint))

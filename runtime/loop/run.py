@@ -98,11 +98,8 @@ def run_of(loop: Loop, digest: bytes, not_given: tuple[str, ...]) -> PeerRun:
     rows = np.concatenate([np.zeros((0, simulation.population.width)), *loop.rows])
     last = int(simulation.settings.duration / simulation.quantum)
     played = len(rows) // len(simulation.marks)
-    starts = range(loop.first, loop.first + played, simulation.length)
-    whole = [instants_of(simulation, at, last) for at in starts]
-    instants = np.concatenate([np.zeros(0, np.int64), *(one for one, _ in whole)])[: len(rows)]
-    recorded = np.concatenate([np.zeros(0, np.bool_), *(one for _, one in whole)])[: len(rows)]
-    recorded = recorded.astype(bool) & np.isfinite(rows).all(axis=1)
+    instants, recorded = instants_of(simulation, loop.first, played, last)
+    recorded &= np.isfinite(rows).all(axis=1)
     # Told to end, it did not wait for the last instant.
     log = np.maximum(np.array(player.log, np.int64).reshape(-1, 3), 0)
     sent: dict[int, dict[int, int]] = {}
