@@ -35,7 +35,7 @@ from apc.analysis.analysis import Prepared, lifted_groups, near_start, prepare
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.distribution import versions
-from apc.eigen.closing import Feedback, Loop, close, feedback_of, lay_out_loop
+from apc.eigen.closing import Loop, close_outside, lay_out_loop
 from apc.eigen.modes import dense_loop
 from apc.eigen.peers import PeerGroup, states_of
 from apc.exports.words import Port
@@ -428,16 +428,8 @@ def _closed(
         [row for row, what in enumerate(rows) if what is OUTSIDE or (link and what.way.link == link)]
         for rows in heard
     ]
-    outside, given = sum(map(len, opened)), n
-    feedback, answer = [], []
-    for wires, rows in zip((one.plain for one in feedback_of(loop, layout)), opened, strict=True):
-        now, before = wires.now.copy(), np.pad(wires.before, ((0, 0), (0, outside)))
-        answer.append((now[rows], before[rows]))
-        now[rows], before[rows] = 0.0, 0.0
-        before[rows, given + np.arange(len(rows))] = 1.0
-        feedback.append(Feedback(now, before))
-        given += len(rows)
-    whole = close([site.map for site in sites], feedback, layout, numbers=arithmetic)
+    maps = [_from_outside(one.map, rows) for one, rows in zip(sites, opened, strict=True)]
+    whole = close_outside(loop, maps, [*map(len, opened)], layout, numbers=arithmetic)
 
     def spread(listed: Sequence[Placed]) -> tuple[Labels, Places]:
         """Return what each site has, by its peer's name, and where in the state."""
@@ -454,7 +446,7 @@ def _closed(
     names = layout.names if len(sites) > 1 else tuple(f"{peers[0]}.{name}" for name in layout.names)
     of_states = [unit for site in sites for unit in _units(site, units)]
     states = tuple(Port(names[place], of_states[place]) for place in kept)
-    matrix, outer = whole.matrix, n + np.arange(outside)
+    matrix, outer = whole.matrix, slice(n, None)
     if not cut:
         outputs, seen = spread([site.signals for site in sites])
         c = (kept[None, :] == seen[:, None]).astype(np.float64)
@@ -462,13 +454,19 @@ def _closed(
         return blocks, (states, inputs, outputs)
     if link:
         forces, _ = spread([_heard_ports(rows, link, units) for rows in heard])
-        parts = [arithmetic.add(arithmetic.multiply(now, whole.sent), before) for now, before in answer]
-        back = -np.concatenate(parts)
+        back = -np.concatenate([r[rows] for r, rows in zip(whole.heard, opened, strict=True)])
     else:
         back = -matrix[computed]
     outputs = tuple(replace(port, name=f"{port.name} back") for port in forces)
-    blocks = matrix[np.ix_(kept, kept)], matrix[np.ix_(kept, outer)], back[:, kept], back[:, outer]
+    blocks = matrix[np.ix_(kept, kept)], matrix[kept, outer], back[:, kept], back[:, outer]
     return blocks, (states, forces, outputs)
+
+
+def _from_outside(one: FrameMap, rows: Sequence[int]) -> FrameMap:
+    """Return a peer's map that takes some of what it hears from outside, behind all that it hears."""
+    q, d = (np.concatenate([block, block[:, rows]], axis=1) for block in (one.q, one.d))
+    q[:, rows] = d[:, rows] = 0.0
+    return replace(one, q=q, d=d)
 
 
 def _named(port: Port, peer: str) -> Port:

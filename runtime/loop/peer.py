@@ -1,6 +1,6 @@
 """One peer of a scene in real time: it ticks, hears what has arrived, and sends.
 
-Takes: a compiled scene, which peer, addresses, how long. Gives: `Loop`, `live_scene`, `number_of`.
+Takes: a compiled scene, which peer, addresses, how long. Gives: `Loop`, `live_scene`, `traced`, `number_of`.
 Guarantees: every tick is done once, in order, however late; what a tick hears is what had arrived when it was
 done; a peer that begins late, or again, joins at the instant it is; others that fall silent are held or left
 out as the link says.
@@ -19,7 +19,7 @@ import heapq
 import math
 import select
 import socket
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
@@ -28,7 +28,7 @@ from multiprocessing.connection import Connection
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import Channel, CompiledSystem
+from apc.compiler.compiled import Channel, CompiledSystem, Link
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.words import counted, cut
 from apc.frame.exchange import Exchange, build_exchange
@@ -36,7 +36,7 @@ from apc.frame.parameters import resolve
 from apc.loop.device import DeviceFunction, Outside
 from apc.loop.packets import DROPPED, Address, Answer, Data, Hello, Post
 from apc.loop.realtime import now
-from apc.network.channel import ChannelLaw, PacketSource, channel_law
+from apc.network.channel import PacketSource, channel_law
 from apc.network.timetable import START, Seen
 from apc.simulation.blocks import pushes, unsolved
 from apc.simulation.population import instants_within
@@ -65,20 +65,20 @@ AT_ONCE = 32
 def live_scene(system: CompiledSystem) -> CompiledSystem:
     """Return a scene whose links take what the network does: each way's packets are heard as they come."""
     timings = {timing.name: timing.value for timing in system.timings}
-    links = []
-    for link in system.links:
-        usual = max(timings[one] for one in (link.delay, *(pair.delay for pair in link.delays)))
-        own = link.channel
-        channel = Channel(
-            loss=None,
-            jitter=None,
-            distribution="uniform",
-            reorder=own.reorder if own else "newest",
-            on_loss=own.on_loss if own else "hold",
-            trace=np.array([float(max(Fraction(GIVEN_UP), TIMES * usual))]),
-        )
-        links.append(replace(link, channel=channel))
-    return replace(system, links=tuple(links), within=())
+    late = [
+        max(timings[one] for one in (link.delay, *(pair.delay for pair in link.delays)))
+        for link in system.links
+    ]
+    given_up = [[float(max(Fraction(GIVEN_UP), TIMES * delay))] for delay in late]
+    links = tuple(map(traced, system.links, given_up))
+    return replace(system, links=links, within=())
+
+
+def traced(link: Link, delays: Sequence[float] | Floats) -> Link:
+    """Return a link whose packets take recorded delays, in seconds; what it makes of lost ones stays."""
+    usual = link.channel or Channel(None, None, "uniform", "newest", "hold", None)
+    lawless = replace(usual, loss=None, jitter=None, distribution="uniform")
+    return replace(link, channel=replace(lawless, trace=np.asarray(delays)))
 
 
 class StoppedError(RuntimeError):
@@ -341,7 +341,7 @@ class _OnePeer(Stepwise):
         self.held_back: list[tuple[int, int, bytes, Address]] = []
         self.log: list[tuple[int, int, int]] = []
         self.arrivals: list[tuple[int, int, int, int, int]] = []
-        self.sent: Counter[tuple[int, int]] = Counter()  # packets by link and receiver
+        self.sent: dict[int, Counter[int]] = defaultdict(Counter)  # packets by link and receiver
         self.instant = 0
 
     def warm_up(self) -> None:
@@ -422,7 +422,7 @@ class _OnePeer(Stepwise):
             instant = link.instant(count)
             for other in sorted(link.receivers):
                 delay = self.network.delay(link, other, count) if self.network else 0
-                self.sent[link.place, other] += loop.begins != 0
+                self.sent[link.place][other] += loop.begins != 0
                 if delay is not None and loop.begins:
                     at = loop.begins + instant + delay
                     datagram = loop.post.data(at, other, link.place, count, values)
@@ -470,15 +470,13 @@ class _OfLink:
     """
 
     def __init__(self, loop: Loop, place: int) -> None:
-        simulation, population = loop.simulation, loop.simulation.population
+        population = loop.simulation.population
         self.place, self.name = place, loop.system.links[place].name
-        over = [at for at, one in enumerate(population.hearing.routes) if one.link == self.name]
-        routes = {at: population.hearing.routes[at] for at in over}
-        luck = simulation.lucks[over[0]] if over else None
-        self.phase = luck.phase * simulation.quantum * NANO if luck else Fraction(0)
-        self.period = luck.period * simulation.quantum * NANO if luck else Fraction(1)
-        self.newest = luck is None or luck.newest
-        self.slots = routes[over[0]].slots if over else 1
+        link, timings = loop.system.links[place], resolve(loop.system).timings
+        clock = next(one for one in loop.system.clocks if one.name == link.clock)
+        self.phase, self.period = (timings[one] * NANO for one in (clock.phase, clock.period))
+        self.newest = link.channel is None or link.channel.reorder == "newest"
+        self.slots = int(loop.simulation.frame * loop.simulation.quantum * NANO / self.period)
         self.channels: dict[int, list[str]] = {}
         for member in population.members:
             sent = sorted({one.channel for one in member.program.schedule.sent if one.link == self.name})
@@ -487,8 +485,8 @@ class _OfLink:
         self.keys = {(one.channel, one.slot): row for row, one in listed if one.link == self.name}
         self.receivers: set[int] = set()
         self.ways: dict[int, list[tuple[int, int]]] = {}
-        for at, route in routes.items():
-            for way, (sender, receiver) in enumerate(route.pairs.tolist()):
+        for at, route in enumerate(population.hearing.routes):
+            for way, (sender, receiver) in enumerate(route.pairs.tolist() if route.link == self.name else ()):
                 if sender == loop.own:
                     self.receivers.add(receiver)
                 if receiver == loop.own:
@@ -527,9 +525,9 @@ class _Emulated:
         way, declared = (loop.own, other), loop.system.links[link.place]
         of, to = map(exchange.group_of, way)
         delay = self.timings[exchange.delay(link.name, of, to)]
-        law = ChannelLaw(0.0, 1.0, 1.0, 0.0, float(delay), 0.0, "uniform", None)
-        if declared.channel is not None:
-            law = channel_law(loop.system, declared, delay)
+        law = channel_law(
+            loop.system, declared if declared.channel else traced(declared, [float(delay)]), delay
+        )
         return PacketSource(law, link.name, [way], seed=loop.simulation.seed)
 
 
