@@ -20,7 +20,7 @@ import math
 import select
 import socket
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from multiprocessing.connection import Connection
@@ -420,10 +420,10 @@ class _OnePeer(Stepwise):
             column = self.population.hearing.column_of[loop.own]
             values = tuple(self.packets[number % self.population.hearing.ring, keys, column].tolist())
             instant = link.instant(count)
-            for other in sorted(link.receivers):
+            for other in sorted(link.receivers) if loop.begins else ():  # while it warms up nobody hears it
                 delay = self.network.delay(link, other, count) if self.network else 0
-                self.sent[link.place][other] += loop.begins != 0
-                if delay is not None and loop.begins:
+                self.sent[link.place][other] += 1
+                if delay is not None:
                     at = loop.begins + instant + delay
                     datagram = loop.post.data(at, other, link.place, count, values)
                     if datagram is None:
@@ -508,16 +508,14 @@ class _Emulated:
     def __init__(self, loop: Loop) -> None:
         self.loop = loop
         self.timings = resolve(loop.system).timings
-        self.sources: dict[tuple[int, int], tuple[PacketSource, list[float]]] = {}
+        self.delays: dict[tuple[int, int], Iterator[tuple[int, float]]] = {}
 
     def delay(self, link: _OfLink, other: int, count: int) -> int | None:
-        """Return the delay of a packet in nanoseconds, None if it gets lost."""
-        if (link.place, other) not in self.sources:
-            self.sources[link.place, other] = self._source(link, other), []
-        source, delays = self.sources[link.place, other]
-        while source.taken <= count:
-            delays[:] = source.take(AHEAD)[0].tolist()
-        found = delays[count - source.taken]
+        """Return the delay of a packet in nanoseconds, None if it gets lost; counts of a way only grow."""
+        key = link.place, other
+        if key not in self.delays:
+            self.delays[key] = enumerate(_drawn(self._source(link, other)))
+        found = next(delay for number, delay in self.delays[key] if number == count)
         return None if math.isinf(found) else int(found * NANO)
 
     def _source(self, link: _OfLink, other: int) -> PacketSource:
@@ -529,6 +527,12 @@ class _Emulated:
             loop.system, declared if declared.channel else traced(declared, [float(delay)]), delay
         )
         return PacketSource(law, link.name, [way], seed=loop.simulation.seed)
+
+
+def _drawn(source: PacketSource) -> Iterator[float]:
+    """Yield the delays of a way's packets, in seconds."""
+    while True:
+        yield from source.take(AHEAD)[0].tolist()
 
 
 def number_of(exchange: Exchange, name: str, option: str) -> int:
