@@ -15,9 +15,12 @@ computer. A device that is tied to a copy by more than forces computed at ticks 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
+from itertools import groupby
+from operator import itemgetter
 from typing import Any
 
 import casadi
@@ -38,6 +41,7 @@ from apc.frame.linearize import start_arguments, start_values
 from apc.frame.parameters import exact_numbers
 from apc.frame.schedule import Schedule
 from apc.simulation.flow import flow_of, rows_to_move, state_scales
+from apc.simulation.program import timed_events
 from apc.simulation.propagate import rates, transition_rows
 from apc.simulation.settings import Method
 from apc.simulation.signals import LocalSignal, local_signals
@@ -442,22 +446,21 @@ def _moves(
 def _instants(schedule: Schedule) -> tuple[tuple[Instant, ...], tuple[int, ...]]:
     """Return the instants of a frame, and the lengths of time between them in quanta."""
     lengths = sorted({one.duration for one in schedule.events if isinstance(one, frames.Propagate)})
-    ticked = dict.fromkeys(range(len(schedule.ticks)), 0)
-    found: list[Instant] = []
-    now = Instant((), (), (), 0)
-    for event in schedule.events:  # a frame ends with a length of time
-        match event:
-            case frames.Send(partition):
-                now = replace(now, sends=(*now.sends, partition))
-            case frames.Tick(partition):
-                now = replace(now, ticks=(*now.ticks, partition))
-                ticked[partition] += 1
-            case frames.Act(hold, value):
-                lag = ticked[value.partition] - 1 - value.index
-                now = replace(now, acts=(*now.acts, Act(hold, lag)))
-            case frames.Propagate(duration):
-                found.append(replace(now, move=lengths.index(duration)))
-                now = Instant((), (), (), 0)
+    ticked: Counter[int] = Counter()
+    found = []
+    for _, group in groupby(timed_events(schedule), itemgetter(0)):  # each ends with a length of time
+        *listed, move = (event for _, event in group)
+        ticks = tuple(one.partition for one in listed if isinstance(one, frames.Tick))
+        ticked.update(ticks)
+        acts = [(one.hold, one.value) for one in listed if isinstance(one, frames.Act)]
+        found.append(
+            Instant(
+                tuple(one.partition for one in listed if isinstance(one, frames.Send)),
+                ticks,
+                tuple(Act(hold, ticked[value.partition] - 1 - value.index) for hold, value in acts),
+                lengths.index(move.duration),
+            )
+        )
     return tuple(found), tuple(lengths)
 
 

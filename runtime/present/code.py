@@ -61,8 +61,8 @@ def code_document(found: Code) -> dict[str, Any]:
 def unit_text(found: Unit) -> str:
     """Return what an FMU takes and gives."""
     inputs = [one.name for one in found.scene.variables if one.given]
-    fixed = [one.name for one in found.scene.variables if one.fixed]
-    outputs = [one.name for one in found.scene.variables if not (one.given or one.fixed)]
+    fixed = [one.name for one in found.scene.variables if one.role == "parameter"]
+    outputs = [one.name for one in found.scene.variables if one.role in ("output", "state")]
     what = found.peer or counted(len(found.scene.peers), "peer")
     lines = [f"{found.system.name}: {what} for co-simulation, FMI 2.0", ""]
     lines += wrapped(f"{counted(len(inputs), 'input')}: {listed(inputs)}", "  ", "    ")
@@ -78,7 +78,7 @@ def unit_text(found: Unit) -> str:
 def unit_document(found: Unit) -> dict[str, Any]:
     """Return an FMU as plain data."""
     variables = [
-        {**picked(one, "name", "unit"), "input": bool(one.given), "parameter": one.fixed}
+        {**picked(one, "name", "unit"), "input": one.given, "parameter": one.role == "parameter"}
         for one in found.scene.variables
     ]
     return {
