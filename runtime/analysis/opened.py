@@ -224,7 +224,7 @@ def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop | str:
     layout = lay_out(names, [site.schedule for site in loop.sites])
     closed = close_outside(
         loop, [one.map for one in opened], [len(one.ticks) for one in opened], layout, numbers=RADII
-    )
+    ).matrix
     n, listed = len(layout.names), list(zip(loop.sites, opened, layout.offsets, strict=True))
     outside = np.concatenate([offset + one.states + np.arange(len(one.ticks)) for _, one, offset in listed])
     own = np.delete(np.arange(n), outside)

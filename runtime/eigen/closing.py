@@ -328,7 +328,7 @@ def close_outside(
     layout: StateLayout,
     *,
     numbers: Arithmetic = FLOATS,
-) -> Matrix:
+) -> Closed:
     """Close a loop into whose sites something comes from outside: over the state, and that behind it.
 
     Parameters
@@ -357,7 +357,7 @@ def close_outside(
         before[..., heard:, columns : columns + many] = numbers.exact(np.eye(many))
         feedback.append(Feedback(now, before))
         first += many
-    return close(maps, feedback, layout, numbers=numbers).matrix
+    return close(maps, feedback, layout, numbers=numbers)
 
 
 def _put(rows: Matrix, z: slice, own: Matrix, of_heard: Matrix, heard: Matrix, numbers: Arithmetic) -> None:

@@ -5,7 +5,7 @@ static ${type} *${what}(model *m, unsigned which) {
   (void)m;
   switch (which) {
 % for one in scene.variables
-% if one.flag == flag
+% if (one.role == "flag") == flag
     case ${loop.index0}: return &m->${one.member};
 % endif
 % endfor
@@ -24,7 +24,7 @@ static int given(unsigned which) {
 static int moving(unsigned which) {
   switch (which) {
 % for one in scene.variables
-% if not one.flag and (one.moving or one.fixed)
+% if one.role in ("state", "parameter")
     case ${loop.index0}: return 1;
 % endif
 % endfor

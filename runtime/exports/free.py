@@ -76,7 +76,7 @@ def state_space_of(system: CompiledSystem, *, cut: str = "", free: Sequence[str]
     values = dict(zip(frees, symbols, strict=True))
 
     def vector(group: PeerGroup) -> Any:
-        place = int(np.searchsorted(exchange.starts, group.peers[0], side="right")) - 1
+        place = exchange.group_of(group.peers[0])
         peer = int(group.peers[0] - exchange.starts[place])
         listed = free_values(system, system.groups[place], peer, values, symbolic)
         return casadi.vertcat(*map(casadi.SX, listed))

@@ -32,10 +32,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, lifted_groups, near_start, prepare
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.distribution import versions
-from apc.eigen.closing import Feedback, Loop, close, feedback_of, lay_out_loop
+from apc.eigen.closing import Loop, close_outside, lay_out_loop
 from apc.eigen.modes import dense_loop
 from apc.eigen.peers import PeerGroup, states_of
 from apc.exports.words import Port
@@ -228,9 +228,7 @@ def lifted(
         loop = dense_loop([one.group for one in opened], exchange)
         of_schedule = {id(one.group.schedule): one for one in opened}
         sites = [of_schedule[id(site.schedule)] for site in loop.sites]
-        blocks, labels = _closed(
-            loop, sites, _sent_units(system), link=link, cut=cut, arithmetic=numbers.arithmetic
-        )
+        blocks, labels = _closed(loop, sites, link=link, cut=cut, arithmetic=numbers.arithmetic)
     notes = () if cut else tuple(dict.fromkeys(note for one in opened for note in one.unpushed))
     return blocks, labels, notes
 
@@ -239,7 +237,7 @@ def lifted(
 class _Opened:
     """Peers that are moved from outside: `group` has the ways in, `map` is their frame.
 
-    `units` are those of the entries of z. `signals` and where each is in z are what is simulated, `inputs`
+    `signals` and where each is in z are what is simulated, `inputs`
     and the entries of z that they come in at what moves them. `cuts` are the forces cut open and the entries
     of z that hold what the ticks made of them; the last of what is heard stands in their place. `unpushed`
     says what no force comes in at, and why.
@@ -247,7 +245,6 @@ class _Opened:
 
     group: PeerGroup
     map: FrameMap
-    units: tuple[str, ...]
     signals: Placed
     inputs: Placed
     cuts: Placed
@@ -263,10 +260,7 @@ def _open(system: CompiledSystem, group: PeerGroup, cut: str, numbers: Numbers) 
     count = len(forces) + len(noises)
     nothing = np.zeros((0, sum(wide.b.shape)), dtype=wide.b.dtype)
     (site,), full, ports = with_ports([wide], schedule, count, [0], [nothing], [])
-    units = [*(state.unit for state in kind.states)]
-    units += [kind.clocks[one.partition].units[one.output] for one in schedule.carried]
     site, full, cuts = _cut_open(site, full, cut)
-    units += ["1"] * (len(kind.states) + len(full.carried) - len(units))
     check_packets(full)
     durations = step_durations(full)
     steps = numbers.steps(group, forces, count, [duration * full.quantum for duration in durations])
@@ -285,7 +279,6 @@ def _open(system: CompiledSystem, group: PeerGroup, cut: str, numbers: Numbers) 
     return _Opened(
         group=group.with_site(site, group.exact, full, frame.mapped(RADII.exact)),
         map=frame,
-        units=tuple(units),
         signals=signals,
         inputs=list(zip(inputs, ports.drawn.ravel().tolist(), strict=True)),
         cuts=cuts,
@@ -414,7 +407,6 @@ def _check_size(system: CompiledSystem, opened: Sequence[_Opened]) -> None:
 def _closed(
     loop: Loop,
     sites: Sequence[_Opened],
-    units: Mapping[tuple[str, str], str],
     *,
     link: str,
     cut: str,
@@ -428,16 +420,8 @@ def _closed(
         [row for row, what in enumerate(rows) if what is OUTSIDE or (link and what.way.link == link)]
         for rows in heard
     ]
-    outside, given = sum(map(len, opened)), n
-    feedback, answer = [], []
-    for wires, rows in zip((one.plain for one in feedback_of(loop, layout)), opened, strict=True):
-        now, before = wires.now.copy(), np.pad(wires.before, ((0, 0), (0, outside)))
-        answer.append((now[rows], before[rows]))
-        now[rows], before[rows] = 0.0, 0.0
-        before[rows, given + np.arange(len(rows))] = 1.0
-        feedback.append(Feedback(now, before))
-        given += len(rows)
-    whole = close([site.map for site in sites], feedback, layout, numbers=arithmetic)
+    maps = [_from_outside(one.map, rows) for one, rows in zip(sites, opened, strict=True)]
+    whole = close_outside(loop, maps, [*map(len, opened)], layout, numbers=arithmetic)
 
     def spread(listed: Sequence[Placed]) -> tuple[Labels, Places]:
         """Return what each site has, by its peer's name, and where in the state."""
@@ -452,23 +436,30 @@ def _closed(
     forces, computed = spread([site.cuts for site in sites])
     kept = np.delete(np.arange(n), np.concatenate([drawn, computed]))
     names = layout.names if len(sites) > 1 else tuple(f"{peers[0]}.{name}" for name in layout.names)
-    of_states = [unit for site in sites for unit in _units(site, units)]
-    states = tuple(Port(names[place], of_states[place]) for place in kept)
-    matrix, outer = whole.matrix, n + np.arange(outside)
+    units = {name: _units(site.group.jacobians.kind) for name, site in zip(peers, sites, strict=True)}
+    states = tuple(Port(name, _unit(units, name)) for name in map(names.__getitem__, kept))
+    matrix, outer = whole.matrix, slice(n, None)
     if not cut:
         outputs, seen = spread([site.signals for site in sites])
         c = (kept[None, :] == seen[:, None]).astype(np.float64)
         blocks = matrix[np.ix_(kept, kept)], matrix[np.ix_(kept, drawn)], c, np.zeros((len(c), len(drawn)))
         return blocks, (states, inputs, outputs)
     if link:
-        forces, _ = spread([_heard_ports(rows, link, units) for rows in heard])
-        parts = [arithmetic.add(arithmetic.multiply(now, whole.sent), before) for now, before in answer]
-        back = -np.concatenate(parts)
+        sent = {name: unit for one in units.values() for name, unit in one.items()}
+        forces, _ = spread([_heard_ports(rows, link, sent) for rows in heard])
+        back = -np.concatenate([r[rows] for r, rows in zip(whole.heard, opened, strict=True)])
     else:
         back = -matrix[computed]
     outputs = tuple(replace(port, name=f"{port.name} back") for port in forces)
-    blocks = matrix[np.ix_(kept, kept)], matrix[np.ix_(kept, outer)], back[:, kept], back[:, outer]
+    blocks = matrix[np.ix_(kept, kept)], matrix[kept, outer], back[:, kept], back[:, outer]
     return blocks, (states, forces, outputs)
+
+
+def _from_outside(one: FrameMap, rows: Sequence[int]) -> FrameMap:
+    """Return a peer's map that takes some of what it hears from outside, behind all that it hears."""
+    q, d = (np.concatenate([block, block[:, rows]], axis=1) for block in (one.q, one.d))
+    q[:, rows] = d[:, rows] = 0.0
+    return replace(one, q=q, d=d)
 
 
 def _named(port: Port, peer: str) -> Port:
@@ -477,7 +468,7 @@ def _named(port: Port, peer: str) -> Port:
     return replace(port, name=f"{word}{on}{peer}.{rest}")
 
 
-def _heard_ports(heard: Sequence[Heard], link: str, units: Mapping[tuple[str, str], str]) -> Placed:
+def _heard_ports(heard: Sequence[Heard], link: str, units: Mapping[str, str]) -> Placed:
     """Return what a peer hears over a link: of which packet of a frame, and how many frames ago."""
     heard = [what for what in heard if what.way.link == link]
     several = any(what.sent.slot for what in heard)
@@ -486,22 +477,20 @@ def _heard_ports(heard: Sequence[Heard], link: str, units: Mapping[tuple[str, st
         for what in heard
     ]
     listed = zip(named, heard, strict=True)
-    return [(Port(name, units[what.sent.link, what.sent.channel]), 0) for name, what in listed]
+    return [(Port(name, units[what.sent.channel]), 0) for name, what in listed]
 
 
-def _sent_units(system: CompiledSystem) -> dict[tuple[str, str], str]:
-    """Return the unit of each channel of each link."""
-    return {
-        (send.link, channel): unit
-        for kind in system.kinds
-        for send in kind.sends
-        for channel, unit in zip(send.channels, send.units, strict=True)
-    }
-
-
-def _units(one: _Opened, units: Mapping[tuple[str, str], str]) -> list[str]:
-    """Return the units of a peer's part of the state: of z, then of the packets on their way."""
-    found, schedule = [*one.units], one.group.schedule
-    for sent, depth in zip(schedule.sent, schedule.depths, strict=True):
-        found += [units[sent.link, sent.channel]] * depth
+def _units(kind: Kind) -> dict[str, str]:
+    """Return the units of what a peer has: of its states, of what is computed and sent, by their names."""
+    found = {state.name: state.unit for state in kind.states}
+    for clock in kind.clocks:
+        found |= zip(clock.outputs, clock.units, strict=True)
+    for send in kind.sends:
+        found |= zip(send.channels, send.units, strict=True)
     return found
+
+
+def _unit(units: Mapping[str, Mapping[str, str]], name: str) -> str:
+    """Return the unit of an entry of the state, such as `user[1].coordination.x sent(-8 ms)`."""
+    peer, _, own = name.partition(".")
+    return units[peer][own.partition("(")[0].partition(" ")[0]]

@@ -24,8 +24,6 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from apc.compiler.compiled import ClockPartition, CompiledSystem, Receive
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import write_text
@@ -40,6 +38,8 @@ from apc.exports.expressions import (
     unit_of_modelica,
     written,
 )
+from apc.exports.peer_step import computing, heard_of
+from apc.exports.texts import filled, quoted
 from apc.exports.words import identifier as word
 from apc.finite_equations import finite_equations
 from apc.frame.ages import stamped
@@ -118,7 +118,6 @@ class _Writer:
         self.clocks, self.clock_lines = self._clocks()
         self.named: dict[Any, Text] = {}  # variables that are written once for all who need them
         self.sent: dict[tuple[int, str], list[tuple[Text, str]]] = {}  # and its channel
-        self.senders: dict[str, dict[int, list[tuple[int, Fraction]]]] = {}
 
     def model(self) -> ModelicaModel:
         """Return the model."""
@@ -137,30 +136,25 @@ class _Writer:
         for peer in peers:
             for partition in peer.kind.clocks:
                 peer.tick(partition)
-        duration = float(system.experiment.duration or SECOND)
-        step = float(min((period for period, _ in self.grids.values()), default=SECOND / 1000))
-        origin = _line(system.origin.topology)
-        about = f"The equations that apc compiled of {system.name}: all peers, every tick and packet."
-        lines = [
-            f"model {name} {_quoted(system.about or system.name)}",
-            f"  // Written by apc {program_version()} from {origin}; its texts have the SHA-256",
-            f"  // {texts_of(system)}.",
-            "  // One equation a line, in SI; a variable is named as in apc simulate, "
-            "PEER[number].PART.VARIABLE.",
-            "  // sample(x, c) is x just before the tick of c, hold(f) acts from the tick on.",
-            *("", *(line for _, line in self.parameters.values())),
-            *("", *self.clock_lines),
-            *("", *self.declared),
-            *("equation", *self.equations),
-            "",
-            f"  annotation(experiment(StopTime={duration!r}, Interval={step!r}), "
-            f"Documentation(info={_quoted(about)}));",
-            f"end {name};",
-        ]
+        text = filled(
+            "modelica.jinja",
+            name=name,
+            system=system,
+            title=system.about or system.name,
+            version=program_version(),
+            texts=texts_of(system),
+            parameters=[line for _, line in self.parameters.values()],
+            clocks=self.clock_lines,
+            declared=self.declared,
+            equations=self.equations,
+            duration=float(system.experiment.duration or SECOND),
+            step=float(min((period for period, _ in self.grids.values()), default=SECOND / 1000)),
+            about=f"The equations that apc compiled of {system.name}: all peers, every tick and packet.",
+        )
         return ModelicaModel(
             topology=system.name,
             name=name,
-            text="\n".join(lines),
+            text=text.rstrip("\n"),
             peers=len(peers),
             variables=len(self.declared),
             clocks=tuple(line.strip() for line in self.clock_lines),
@@ -217,7 +211,7 @@ class _Writer:
         if label not in self.parameters:
             name, modelica_unit = self.name(label), unit_of_modelica(unit)
             modifier = f'(unit="{modelica_unit}")' if modelica_unit else ""
-            comment = f" {_quoted(about)}" if about else ""
+            comment = f" {quoted(about)}" if about else ""
             line = f"  parameter Real {name}{modifier} = {number(value).text}{comment};"
             self.parameters[label] = Text(name), line
         return self.parameters[label][0]
@@ -241,17 +235,6 @@ class _Writer:
             shifted = f"shiftSample({value.text}, {rest.numerator}, {rest.denominator})"
             value = self.like(value, f"{label} late", shifted)
         return value
-
-    def heard_of(self, peer: int, link: str) -> list[tuple[int, Fraction]]:
-        """Return whom a peer hears over a link, and with what weights."""
-        if link not in self.senders:
-            found: dict[int, list[tuple[int, Fraction]]] = {}
-            pairs, weights = self.exchange.arcs(link)
-            for (sender, receiver), weight in zip(pairs.tolist(), weights.tolist(), strict=True):
-                if (sender, link) in self.sent:
-                    found.setdefault(receiver, []).append((sender, exact_weight(weight)))
-            self.senders[link] = found
-        return sorted(self.senders[link].get(peer, []))
 
     def heard(self, sender: int, link: str, channel: int, timing: str, clock: str) -> Text:
         """Return what a peer sent, so much later, as a clock of another sees it."""
@@ -324,7 +307,7 @@ class _Writer:
             part, base = phase / period, self.name(f"{clock} from 0")
             lines.append(f"  Clock {base} = {value};")
             derived = f"shiftSample({base}, {part.numerator}, {part.denominator})"
-        about = _quoted(f"every {float(period) * 1e3:.6g} ms, from {float(phase) * 1e3:.6g} ms")
+        about = quoted(f"every {float(period) * 1e3:.6g} ms, from {float(phase) * 1e3:.6g} ms")
         lines.append(f"  Clock {name} = {derived or value} {about};")
         return name
 
@@ -424,8 +407,8 @@ class _Peer:
         """Write what it makes of what it hears."""
         writer, link, exchange = self.writer, receive.link, self.writer.exchange
         terms, weights, unit = [], [], NONE
-        for sender, weight in writer.heard_of(self.number, link):
-            role = exchange.role(int(np.searchsorted(exchange.starts, sender, side="right")) - 1)
+        for sender, inexact in heard_of(writer.system, exchange, link, self.number):
+            weight, role = exact_weight(inexact), exchange.role(exchange.group_of(sender))
             timing = exchange.delay(link, role, self.role)
             heard = [
                 functools.partial(writer.heard, sender, link, channel, timing, clock)
@@ -460,16 +443,7 @@ def _refuse_what_has_no_words(system: CompiledSystem, exchange: Exchange) -> Non
         what = f"{chance(link, law)}: luck that is drawn packet by packet"
         raise _refused(system, what, "a link without it, or apc simulate")
     for kind in system.kinds:
-        functions = [(kind.derivative, "what moves")]
-        functions += [
-            (receive.edge, "a look at others")
-            for part in kind.clocks
-            for receive in part.receives
-            if receive.edge
-        ]
-        functions += [(part.tick, ", ".join(part.outputs)) for part in kind.clocks]
-        functions += [(sending.send, ", ".join(sending.channels)) for sending in kind.sends]
-        for function, what in functions:
+        for function, _, what, _ in [(kind.derivative, "", "what moves", ""), *computing(kind)]:
             if not function.is_a("SXFunction"):
                 solved = f"the nonlinear loop of {kind.name} that Newton's method solves for {what[:120]}"
                 raise _refused(system, solved, "a coupler without a loop")
@@ -491,13 +465,3 @@ def _grid(times: Sequence[Fraction]) -> Fraction:
     """Return the largest time that all of some times are whole multiples of."""
     whole = math.lcm(*(time.denominator for time in times))
     return Fraction(math.gcd(*(int(time * whole) for time in times)), whole)
-
-
-def _line(text: str) -> str:
-    return "".join(one if one.isprintable() else " " for one in text)
-
-
-def _quoted(text: str) -> str:
-    """Return a text as Modelica writes it."""
-    escaped = _line(text).replace("\\", "\\\\").replace('"', '\\"')
-    return f'"{escaped}"'

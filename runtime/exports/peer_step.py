@@ -1,8 +1,8 @@
 """One peer apart from the others: what it measures and hears, computes, sends, and moves by itself.
 
 Takes: a `CompiledSystem`, which of its peers, how its states move between events.
-Gives: `Peer`, `peer_of`, `sites_of`, `group_of`, `lines_of`, `first_packet`, `has_edge`, `refused`;
-its parts `Instant`, `Act`, `Line`, `Sender`, `Force`, `Move`.
+Gives: `Peer`, `peer_of`, `sites_of`, `lines_of`, `first_packet`, `heard_of`, `has_edge`, `computing`,
+`refused`; its parts `Instant`, `Act`, `Line`, `Sender`, `Force`, `Move`.
 Guarantees: the functions, transitions and instants are those that `simulate` plays; what stands in no finite
 list of arithmetic is refused, by the name of what moves or is computed so.
 Does not: write anything (see `c_text`), or carry packets from peer to peer (see `scene_text`).
@@ -15,9 +15,12 @@ computer. A device that is tied to a copy by more than forces computed at ticks 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
+from itertools import groupby
+from operator import itemgetter
 from typing import Any
 
 import casadi
@@ -32,11 +35,13 @@ from apc.frame import schedule as frames
 from apc.frame.devices import Device, coupled_directly, find_device, find_devices
 from apc.frame.discretize import moved_together
 from apc.frame.exact import evaluate_exact
+from apc.frame.exchange import Exchange
 from apc.frame.jacobians import SiteJacobians, edge_name, structural_pattern
 from apc.frame.linearize import start_arguments, start_values
 from apc.frame.parameters import exact_numbers
 from apc.frame.schedule import Schedule
 from apc.simulation.flow import flow_of, rows_to_move, state_scales
+from apc.simulation.program import timed_events
 from apc.simulation.propagate import rates, transition_rows
 from apc.simulation.settings import Method
 from apc.simulation.signals import LocalSignal, local_signals
@@ -202,7 +207,7 @@ def peer_of(
     ApcError
         E960 it does what is not arithmetic, or has no ticks; E961 no device, or one that can't be told apart.
     """
-    system, group = plan.system, group_of(plan, number)
+    system, group = plan.system, plan.exchange.group_of(number)
     place = system.groups[group].kind
     kind, site, schedule = system.kinds[place], plan.sites[place], plan.schedules[group]
     vector, label = _parameters(plan, number), plan.exchange.peer_name(number)
@@ -239,14 +244,9 @@ def peer_of(
     )
 
 
-def group_of(plan: Plan, number: int) -> int:
-    """Return the group of a peer, counted from 0 over all groups."""
-    return int(np.searchsorted(plan.exchange.starts, number, side="right")) - 1
-
-
 def _parameters(plan: Plan, number: int) -> Any:
     """Return a peer's vector (n_p,) of parameters."""
-    group = group_of(plan, number)
+    group = plan.exchange.group_of(number)
     row = plan.numbers.rows[group][number - int(plan.exchange.starts[group])]
     return plan.numbers.parameters[group][int(row)]
 
@@ -275,8 +275,11 @@ def sites_of(plan: Plan) -> tuple[int, ...]:
     found = []
     graphs = [link for link in plan.exchange.links if not plan.exchange.is_complete(link)]
     for number in range(plan.exchange.peers):
-        heard = tuple(tuple(weight for _, weight in _heard(plan, link, number)) for link in graphs)
-        key = group_of(plan, number), _parameters(plan, number).tobytes(), heard
+        heard = tuple(
+            tuple(weight for _, weight in heard_of(plan.system, plan.exchange, link, number))
+            for link in graphs
+        )
+        key = plan.exchange.group_of(number), _parameters(plan, number).tobytes(), heard
         found.append(first.setdefault(key, number))
     return tuple(found)
 
@@ -288,13 +291,9 @@ def refused(system: CompiledSystem, what: str, hint: str = "", code: str = "E960
 
 def _refuse_what_iterates(system: CompiledSystem, name: str, kind: Kind) -> None:
     """Refuse a peer of which something is solved by Newton's method."""
-    computed = [
-        (clock.tick, f"at a tick of {clock.clock} {', '.join(clock.outputs)}") for clock in kind.clocks
-    ]
-    computed += [(sending.send, f"{', '.join(sending.channels)} of {sending.link}") for sending in kind.sends]
-    for function, what in computed:
+    for function, when, what, where in computing(kind):
         if not function.is_a("SXFunction"):
-            what = f"{name}: {what} are solved for by iteration, which is not written as C"
+            what = f"{name}: {when}{what}{where} are solved for by iteration, which is not written as C"
             raise refused(system, what, "equations that can be solved for these")
     if not kind.clocks:
         what = f"{name} computes nothing at any tick of a clock: there is nothing to write as C"
@@ -358,11 +357,7 @@ def _is_position(kind: Kind, site: SiteJacobians, row: int) -> bool:
 
 def _read(kind: Kind) -> frozenset[int]:
     """Return the states that anything computed at an instant looks at."""
-    functions = [clock.tick for clock in kind.clocks] + [sending.send for sending in kind.sends]
-    functions += [
-        receive.edge for clock in kind.clocks for receive in clock.receives if receive.edge is not None
-    ]
-    reads = [structural_pattern(function.jac_sparsity(0, 0)).any(axis=0) for function in functions]
+    reads = [structural_pattern(function.jac_sparsity(0, 0)).any(axis=0) for function, *_ in computing(kind)]
     return frozenset(np.flatnonzero(np.any(reads, axis=0)).tolist())
 
 
@@ -451,22 +446,21 @@ def _moves(
 def _instants(schedule: Schedule) -> tuple[tuple[Instant, ...], tuple[int, ...]]:
     """Return the instants of a frame, and the lengths of time between them in quanta."""
     lengths = sorted({one.duration for one in schedule.events if isinstance(one, frames.Propagate)})
-    ticked = dict.fromkeys(range(len(schedule.ticks)), 0)
-    found: list[Instant] = []
-    now = Instant((), (), (), 0)
-    for event in schedule.events:  # a frame ends with a length of time
-        match event:
-            case frames.Send(partition):
-                now = replace(now, sends=(*now.sends, partition))
-            case frames.Tick(partition):
-                now = replace(now, ticks=(*now.ticks, partition))
-                ticked[partition] += 1
-            case frames.Act(hold, value):
-                lag = ticked[value.partition] - 1 - value.index
-                now = replace(now, acts=(*now.acts, Act(hold, lag)))
-            case frames.Propagate(duration):
-                found.append(replace(now, move=lengths.index(duration)))
-                now = Instant((), (), (), 0)
+    ticked: Counter[int] = Counter()
+    found = []
+    for _, group in groupby(timed_events(schedule), itemgetter(0)):  # each ends with a length of time
+        *listed, move = (event for _, event in group)
+        ticks = tuple(one.partition for one in listed if isinstance(one, frames.Tick))
+        ticked.update(ticks)
+        acts = [(one.hold, one.value) for one in listed if isinstance(one, frames.Act)]
+        found.append(
+            Instant(
+                tuple(one.partition for one in listed if isinstance(one, frames.Send)),
+                ticks,
+                tuple(Act(hold, ticked[value.partition] - 1 - value.index) for hold, value in acts),
+                lengths.index(move.duration),
+            )
+        )
     return tuple(found), tuple(lengths)
 
 
@@ -475,7 +469,7 @@ def _instants(schedule: Schedule) -> tuple[tuple[Instant, ...], tuple[int, ...]]
 
 def lines_of(plan: Plan, number: int) -> tuple[tuple[Line, ...], dict[tuple[int, int], tuple[int, ...]]]:
     """Return the links of a peer, and for every receive the places of its channels on its line."""
-    system, exchange, group = plan.system, plan.exchange, group_of(plan, number)
+    system, exchange, group = plan.system, plan.exchange, plan.exchange.group_of(number)
     site, schedule = plan.sites[system.groups[group].kind], plan.schedules[group]
     kind = site.kind
     read = {
@@ -505,7 +499,7 @@ def lines_of(plan: Plan, number: int) -> tuple[tuple[Line, ...], dict[tuple[int,
         places |= {key: tuple(map(used.index, channels)) for key, channels in of.items()}
         channels = tuple(known.channels[i] for i in used)
         members = unique(map(identifier, channels))
-        senders = [*_heard(plan, link, number)] if hears else []
+        senders = [*heard_of(plan.system, plan.exchange, link, number)] if hears else []
         if len(senders) > MOST_HEARD:
             what = f"{exchange.peer_name(number)} hears {len(senders):,} peers over {link}"
             what = f"{what}; {MOST_HEARD:,} fit a text of C"
@@ -530,7 +524,7 @@ def lines_of(plan: Plan, number: int) -> tuple[tuple[Line, ...], dict[tuple[int,
 
 def first_packet(plan: Plan, link: str, number: int, channels: Sequence[str]) -> tuple[float, ...]:
     """Return what is heard of a peer over a link before any packet of it arrives, channel by channel."""
-    site = plan.sites[plan.system.groups[group_of(plan, number)].kind]
+    site = plan.sites[plan.system.groups[plan.exchange.group_of(number)].kind]
     sent: dict[str, float] = {}
     for sending in site.kind.sends:
         if sending.link == link:
@@ -541,19 +535,27 @@ def first_packet(plan: Plan, link: str, number: int, channels: Sequence[str]) ->
     return tuple(sent.get(one, 0.0) for one in channels)
 
 
-def _heard(plan: Plan, link: str, number: int) -> Iterator[tuple[int, float]]:
+def heard_of(
+    system: CompiledSystem, exchange: Exchange, link: str, number: int
+) -> Iterator[tuple[int, float]]:
     """Yield the peers that one hears over a link, with their weights, in the scene's order."""
-    system, exchange = plan.system, plan.exchange
-    sends = [
-        any(sending.link == link for sending in system.kinds[group.kind].sends) for group in system.groups
-    ]
     if exchange.is_complete(link):
         listed = [(one, 1.0) for one in range(exchange.peers) if one != number]
     else:
         pairs, weights = exchange.arcs(link)
         mine = np.flatnonzero(pairs[:, 1] == number)
         listed = sorted(zip(pairs[mine, 0].tolist(), weights[mine].tolist(), strict=True))
-    return ((one, weight) for one, weight in listed if sends[group_of(plan, one)])
+    kinds = [system.kinds[group.kind] for group in system.groups]
+    sends = [any(sending.link == link for sending in kind.sends) for kind in kinds]
+    return ((one, weight) for one, weight in listed if sends[exchange.group_of(one)])
+
+
+def computing(kind: Kind) -> list[tuple[Any, str, str, str]]:
+    """Return all that a peer computes at instants: each function, when, what it gives, over which link."""
+    found = [(one.tick, f"at a tick of {one.clock} ", ", ".join(one.outputs), "") for one in kind.clocks]
+    edges = [each.edge for one in kind.clocks for each in one.receives if each.edge is not None]
+    found += [(edge, "", "a look at others", "") for edge in edges]
+    return [*found, *((one.send, "", ", ".join(one.channels), f" of {one.link}") for one in kind.sends)]
 
 
 def has_edge(kind: Kind, partition: int, receive: int) -> bool:

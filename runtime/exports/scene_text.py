@@ -26,7 +26,6 @@ from apc.exports.peer_step import (
     MOST_HEARD,
     Peer,
     first_packet,
-    group_of,
     lines_of,
     peer_of,
     refused,
@@ -47,19 +46,20 @@ MOST_WAYS = 20_000  # from peer to peer in one text: each is a number of a table
 class Variable:
     """What can be looked at: its name as `simulate` has it, unit, and the member of `model` that holds it.
 
-    `given` says that it comes from outside, and is `start` until something does; `flag` that it is 0 or 1;
-    `moving` that it is a state, which is `start` as the scene begins, if nothing else is set; `fixed` that it
-    is a parameter, which is `start` if nothing else is set until then.
+    Its `role` is "input" or "flag" (0 or 1) of what comes from outside, and is `start` until something does;
+    "state" or "parameter" of what is `start` as the scene begins if nothing else is set until then; "output".
     """
 
     name: str
     unit: str
     member: str
-    given: bool = False
-    flag: bool = False
-    moving: bool = False
-    fixed: bool = False
+    role: str = "output"
     start: float = 0.0
+
+    @property
+    def given(self) -> bool:
+        """Whether it comes from outside."""
+        return self.role in ("input", "flag")
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,11 +109,11 @@ def one_peer(plan: Plan, number: int, method: Method) -> CScene:
         for k, sender in enumerate(line.senders):
             label, member = f"{line.link}.{sender.name}", f"in0[0].{line.name}[{k}]"
             variables += [
-                Variable(f"{label}.{one.name}", one.unit, f"{member}.{one.member}", given=True, start=start)
+                Variable(f"{label}.{one.name}", one.unit, f"{member}.{one.member}", "input", start)
                 for one, start in zip(line.packet, sender.start, strict=True)
             ]
             if line.missing:
-                flag = Variable(f"{label}.missing", "1", f"{member}.missing", given=True, flag=True)
+                flag = Variable(f"{label}.missing", "1", f"{member}.missing", "flag")
                 variables.append(flag)
     variables += [
         Variable(f"{line.link}.{entry.name}", entry.unit, f"out0[0].{line.name}.{entry.member}")
@@ -129,19 +129,18 @@ def _looked_at(peer: Peer, member: str, prefix: str) -> list[Variable]:
     """Return what can be looked at of a peer that a member of `model` is."""
     found = []
     for signal in peer.signals:
-        moving = signal.role == "state"
-        start = peer.start[signal.place[0]] if moving else 0.0
+        began = ("state", peer.start[signal.place[0]]) if signal.role == "state" else ()
         own = f"{member}.{memory(peer, signal)}"
         if not signal.name.startswith(FORCE_ON):
-            found.append(Variable(prefix + signal.name, signal.unit, own, moving=moving, start=start))
+            found.append(Variable(prefix + signal.name, signal.unit, own, *began))
     units = parameter_units(peer)
     for k, place in enumerate(peer.settable):
         name, start, own = peer.kind.parameters[place], float(peer.parameters[place]), f"{member}.p[{k}]"
         if name.startswith(FORCE_ON):
             name = f"{FORCE_ON}{prefix}{name.removeprefix(FORCE_ON)}"
-            found.append(Variable(name, "N", own, given=True, start=start))
+            found.append(Variable(name, "N", own, "input", start))
         else:
-            found.append(Variable(prefix + name, units[name], own, fixed=True, start=start))
+            found.append(Variable(prefix + name, units[name], own, "parameter", start))
     return found
 
 
@@ -193,7 +192,9 @@ def _links(plan: Plan, quantum: Fraction) -> tuple[Link, ...]:
     for name, (link, channels) in zip(unique(map(identifier, used)), used.items(), strict=True):
         clock = clocks[exchange.links[link].clock]
         period, phase = (int(timings[one] / quantum) for one in (clock.period, clock.phase))
-        delays = [timings[exchange.delay(link, *(group_of(plan, one) for one in way))] for way in ways[link]]
+        delays = [
+            timings[exchange.delay(link, *(exchange.group_of(one) for one in way))] for way in ways[link]
+        ]
         lucks = [
             (luck_of(plan.system, timings, exchange, route, quantum), route)
             for route in plan.routes

@@ -1,6 +1,6 @@
 """Texts of C, XML and Python from the templates beside this module, by Jinja2.
 
-Takes: the name of a template, what it is of. Gives: `filled`; `number`, `comment`.
+Takes: the name of a template, what it is of. Gives: `filled`; `number`, `quoted`.
 Guarantees: a number is read as the very same double; nothing in a comment ends it; a name that a template
 has and nobody gave is an error.
 Does not: know what a text means.
@@ -41,6 +41,7 @@ def _templates() -> Environment:
     )
     made.filters |= {"number": number, "comment": comment, "row": row, "members": _members}
     made.filters |= {"attribute": quoteattr, "json": json.dumps, "fill": textwrap.fill, "quotable": quotable}
+    made.filters |= {"line": line_of, "quoted": quoted}
     return made
 
 
@@ -59,6 +60,17 @@ def comment(text: str) -> str:
     """Return a text that can stand in a comment of C."""
     shown = "".join(c if c.isascii() and c.isprintable() else "?" for c in text)
     return shown.replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?")
+
+
+def line_of(text: str) -> str:
+    """Return a text on one line."""
+    return "".join(one if one.isprintable() else " " for one in text)
+
+
+def quoted(text: str) -> str:
+    """Return a text as Modelica writes it."""
+    escaped = line_of(text).replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{escaped}"'
 
 
 def quotable(text: str) -> str:

@@ -74,9 +74,13 @@ class Exchange:
         heard = np.bincount(group_of[group_of[:, 1] == receiver, 0], minlength=len(sending))
         return [h for h, does in enumerate(sending) if does and heard[h]]
 
+    def group_of(self, peer: int) -> int:
+        """Return the group of a peer, by its number."""
+        return int(np.searchsorted(self.starts, peer, side="right")) - 1
+
     def peer_name(self, peer: int) -> str:
         """Return `left[2]`, for a peer's number."""
-        group = int(np.searchsorted(self.starts, peer, side="right")) - 1
+        group = self.group_of(peer)
         return f"{self.groups[group]}[{peer - int(self.starts[group]) + 1}]"
 
 

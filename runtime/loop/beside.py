@@ -18,16 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import Analysis, analyze
-from apc.compiler.compiled import Channel, CompiledSystem, Link
-from apc.loop.peer import live_scene
+from apc.compiler.compiled import CompiledSystem, Link
+from apc.loop.peer import live_scene, traced
 from apc.loop.run import PeerRun, Run, delays_of, trace_name
 from apc.moments.network import NetworkVerdict, judge_network
 from apc.network.recorded import NetworkRecording, describe_delays
 from apc.network.timetable import START, Seen
 from apc.result import Result
 from apc.simulation.blocks import blocks
+from apc.simulation.population import Population
 from apc.simulation.settings import Settings
-from apc.simulation.simulation import prepare
+from apc.simulation.simulation import Simulation, prepare
 from apc.simulation.stepwise import Stepwise
 
 Floats = NDArray[np.float64]
@@ -135,7 +136,7 @@ def compare_run(run: Run) -> RunComparison:
         emulated=any(peer.emulated for peer in peers),
         ticks=tuple(ticks_of(peer, frame) for peer in peers),
         ways=ways,
-        apart={} if why_not else _apart(run),
+        apart={} if why_not else _apart(run, simulation),
         why_not=why_not,
         measured=tuple(
             _measured(system, link, listed)
@@ -165,10 +166,8 @@ def _incomplete(system: CompiledSystem, peers: tuple[PeerRun, ...]) -> str:
 class _AsSeen:
     """What the ticks of a run saw, frame by frame (see `Timetable`)."""
 
-    def __init__(self, run: Run, simulation: object) -> None:
-        self.now = 0
-        self.seen = []
-        population = simulation.population  # type: ignore[attr-defined]
+    def __init__(self, run: Run, population: Population) -> None:
+        self.now, self.seen = 0, list[Seen]()
         self.frame = population.frame
         self.routes = population.hearing.routes
         for place, route in enumerate(self.routes):
@@ -192,10 +191,9 @@ class _AsSeen:
         return tuple(found)
 
 
-def _apart(run: Run) -> dict[str, tuple[float, float]]:
+def _apart(run: Run, simulation: Simulation) -> dict[str, tuple[float, float]]:
     """Return how far the peers' signals are from the simulated ones, by unit."""
-    simulation = prepare(live_scene(run.system), Settings(_duration(run.peers), jit=False))
-    player = Stepwise(simulation.population, lambda _: _AsSeen(run, simulation))
+    player = Stepwise(simulation.population, lambda _: _AsSeen(run, simulation.population))
     whole = np.concatenate([block.values for block in blocks(simulation, player=player)])
     simulated = {one.name: (one.unit, whole[:, column]) for column, one in enumerate(simulation.signals)}
     found: dict[str, tuple[float, float]] = {}
@@ -238,13 +236,12 @@ def _measured(system: CompiledSystem, link: Link, ways: Sequence[WayRun]) -> Mea
     tick = min(float(timing.value) for timing in system.timings if timing.name in clocks.values())
     median = dict(came.quantiles).get(0.5, came.mean)
     delay = Fraction(int(np.ceil(median / tick - 1e-9))) * Fraction(tick).limit_denominator(10**9)
-    usual = link.channel or Channel(None, None, "uniform", "newest", "hold", None)
-    channel = Channel(None, None, "uniform", usual.reorder, usual.on_loss, came.delays)
     timings = tuple(
         replace(timing, value=delay) if timing.name == link.delay else timing for timing in system.timings
     )
     period = next(float(timing.value) for timing in timings if timing.name == clocks[link.clock])
-    links = tuple(replace(one, channel=channel, delays=()) if one is link else one for one in system.links)
+    worse = replace(traced(link, came.delays), delays=())
+    links = tuple(worse if one is link else one for one in system.links)
     measured = replace(system, timings=timings, links=links)
     late = came.longest > LATEST * period or came.packets > LONGEST
     network = None if late else judge_network(measured)

@@ -1,6 +1,6 @@
 """One peer of a scene in real time: it ticks, hears what has arrived, and sends.
 
-Takes: a compiled scene, which peer, addresses, how long. Gives: `Loop`, `live_scene`, `number_of`.
+Takes: a compiled scene, which peer, addresses, how long. Gives: `Loop`, `live_scene`, `traced`, `number_of`.
 Guarantees: every tick is done once, in order, however late; what a tick hears is what had arrived when it was
 done; a peer that begins late, or again, joins at the instant it is; others that fall silent are held or left
 out as the link says.
@@ -17,11 +17,10 @@ from __future__ import annotations
 
 import heapq
 import math
-import re
 import select
 import socket
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from multiprocessing.connection import Connection
@@ -29,7 +28,7 @@ from multiprocessing.connection import Connection
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import Channel, CompiledSystem
+from apc.compiler.compiled import Channel, CompiledSystem, Link
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.words import counted, cut
 from apc.frame.exchange import Exchange, build_exchange
@@ -37,7 +36,7 @@ from apc.frame.parameters import resolve
 from apc.loop.device import DeviceFunction, Outside
 from apc.loop.packets import DROPPED, Address, Answer, Data, Hello, Post
 from apc.loop.realtime import now
-from apc.network.channel import ChannelLaw, PacketSource, channel_law
+from apc.network.channel import PacketSource, channel_law
 from apc.network.timetable import START, Seen
 from apc.simulation.blocks import pushes, unsolved
 from apc.simulation.population import instants_within
@@ -61,26 +60,25 @@ AHEAD = 1024  # packets whose luck is drawn at once
 # Datagrams read before the clock is looked at again, and all that a late tick reads: some tenths of a
 # millisecond, whatever comes.
 AT_ONCE = 32
-PEER = re.compile(r"(?P<group>[A-Za-z_][A-Za-z0-9_]*)\[(?P<place>[0-9]{1,9})\]\Z")
 
 
 def live_scene(system: CompiledSystem) -> CompiledSystem:
     """Return a scene whose links take what the network does: each way's packets are heard as they come."""
     timings = {timing.name: timing.value for timing in system.timings}
-    links = []
-    for link in system.links:
-        usual = max(timings[one] for one in (link.delay, *(pair.delay for pair in link.delays)))
-        own = link.channel
-        channel = Channel(
-            loss=None,
-            jitter=None,
-            distribution="uniform",
-            reorder=own.reorder if own else "newest",
-            on_loss=own.on_loss if own else "hold",
-            trace=np.array([float(max(Fraction(GIVEN_UP), TIMES * usual))]),
-        )
-        links.append(replace(link, channel=channel))
-    return replace(system, links=tuple(links), within=())
+    late = [
+        max(timings[one] for one in (link.delay, *(pair.delay for pair in link.delays)))
+        for link in system.links
+    ]
+    given_up = [[float(max(Fraction(GIVEN_UP), TIMES * delay))] for delay in late]
+    links = tuple(map(traced, system.links, given_up))
+    return replace(system, links=links, within=())
+
+
+def traced(link: Link, delays: Sequence[float] | Floats) -> Link:
+    """Return a link whose packets take recorded delays, in seconds; what it makes of lost ones stays."""
+    usual = link.channel or Channel(None, None, "uniform", "newest", "hold", None)
+    lawless = replace(usual, loss=None, jitter=None, distribution="uniform")
+    return replace(link, channel=replace(lawless, trace=np.asarray(delays)))
 
 
 class StoppedError(RuntimeError):
@@ -343,7 +341,7 @@ class _OnePeer(Stepwise):
         self.held_back: list[tuple[int, int, bytes, Address]] = []
         self.log: list[tuple[int, int, int]] = []
         self.arrivals: list[tuple[int, int, int, int, int]] = []
-        self.sent: Counter[tuple[int, int]] = Counter()  # packets by link and receiver
+        self.sent: dict[int, Counter[int]] = defaultdict(Counter)  # packets by link and receiver
         self.instant = 0
 
     def warm_up(self) -> None:
@@ -422,10 +420,10 @@ class _OnePeer(Stepwise):
             column = self.population.hearing.column_of[loop.own]
             values = tuple(self.packets[number % self.population.hearing.ring, keys, column].tolist())
             instant = link.instant(count)
-            for other in sorted(link.receivers):
+            for other in sorted(link.receivers) if loop.begins else ():  # while it warms up nobody hears it
                 delay = self.network.delay(link, other, count) if self.network else 0
-                self.sent[link.place, other] += loop.begins != 0
-                if delay is not None and loop.begins:
+                self.sent[link.place][other] += 1
+                if delay is not None:
                     at = loop.begins + instant + delay
                     datagram = loop.post.data(at, other, link.place, count, values)
                     if datagram is None:
@@ -472,15 +470,13 @@ class _OfLink:
     """
 
     def __init__(self, loop: Loop, place: int) -> None:
-        simulation, population = loop.simulation, loop.simulation.population
+        population = loop.simulation.population
         self.place, self.name = place, loop.system.links[place].name
-        over = [at for at, one in enumerate(population.hearing.routes) if one.link == self.name]
-        routes = {at: population.hearing.routes[at] for at in over}
-        luck = simulation.lucks[over[0]] if over else None
-        self.phase = luck.phase * simulation.quantum * NANO if luck else Fraction(0)
-        self.period = luck.period * simulation.quantum * NANO if luck else Fraction(1)
-        self.newest = luck is None or luck.newest
-        self.slots = routes[over[0]].slots if over else 1
+        link, timings = loop.system.links[place], resolve(loop.system).timings
+        clock = next(one for one in loop.system.clocks if one.name == link.clock)
+        self.phase, self.period = (timings[one] * NANO for one in (clock.phase, clock.period))
+        self.newest = link.channel is None or link.channel.reorder == "newest"
+        self.slots = int(loop.simulation.frame * loop.simulation.quantum * NANO / self.period)
         self.channels: dict[int, list[str]] = {}
         for member in population.members:
             sent = sorted({one.channel for one in member.program.schedule.sent if one.link == self.name})
@@ -489,8 +485,8 @@ class _OfLink:
         self.keys = {(one.channel, one.slot): row for row, one in listed if one.link == self.name}
         self.receivers: set[int] = set()
         self.ways: dict[int, list[tuple[int, int]]] = {}
-        for at, route in routes.items():
-            for way, (sender, receiver) in enumerate(route.pairs.tolist()):
+        for at, route in enumerate(population.hearing.routes):
+            for way, (sender, receiver) in enumerate(route.pairs.tolist() if route.link == self.name else ()):
                 if sender == loop.own:
                     self.receivers.add(receiver)
                 if receiver == loop.own:
@@ -512,27 +508,31 @@ class _Emulated:
     def __init__(self, loop: Loop) -> None:
         self.loop = loop
         self.timings = resolve(loop.system).timings
-        self.sources: dict[tuple[int, int], tuple[PacketSource, list[float]]] = {}
+        self.delays: dict[tuple[int, int], Iterator[tuple[int, float]]] = {}
 
     def delay(self, link: _OfLink, other: int, count: int) -> int | None:
-        """Return the delay of a packet in nanoseconds, None if it gets lost."""
-        if (link.place, other) not in self.sources:
-            self.sources[link.place, other] = self._source(link, other), []
-        source, delays = self.sources[link.place, other]
-        while source.taken <= count:
-            delays[:] = source.take(AHEAD)[0].tolist()
-        found = delays[count - source.taken]
+        """Return the delay of a packet in nanoseconds, None if it gets lost; counts of a way only grow."""
+        key = link.place, other
+        if key not in self.delays:
+            self.delays[key] = enumerate(_drawn(self._source(link, other)))
+        found = next(delay for number, delay in self.delays[key] if number == count)
         return None if math.isinf(found) else int(found * NANO)
 
     def _source(self, link: _OfLink, other: int) -> PacketSource:
         loop, exchange = self.loop, self.loop.exchange
         way, declared = (loop.own, other), loop.system.links[link.place]
-        of, to = (int(np.searchsorted(exchange.starts, one, side="right")) - 1 for one in way)
+        of, to = map(exchange.group_of, way)
         delay = self.timings[exchange.delay(link.name, of, to)]
-        law = ChannelLaw(0.0, 1.0, 1.0, 0.0, float(delay), 0.0, "uniform", None)
-        if declared.channel is not None:
-            law = channel_law(loop.system, declared, delay)
+        law = channel_law(
+            loop.system, declared if declared.channel else traced(declared, [float(delay)]), delay
+        )
         return PacketSource(law, link.name, [way], seed=loop.simulation.seed)
+
+
+def _drawn(source: PacketSource) -> Iterator[float]:
+    """Yield the delays of a way's packets, in seconds."""
+    while True:
+        yield from source.take(AHEAD)[0].tolist()
 
 
 def number_of(exchange: Exchange, name: str, option: str) -> int:
@@ -550,13 +550,11 @@ def number_of(exchange: Exchange, name: str, option: str) -> int:
     ApcError
         E970 there is no such peer.
     """
-    found = PEER.match(name)
-    group = exchange.groups.index(found["group"]) if found and found["group"] in exchange.groups else -1
-    place = int(found["place"]) if found else 0
-    if group >= 0 and 1 <= place <= exchange.starts[group + 1] - exchange.starts[group]:
-        return int(exchange.starts[group]) + place - 1
-    names = [exchange.peer_name(one) for one in range(min(exchange.peers, 4))]
-    expected = f"one of {', '.join(names)}{', …' if exchange.peers > len(names) else ''}"
+    every = [exchange.peer_name(one) for one in range(exchange.peers)]
+    if name in every:
+        return every.index(name)
+    names = every[:4]
+    expected = f"one of {', '.join(names)}{', …' if len(every) > 4 else ''}"
     near = nearest(name, [f"{one}[1]" for one in exchange.groups]) or names[0]
     hint = f'{option} "{near}{"=HOST:PORT" if option == "--to" else ""}"'
     raise ApcError(Mistake("E970", Place(option), "a peer", expected, cut(name) or "nothing", hint))

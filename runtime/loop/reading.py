@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import hashlib
 import re
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from apc.compiler.cache import read_archive
 from apc.compiler.errors import ApcError, Mistake, Place
@@ -25,7 +24,7 @@ from apc.compiler.files import RefusedError, read_file
 from apc.compiler.words import counted
 from apc.loop.packets import DROPPED
 from apc.loop.peer import live_scene
-from apc.loop.run import ARRAYS, SCENE, PeerRun, Run, Words
+from apc.loop.run import ARRAYS, OF_ROUTES, SCENE, PeerRun, Run, Words
 from apc.network.timetable import START, Route
 from apc.npz import DamageError, read_arrays
 from apc.opening import opened
@@ -37,14 +36,6 @@ LARGEST = 1 << 30
 LONGEST = 1 << 24  # bytes of what is told in words
 MOST_PACKETS = 10**7  # of a way, the lost ones between the first and the last included
 LATEST = 1 << 62  # nanoseconds: what any two differ by can be told as well
-KINDS = {
-    "told": ("|u1", 1),
-    "time|late|took": ("<f8", 1),
-    "values": ("<f8", 2),
-    "arrivals": ("<i8", 2),
-    "packets[0-9]{1,5}": ("<i8", 2),
-    "missing[0-9]{1,5}": ("|b1", 2),
-}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,7 +80,7 @@ def read_run(folder: Path) -> Run:
 
 def _read_peer(path: Path, scene: _Scene) -> PeerRun:
     try:
-        peer = _peer(read_arrays(read_file(path, LARGEST), KINDS, LARGEST))
+        peer = _peer(read_file(path, LARGEST), scene)
         for check in (_check_words, _check_signals, _check_packets):
             check(peer, scene)
     except (RefusedError, DamageError) as error:
@@ -103,25 +94,23 @@ def _want(right: bool | np.bool_, fault: str) -> None:
         raise DamageError(fault)
 
 
-def _peer(found: dict[str, NDArray[Any]]) -> PeerRun:
-    """Return what arrays hold, of which only the types are known to be right."""
-    _want({"told", *ARRAYS} <= found.keys(), f"it lacks one of {', '.join(('told', *ARRAYS))}")
+def _peer(data: bytes, scene: _Scene) -> PeerRun:
+    """Return what a file holds, of which only the names and the types are known to be right."""
+    of_routes = {
+        name: {f"{name}{at}": kind for at in range(len(scene.routes))} for name, kind in OF_ROUTES.items()
+    }
+    kinds = {"told": ("|u1", 1), **ARRAYS} | of_routes["packets"] | of_routes["missing"]
+    found = read_arrays(data, kinds, LARGEST)
+    _want(found.keys() == kinds.keys(), f"it lacks one of {', '.join(kinds)}")
     _want(found["told"].size <= LONGEST, "it tells too much")
     try:
         words = msgspec.json.decode(found["told"].tobytes(), type=Words)
         _want(all(map(str.isprintable, words.not_given)), "")  # it is shown in a terminal
     except ValueError:
         raise DamageError("what it tells is not what apc play writes") from None
-    routes = range((len(found) - len(ARRAYS) - 1) // 2)
-    packets, missing = ([f"{name}{at}" for at in routes] for name in ("packets", "missing"))
-    _want(found.keys() == {"told", *ARRAYS, *packets, *missing}, "it hears no route, or one by half")
-    plain: dict[str, Any] = {one.name: getattr(words, one.name) for one in fields(Words)}
-    plain |= {name: found[name] for name in ARRAYS}
-    return PeerRun(
-        **plain,
-        packets=tuple(found[name] for name in packets),
-        missing=tuple(found[name] for name in missing),
-    )
+    arrays: dict[str, Any] = {name: found[name] for name in ARRAYS}
+    arrays |= {name: tuple(map(found.__getitem__, listed)) for name, listed in of_routes.items()}
+    return PeerRun(**asdict(words), **arrays)
 
 
 def _check_words(peer: PeerRun, scene: _Scene) -> None:
@@ -164,7 +153,6 @@ def _check_signals(peer: PeerRun, scene: _Scene) -> None:
 
 def _check_packets(peer: PeerRun, scene: _Scene) -> None:
     """Check what came, and what ticks saw of it."""
-    _want(len(peer.packets) == len(scene.routes), "it hears other links than the scene's")
     for route, packets, missing in zip(scene.routes, peer.packets, peer.missing, strict=True):
         ways = int((route.pairs[:, 1] == peer.number).sum())
         _want(packets.shape == missing.shape == (len(packets), ways), "it hears other peers than the scene's")

@@ -29,7 +29,15 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 SCENE = "scene.apc"
-ARRAYS = ("time", "values", "late", "took", "arrivals")
+# Of the arrays of a peer's file the type and the number of dimensions, and of those of each route.
+ARRAYS = {
+    "time": ("<f8", 1),
+    "values": ("<f8", 2),
+    "late": ("<f8", 1),
+    "took": ("<f8", 1),
+    "arrivals": ("<i8", 2),
+}
+OF_ROUTES = {"packets": ("<i8", 2), "missing": ("|b1", 2)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,16 +106,10 @@ def run_of(loop: Loop, digest: bytes, not_given: tuple[str, ...]) -> PeerRun:
     rows = np.concatenate([np.zeros((0, simulation.population.width)), *loop.rows])
     last = int(simulation.settings.duration / simulation.quantum)
     played = len(rows) // len(simulation.marks)
-    starts = range(loop.first, loop.first + played, simulation.length)
-    whole = [instants_of(simulation, at, last) for at in starts]
-    instants = np.concatenate([np.zeros(0, np.int64), *(one for one, _ in whole)])[: len(rows)]
-    recorded = np.concatenate([np.zeros(0, np.bool_), *(one for _, one in whole)])[: len(rows)]
-    recorded = recorded.astype(bool) & np.isfinite(rows).all(axis=1)
+    instants, recorded = instants_of(simulation, loop.first, played, last)
+    recorded &= np.isfinite(rows).all(axis=1)
     # Told to end, it did not wait for the last instant.
     log = np.maximum(np.array(player.log, np.int64).reshape(-1, 3), 0)
-    sent: dict[int, dict[int, int]] = {}
-    for (link, receiver), count in player.sent.items():
-        sent.setdefault(link, {})[receiver] = count
 
     def seen(place: int, kind: type) -> tuple[NDArray[Any], ...]:
         ways = zip(player.seen, player.mine, strict=True)
@@ -129,7 +131,7 @@ def run_of(loop: Loop, digest: bytes, not_given: tuple[str, ...]) -> PeerRun:
         signals=tuple(signal.name for signal in simulation.signals),
         dropped=dict(loop.post.dropped),
         not_given=not_given,
-        sent=sent,
+        sent={link: dict(counts) for link, counts in player.sent.items()},
         offsets={one: (trip / NANO, ahead / NANO) for one, (trip, ahead) in loop.offsets.items()},
         time=np.asarray(instants[recorded] * float(simulation.quantum), np.float64),
         values=rows[recorded][:, simulation.order],
@@ -202,8 +204,8 @@ def _write_peer(folder: Path, peer: PeerRun, system: CompiledSystem) -> None:
     """Write what a peer did, and a trace of every way that it heard. Raises OSError if it can't."""
     words = msgspec.json.encode({one.name: getattr(peer, one.name) for one in fields(Words)})
     arrays = {name: getattr(peer, name) for name in ARRAYS}
-    arrays |= {f"packets{at}": one for at, one in enumerate(peer.packets)}
-    arrays |= {f"missing{at}": one for at, one in enumerate(peer.missing)}
+    for name in OF_ROUTES:
+        arrays |= {f"{name}{at}": one for at, one in enumerate(getattr(peer, name))}
     arrays["told"] = np.frombuffer(words, np.uint8)
     np.savez_compressed(folder / f"{file_name(peer.name)}.npz", **arrays)
     for link, sender in peer.ways:

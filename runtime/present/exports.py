@@ -107,9 +107,9 @@ def unit_text(found: Unit) -> Lines:
     what = found.peer or counted(len(found.scene.peers), "peer")
     yield f"{found.system.name}: {what} for co-simulation, FMI 2.0\n"
     variables = found.scene.variables
-    fixed = [one.name for one in variables if one.fixed]
+    fixed = [one.name for one in variables if one.role == "parameter"]
     yield from _numbered("input", [one.name for one in variables if one.given])
-    yield from _numbered("output", [one.name for one in variables if not (one.given or one.fixed)])
+    yield from _numbered("output", [one.name for one in variables if one.role in ("output", "state")])
     if fixed:
         yield from _numbered("parameter", fixed)
     told = f"steps of {found.step * 1e3:.6g} ms show every tick of the fastest clock, values before the tick"
@@ -122,7 +122,7 @@ def unit_text(found: Unit) -> Lines:
 def unit_document(found: Unit) -> Plain:
     """Return an FMU as plain data."""
     variables = [
-        {**picked(one, "name", "unit"), "input": bool(one.given), "parameter": one.fixed}
+        {**picked(one, "name", "unit"), "input": one.given, "parameter": one.role == "parameter"}
         for one in found.scene.variables
     ]
     return {

@@ -66,7 +66,7 @@ def blocks(simulation: Simulation, *, run: int = 0, player: Player | None = None
     player.begin(run)
     for first in range(0, last // simulation.frame + 1, length):
         played = player.play(first, length, pushes(simulation, first))
-        instants, kept = instants_of(simulation, first, last)
+        instants, kept = instants_of(simulation, first, length, last)
         kept &= np.arange(len(kept)) < played.frames * marks
         values = played.rows[kept][:, simulation.order]
         time = instants[kept] * simulation.quantum.numerator / simulation.quantum.denominator
@@ -124,9 +124,11 @@ def pushes(simulation: Simulation, first: int) -> list[Floats | None]:
     return found
 
 
-def instants_of(simulation: Simulation, first: int, last: int) -> tuple[Integers, NDArray[np.bool_]]:
-    """Return every row's instant in quanta, and which rows are kept: those until the quantum `last`."""
+def instants_of(
+    simulation: Simulation, first: int, count: int, last: int
+) -> tuple[Integers, NDArray[np.bool_]]:
+    """Return the instant in quanta of each row of some frames, and which are kept: those until `last`."""
     marks = np.array(simulation.marks, dtype=np.int64)
-    instants = (first + np.arange(simulation.length))[:, None] * simulation.frame + marks
+    instants = (first + np.arange(count))[:, None] * simulation.frame + marks
     kept = ((marks > marks[0]) | simulation.ticks_at_zero | (instants == 0)) & (instants <= last)
     return instants.reshape(-1), kept.reshape(-1)
