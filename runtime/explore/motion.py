@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.present.bodies import Body, Disc, moves_in_plane, views_of
+from apc.present.bodies import Body, Disc, heading, moves_in_plane, views_of
 from apc.simulation.strike import SPEED, WATCHED, strike
 from apc.simulation.trajectory import simulate
 
@@ -72,15 +72,13 @@ def motion_of(system: CompiledSystem, *, struck: bool) -> Motion:
         told.append(f"{what} is struck: it starts at {SPEED * MM:g} mm/s.")
     shown = tuple((view.name, body) for view in views for body in view.bodies)
     names = [
-        [f"{peer}.{state}" for state in (one.states[0], one.states[planar], one.turning)]
+        [f"{peer}.{state}" for state in (one.states[0], one.states[planar], *one.turning)]
         for peer, one in shown
     ]
     if not names:
         raise ApcError(Mistake("E983", Place(system.name), "nothing here has a position that could be shown"))
     duration = system.experiment.duration or WATCHED
-    played = simulate(
-        system, duration=duration, signals=[one for own in names for one in own if one[-1] != "."]
-    )
+    played = simulate(system, duration=duration, signals=[one for own in names for one in own])
     values, time = played.values, played.time
     places = [number for number, one in enumerate(played.signals) if one.unit == "m"]
     apart = np.abs(values - values[0])[:, places].max(axis=1) > FAR
@@ -89,11 +87,10 @@ def motion_of(system: CompiledSystem, *, struck: bool) -> Motion:
         values, time = values[:last], time[:last]
         told.append(f"Shown until something is {FAR:g} m from where it began.")
     some = np.unique(np.linspace(0, len(time) - 1, min(ROWS, len(time))).astype(int))
-    columns = {one.name: values[some, place] for place, one in enumerate(played.signals)}
-    still = np.zeros(len(some))
-    x, y, angle = (
-        np.stack([columns.get(one, still) for one in each], axis=1) for each in zip(*names, strict=True)
-    )
+    columns = {one.name: place for place, one in enumerate(played.signals)}
+    tracks = [values[np.ix_(some, [columns[one] for one in own])] for own in names]
+    x, y = (np.stack([one[:, place] for one in tracks], axis=1) for place in (0, 1))
+    angle = np.stack([heading(one[:, 2:]) for one in tracks], axis=1)
     fixed = [(row, surface) for row, view in enumerate(views) for surface in view.surfaces]
     told.append(f"It {played.summary.verdict}.")
     return Motion(

@@ -23,6 +23,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.files import check_target, write_file
 from apc.compiler.timings import part
 from apc.optional import missing, need
+from apc.present.bodies import heading
 from apc.present.still import MM, draw_actors, keep_in_sight, widen
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ def save_animation(system: CompiledSystem, found: Trajectory, path: Path) -> Non
     figure, actors = draw_actors(system)
     columns = {signal.name: place for place, signal in enumerate(found.signals)}
     tracks = [MM * found.values[:, [columns[name] for name in actor.states]] for actor in actors]
-    turns = [found.values[:, columns[actor.turning]] if actor.turning else None for actor in actors]
+    turns = [heading(found.values[:, [columns[one] for one in actor.turning]]) for actor in actors]
     for actor, track in zip(actors, tracks, strict=True):
         widen(actor, track)
     if actors:
@@ -93,7 +94,7 @@ def save_animation(system: CompiledSystem, found: Trajectory, path: Path) -> Non
                 for row in rows.tolist():
                     title.set_text(f"{system.name}: {found.time[row]:.3f} s{told}")
                     for actor, track, turn in zip(actors, tracks, turns, strict=True):
-                        actor.move(track[row], 0.0 if turn is None else turn[row])
+                        actor.move(track[row], turn[row])
                     writer.grab_frame()
             shutil.copyfile(named, temporary)
 

@@ -41,15 +41,16 @@ SAME = 1e-9  # relative: what is equal but for roundings
 class Body:
     """A body at the start: its place (d,) and its radius, 0 for a point, in m; `states` are its coordinates.
 
-    Of a body on an axis d is 1, and the radius half its width. `turning` is the state that is the angle of a
-    body of a plane, "" of one that has none, and `angle` its value in rad.
+    Of a body on an axis d is 1, and the radius half its width. `turning` are the states that say how it is
+    turned, none of one that is not: its angle in a plane, or in space Rodrigues' vector, the axis times twice
+    the tangent of half the angle; `angle` is its `heading` in rad.
     """
 
     name: str
     place: tuple[float, ...]
     radius: float
     states: tuple[str, ...]
-    turning: str = ""
+    turning: tuple[str, ...] = ()
     angle: float = 0.0
 
 
@@ -87,13 +88,28 @@ def positions_of(kind: Kind) -> dict[str, list[int]]:
     return found
 
 
-def angles_of(kind: Kind) -> dict[str, int]:
-    """Return of each part that turns by one angle the place of that among the states."""
+def heading(turned: Floats) -> Floats:
+    """Return the angle in rad from the first axis to that of a body, as seen along the third axis.
+
+    Parameters
+    ----------
+    turned
+        How it is turned (…, k): by nothing, by an angle, or by Rodrigues' vector in space.
+    """
+    if turned.shape[-1] < 3:
+        return turned.sum(axis=-1)
+    # Of the first axis turned by 2 g, (1 + g·g) times the first two coordinates (Shuster, see SpatialBody).
+    a, b, c = np.moveaxis(turned / 2, -1, 0)
+    return np.asarray(np.arctan2(2 * (c + a * b), 1 + a**2 - b**2 - c**2))
+
+
+def turns_of(kind: Kind) -> dict[str, list[int]]:
+    """Return of each part that turns, in a plane or in space, the places of how among the states."""
     found: dict[str, list[int]] = {}
     for place, state in enumerate(kind.states):
         if state.unit == "rad":
             found.setdefault(state.name.rpartition(".")[0], []).append(place)
-    return {part: places[0] for part, places in found.items() if len(places) == 1}
+    return {part: places for part, places in found.items() if len(places) in (1, 3)}
 
 
 def moves_in_plane(system: CompiledSystem) -> bool:
@@ -157,17 +173,19 @@ def bodies_of(
             radii[wide] = max(radii[wide], abs(surface.offset))
         elif isinstance(surface, Disc) and _equal(surface.centre, 0):
             radii[wide] = max(radii[wide], surface.radius)
-    turns = angles_of(kind)
+    turns = turns_of(kind)
     bodies = [
         Body(
             part,
             tuple(float(start[place]) for place in places),
             radii[name],
             tuple(kind.states[place].name for place in places),
-            *((kind.states[turns[part]].name, float(start[turns[part]])) if part in turns else ()),
+            tuple(kind.states[place].name for place in turned),
+            float(heading(np.array([start[place] for place in turned], dtype=np.float64))),
         )
         for name, places in positions.items()
         for part in [name.rpartition(".")[0]]
+        for turned in [turns.get(part, [])]
     ]
     return bodies, list(fixed)
 

@@ -37,7 +37,7 @@ class Actor:
     """A body in a picture: its signals `states`, half its width in mm, and the `shift` that it is drawn at.
 
     `shift` is a matplotlib Affine2D; `artists` are what is drawn, the last one the bar along its axis if it
-    has an angle, the signal `turning`.
+    is turned, as the signals `turning` say.
     """
 
     ax: Any
@@ -46,7 +46,7 @@ class Actor:
     row: int
     shift: Any
     artists: tuple[Any, ...]
-    turning: str
+    turning: tuple[str, ...]
 
     def move(self, place: Sequence[float], angle: float = 0.0) -> None:
         """Put it at (d,), in mm, turned by an angle in rad; along an axis it stays in its row."""
@@ -134,7 +134,7 @@ def _actor(ax: Any, peer: str, body: Body, row: int, colour: Any, size: int) -> 
         corner, sides = (-half, -HALF), (2 * half, 2 * HALF)
         shape = patches.Rectangle(corner, *sides, **look) if flat else patches.Circle((0, 0), half, **look)
         artists.append(ax.add_patch(shape))
-    turning = f"{peer}.{body.turning}" if body.turning and not flat else ""
+    turning = tuple(f"{peer}.{one}" for one in body.turning if not flat)
     if turning:
         bar = {"markersize": BAR, "markeredgewidth": 3, "transform": shift + ax.transData, "zorder": 1.5}
         artists += ax.plot(0, 0, color=colour, marker=_bar(body.angle), **bar)

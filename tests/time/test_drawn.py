@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 from matplotlib.markers import MarkerStyle
+from scipy.spatial.transform import Rotation
 
 import apc
 from apc.compiler.compiled import CompiledSystem
+from apc.present.bodies import heading
 from apc.present.pictures import write_picture
 from apc.present.simulation import paths_of
 from apc.present.still import draw_actors
@@ -69,7 +72,11 @@ def test_every_peer_has_a_plane_of_its_own_to_one_scale(tmp_path: Path) -> None:
 
 def test_what_turns_has_a_bar_along_its_axis_and_what_does_not_none() -> None:
     device, beam = sorted(draw_actors(scene("carried-beam"))[1][:2], key=lambda one: one.turning)
-    assert (device.turning, beam.turning, len(device.artists)) == ("", "left[1].beam.angle", 1)
+    assert (device.turning, beam.turning, len(device.artists)) == ((), ("left[1].beam.angle",), 1)
+    vectors = np.random.default_rng(1).uniform(-2, 2, (9, 3))  # turned by up to 3.4 rad, half its tangent
+    size = np.linalg.norm(vectors, axis=1, keepdims=True)
+    x, y, _ = Rotation.from_rotvec(vectors).apply([1, 0, 0]).T
+    assert heading(2 * vectors / size * np.tan(size / 2)) == pytest.approx(np.arctan2(y, x))
     beam.move([0.0, 0.0], math.pi / 3)
     mark = MarkerStyle(beam.artists[-1].get_marker())
     ends = mark.get_transform().transform(mark.get_path().vertices)
