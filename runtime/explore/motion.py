@@ -88,7 +88,7 @@ def motion_of(system: CompiledSystem, *, struck: bool) -> Motion:
         told.append(f"Shown until something is {FAR:g} m from where it began.")
     some = np.unique(np.linspace(0, len(time) - 1, min(ROWS, len(time))).astype(int))
     columns = {one.name: place for place, one in enumerate(played.signals)}
-    tracks = [values[np.ix_(some, [columns[one] for one in own])] for own in names]
+    tracks = [values[some][:, [columns[one] for one in own]] for own in names]
     x, y = (np.stack([one[:, place] for one in tracks], axis=1) for place in (0, 1))
     angle = np.stack([heading(one[:, 2:]) for one in tracks], axis=1)
     fixed = [(row, surface) for row, view in enumerate(views) for surface in view.surfaces]

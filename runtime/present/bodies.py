@@ -97,7 +97,7 @@ def heading(turned: Floats) -> Floats:
         How it is turned (…, k): by nothing, by an angle, or by Rodrigues' vector in space.
     """
     if turned.shape[-1] < 3:
-        return turned.sum(axis=-1)
+        return np.asarray(turned.sum(axis=-1))
     # Of the first axis turned by 2 g, (1 + g·g) times the first two coordinates (Shuster, see SpatialBody).
     a, b, c = np.moveaxis(turned / 2, -1, 0)
     return np.asarray(np.arctan2(2 * (c + a * b), 1 + a**2 - b**2 - c**2))
