@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, analyze, prepare
 from apc.analysis.box import open_systems
-from apc.analysis.cells import Cell, OpenSystem, look, open_system
+from apc.analysis.cells import Cell, OpenSystem, contracted, matrices_over, open_system
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.timings import part
 from apc.eigen.rigid import find_rigid_modes, stays_rigid, what_stands
@@ -272,11 +272,12 @@ def _looked(
         proved, inside = np.ones((2, len(some)), dtype=np.bool_)
         reach = np.array([[float(high - low) for low, high in cell] for cell in some])
         for question in questions:
-            found = look(question, some)
+            found = contracted(matrices_over(question, some))
             sound = found.inside | found.proved
             left = np.flatnonzero(~sound)
             if len(left):
-                sound[left] = look(question, [points[place] for place in left.tolist()]).proved
+                at = [points[place] for place in left.tolist()]
+                sound[left] = contracted(matrices_over(question, at)).proved
             inside &= sound
             fails = ~found.proved & np.isfinite(found.reach).all(axis=1)
             first = fails & proved

@@ -1,8 +1,8 @@
 """A closed system over many cells of some parameters at once, and which of them a norm proves stable.
 
 Takes: a `ClosedSystem`, its sites over `Fraction` and `Ratio`, its rigid motions; cells.
-Gives: `OpenFrames`, `open_frames`, `frames_over`; `OpenLoop`, `open_loop`, `closed_over`; `OpenSystem`,
-`open_system`, `matrices_over`; `Cell`; `Looked`, `look`, `contracted`.
+Gives: `OpenFrames`, `open_frames`, `frames_over`; `OpenSystem`, `open_system`, `matrices_over`; `Cell`;
+`Contraction`, `contracted`.
 Guarantees: a cell that is said to be stable is proved so, at every point of it; rounding is charged.
 Does not: divide cells, or decide what floats leave open (see `box_proof`).
 
@@ -65,40 +65,33 @@ class _Written:
 class OpenFrames:
     """Sites over the open parameters of a box, ready to be lifted over cells.
 
-    `written` are the sites in floats, `beside` another matrix that is wanted, `quotients` the numerators and
-    denominators in these, none where this is 1.
+    `written` are the sites in floats, `quotients` the numerators and denominators in these, none where this
+    is 1.
     """
 
     sites: tuple[LinearSite, ...]
     schedules: tuple[Schedule, ...]
     written: tuple[LinearSite, ...]
-    beside: Matrix
     quotients: tuple[tuple[Polynomial, Polynomial | None], ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class OpenLoop:
-    """One closed system over a box: its sites over the open parameters, and who hears whom."""
+class OpenSystem:
+    """A closed system over a box: its sites over the open parameters, and who hears whom.
+
+    Its relative coordinates serve all over the box. Eigenvalues are wanted inside a circle, of radius
+    `inside`.
+    """
 
     system: ClosedSystem
     frames: OpenFrames
     feedback: tuple[Feedback, ...]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class OpenSystem:
-    """A closed system over a box, and its relative coordinates, which serve all over it.
-
-    Eigenvalues are wanted inside a circle of radius `inside`.
-    """
-
-    loop: OpenLoop
     relative: Relative
     inside: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Looked:
+class Contraction:
     """What is known of k cells: which are proved, or only their middles, and how much each parameter matters.
 
     Of points nothing matters: m is 0. Where there is no norm it is NaN.
@@ -116,43 +109,31 @@ def open_system(
 
     Parameters
     ----------
-    system, sites
-        As for `open_loop`.
+    system
+        The system, at some point of the box.
+    sites
+        Its sites' matrices, over `Fraction` and `Ratio`.
     rigid
         Its rigid motions, which are so all over the box.
     inside
         The radius of the circle that eigenvalues are wanted in.
     """
-    return OpenSystem(open_loop(system, sites), with_doubt(relative_coordinates(rigid.basis)), inside)
+    return OpenSystem(
+        system,
+        open_frames(sites, [group.schedule for group in system.sites]),
+        tuple(feedback_of(system, system.layout)),
+        with_doubt(relative_coordinates(rigid.basis)),
+        inside,
+    )
 
 
-def open_loop(system: ClosedSystem, sites: Sequence[LinearSite], beside: Matrix | None = None) -> OpenLoop:
-    """Make a closed system ready to be closed over cells.
-
-    Parameters
-    ----------
-    system
-        The system, at some point of the box.
-    sites
-        Its sites' matrices, over `Fraction` and `Ratio`.
-    beside
-        Another matrix over these that is wanted.
-    """
-    frames = open_frames(sites, [group.schedule for group in system.sites], beside)
-    return OpenLoop(system, frames, tuple(feedback_of(system, system.layout)))
-
-
-def open_frames(
-    sites: Sequence[LinearSite], schedules: Sequence[Schedule], beside: Matrix | None = None
-) -> OpenFrames:
+def open_frames(sites: Sequence[LinearSite], schedules: Sequence[Schedule]) -> OpenFrames:
     """Make sites ready to be lifted over cells.
 
     Parameters
     ----------
     sites, schedules
         Their matrices, over `Fraction` and `Ratio`, and what happens in their frames.
-    beside
-        Another matrix over these that is wanted.
     """
     known: dict[str, int] = {}
     quotients: list[tuple[Polynomial, Polynomial | None]] = []
@@ -174,36 +155,17 @@ def open_frames(
         return np.array(_Written(still, moving), dtype=object)
 
     alike = {id(site): every_matrix(site, written) for site in sites}
-    wanted = written(np.zeros((0, 0)) if beside is None else beside)
-    return OpenFrames(
-        sites=tuple(sites),
-        schedules=tuple(schedules),
-        written=tuple(alike[id(site)] for site in sites),
-        beside=wanted,
-        quotients=tuple(quotients),
-    )
+    written_sites = tuple(alike[id(site)] for site in sites)
+    return OpenFrames(tuple(sites), tuple(schedules), written_sites, tuple(quotients))
 
 
-def look(asked: OpenSystem, cells: Sequence[Cell]) -> Looked:
-    """Say which cells are proved stable, all eigenvalues inside the system's circle.
-
-    Parameters
-    ----------
-    asked
-        The system.
-    cells
-        Of all its parameters, k of them; points, where low and high are the same.
-    """
-    return contracted(matrices_over(asked, cells))
-
-
-def contracted(matrix: Matrix) -> Looked:
+def contracted(matrix: Matrix) -> Contraction:
     """Say over which cells all eigenvalues of matrices (k, 2 + m, n, n) are inside the circle."""
     k, count, n = len(matrix), matrix.shape[1] - 2, matrix.shape[-1]
     proved, inside = np.full((2, k), not n)
     reach = np.zeros((k, count))
     if not n:
-        return Looked(proved, inside, reach)
+        return Contraction(proved, inside, reach)
     value, off, slopes = value_of(matrix), radius_of(matrix), matrix[:, 2:]
     basis = _change_of_basis(value)
     known = np.isfinite(basis).all(axis=(1, 2)) & np.isfinite(matrix).all(axis=(1, 2, 3))
@@ -211,10 +173,10 @@ def contracted(matrix: Matrix) -> Looked:
     if known.any():
         found = _contracted(basis[known], value[known], off[known], slopes[known])
         proved[known], inside[known], reach[known] = found.proved, found.inside, found.reach
-    return Looked(proved, inside, reach)
+    return Contraction(proved, inside, reach)
 
 
-def _contracted(basis: Floats, value: Floats, off: Floats, slopes: Floats) -> Looked:
+def _contracted(basis: Floats, value: Floats, off: Floats, slopes: Floats) -> Contraction:
     """Say whether ‖R M R⁻¹‖ < 1 all over each cell, and by how much each parameter moves it.
 
     Notes
@@ -239,7 +201,7 @@ def _contracted(basis: Floats, value: Floats, off: Floats, slopes: Floats) -> Lo
     for signs in itertools.product((1.0, -1.0), repeat=count):
         corner = moved + np.tensordot(turned, np.array(signs), (1, 0))
         proved[proved] = _norm_below(corner[proved], limit[proved])
-    return Looked(proved, inside, norms(turned))
+    return Contraction(proved, inside, norms(turned))
 
 
 def _norm_below(matrix: Floats, limit: Floats) -> Truths:
@@ -303,11 +265,16 @@ def matrices_over(asked: OpenSystem, cells: Sequence[Cell]) -> Matrix:
 
     Parameters
     ----------
-    asked, cells
-        As for `look`; what the circle's radius is by, the matrices are smaller by.
+    asked
+        The system; as its circle's radius is to 1, so are the matrices to these.
+    cells
+        Of all its parameters, k of them; points, where low and high are the same.
     """
-    closed, _ = closed_over(asked.loop, cells)
-    count = closed.shape[1] - 2
+    maps = frames_over(asked.frames, cells)
+    count = maps[0].p.shape[-3] - 2
+    heard = [Feedback(within(one.now, count), within(one.before, count)) for one in asked.feedback]
+    closed = close(maps, heard, asked.system.layout, numbers=taylor(count)).matrix
+    closed = np.broadcast_to(closed, (len(cells), *closed.shape[-3:]))
     at = replace(asked.relative, weights=within(asked.relative.weights, count))
     found = relative(closed, at, taylor(count))
     if asked.inside == 1:
@@ -317,32 +284,15 @@ def matrices_over(asked: OpenSystem, cells: Sequence[Cell]) -> Matrix:
     return larger
 
 
-def closed_over(asked: OpenLoop, cells: Sequence[Cell]) -> tuple[Matrix, Matrix]:
-    """Return the matrices over cells (k, 2 + m, n, n), or of points (k, 2, n, n); and what is wanted beside.
-
-    Parameters
-    ----------
-    asked
-        The system.
-    cells
-        As for `look`.
-    """
-    maps, beside = frames_over(asked.frames, cells)
-    count = maps[0].p.shape[-3] - 2
-    heard = [Feedback(within(one.now, count), within(one.before, count)) for one in asked.feedback]
-    closed = close(maps, heard, asked.system.layout, numbers=taylor(count)).matrix
-    return np.broadcast_to(closed, (len(cells), *closed.shape[-3:])), beside
-
-
-def frames_over(asked: OpenFrames, cells: Sequence[Cell]) -> tuple[list[FrameMap], Matrix]:
-    """Return each site's frame over cells (k, 2 + m, …), k being 1 of what stays; and what is wanted beside.
+def frames_over(asked: OpenFrames, cells: Sequence[Cell]) -> list[FrameMap]:
+    """Return each site's frame over cells (k, 2 + m, …), k being 1 of what stays.
 
     Parameters
     ----------
     asked
         The sites.
     cells
-        As for `look`.
+        As for `matrices_over`.
     """
     wide = any(low != high for low, high in cells[0])
     parameters = _parameters(cells, wide=wide)
@@ -370,7 +320,7 @@ def frames_over(asked: OpenFrames, cells: Sequence[Cell]) -> tuple[list[FrameMap
             }
             known[key] = compose(here, schedule, steps, numbers=numbers)
         maps.append(known[key])
-    return maps, over(asked.beside)
+    return maps
 
 
 def _parameters(cells: Sequence[Cell], *, wide: bool) -> list[Matrix]:

@@ -125,7 +125,7 @@ def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question:
     sites = [opened.sites[group.name] for group in told.groups]
     frames = open_frames(sites, [group.schedule for group in told.groups])
     whole = tuple((ranges[place].low, ranges[place].high) for place in own)
-    maps = [one.mapped(lambda block: hull(block)[0]) for one in frames_over(frames, [whole])[0]]
+    maps = [one.mapped(lambda block: hull(block)[0]) for one in frames_over(frames, [whole])]
     lifted_wide = [group.with_lifted(frame) for group, frame in zip(told.groups, maps, strict=True)]
     wide = peer_classes(replace(told, groups=tuple(lifted_wide)))[0][0]
     memories = remembered_of(opened.at, told, wide)
@@ -182,7 +182,7 @@ def _looked(asked: _Question, cells: Sequence[Cell]) -> Iterator[Looked]:
     widths = np.array([float(one.high - one.low) for one in asked.ranges])
     for start in range(0, len(cells), TOGETHER):
         some = cells[start : start + TOGETHER]
-        maps, _ = frames_over(asked.frames, [tuple(cell[place] for place in asked.own) for cell in some])
+        maps = frames_over(asked.frames, [tuple(cell[place] for place in asked.own) for cell in some])
         for place, cell in enumerate(some):
             lifted = [one.mapped(partial(_of_cell, place, len(cell))) for one in maps]
             proved, sound = _proved(asked, cell, lifted)
