@@ -1,26 +1,33 @@
-"""Analyses as text and plain data: the verdict, what stands beside it, what a compiled scene needs.
+"""Analyses as text, plain data, a picture: the verdict, what stands beside it, what a compiled scene needs.
 
-Takes: results of `analysis`, and the `Answer` they make together. Gives: their texts and documents;
-`compile_text`, `timings_text`.
-Guarantees: every number that decides something stands with its error.
-Does not: compute.
+Takes: results of `analysis`, and the `Answer` they make together; a `Locus`.
+Gives: their texts and documents; `compile_text`; `analysis_picture`, the eigenvalues over the unit circle,
+and `locus_picture`, where they go.
+Guarantees: every number that decides something stands with its error. In a picture what decides is in sight,
+and so are the unit circle and every eigenvalue; nothing is written over a mark, what marks mean stands beside
+the circle.
+Does not: compute, or need a display.
 """
 
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
-from math import floor, isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from apc.compiler.words import counted, in_hertz, wrapped
+from apc.optional import need
 from apc.present.forms import (
     LINEARIZED,
     NEAR,
     Lines,
     Plain,
+    axis_label,
     document,
     labelled,
     listed,
@@ -32,6 +39,7 @@ from apc.present.forms import (
     sentences,
     table,
 )
+from apc.present.pictures import COLOURS, legend_below, new_figure
 
 if TYPE_CHECKING:
     from apc.analysis.analysis import Analysis
@@ -45,6 +53,7 @@ if TYPE_CHECKING:
     from apc.compiler.compiled import CompiledSystem
     from apc.eigen.spectrum import Mode
     from apc.frame.names import Range
+    from apc.vary.locus import Locus
 
 MOST_ROWS = 16
 MORE_CELLS = 10  # times as many as left a box open, to try next
@@ -71,6 +80,11 @@ _WORDS = {
     "drifts": "Nothing slows a common motion down. Every other motion dies out.",
     "unstable": "Some motion grows until the devices shake or hit their limits.",
 }
+
+SIZE = (5.6, 4.6)  # inches
+MOST_NAMED = 5  # modes
+MARKS = "os^Dv"
+LETTERS = 75  # of a line of a title
 
 
 def compile_text(system: CompiledSystem, needs: Needs, target: Path) -> Lines:
@@ -156,13 +170,6 @@ def _mode_document(mode: Mode) -> Plain:
     (motion,) = mode.motion
     moved = record(motion, {"participation": dict(motion.participation)})
     return record(mode, {"motion": ..., **moved})
-
-
-def analysis_picture(result: Analysis, ax: Any = None) -> Any:
-    """Draw the eigenvalues of an analysis; return the matplotlib Axes."""
-    from apc.present.eigenvalues import eigenvalues_picture  # an analysis in words needs none of it
-
-    return eigenvalues_picture(result, ax)
 
 
 def answer_text(found: Answer) -> Lines:
@@ -274,7 +281,7 @@ def _cells(mode: Mode) -> tuple[str, ...]:
         mode.shape,
         str(mode.multiplicity),
         in_hertz(mode.frequency_hz) if mode.frequency_hz else "–",
-        "–" if isnan(mode.damping_ratio) else f"{mode.damping_ratio + 0.0:.3g}",
+        "–" if math.isnan(mode.damping_ratio) else f"{mode.damping_ratio + 0.0:.3g}",
         _leading(mode),
     )
 
@@ -424,7 +431,7 @@ def switching_text(found: Switching) -> Lines:
     else:
         said = f"{'cannot be proved' if found.stable is False else 'not decided'}: {found.reason}"
     if reach is not None and math.isfinite(reach):
-        times = f"{floor(reach * 10**DECIMALS) / 10**DECIMALS:.6g}"
+        times = f"{math.floor(reach * 10**DECIMALS) / 10**DECIMALS:.6g}"
         said += f"; the criterion holds for contacts up to {times} times as stiff"
     elif reach is not None:
         said += "; the criterion holds however stiff the contacts"
@@ -490,3 +497,98 @@ def matrix_text(found: NamedMatrix) -> Lines:
     rows, columns = found.rows, found.columns
     ends = f": {rows[0]} … {rows[-1]} by {columns[0]} … {columns[-1]}" if found.values.size else ""
     yield f"{len(rows)} × {len(columns)}{ends}"
+
+
+def analysis_picture(result: Analysis, ax: Any = None) -> Any:
+    """Draw the eigenvalues of a frame over the unit circle; return the matplotlib Axes.
+
+    Parameters
+    ----------
+    result
+        The analysis whose modes are drawn, rigid ones left out.
+    ax
+        The matplotlib Axes to draw into; one of a figure of its own if not given.
+
+    Raises
+    ------
+    ApcError
+        E875 matplotlib is not installed.
+    """
+    ax = _circle(ax)
+    modes = [mode for mode in result.modes if mode.eigenvalue.imag >= 0]  # of a pair one
+    rest = [mode.eigenvalue for mode in modes[MOST_NAMED:]]
+    for place, mode in enumerate(modes[:MOST_NAMED]):
+        times = f" × {mode.multiplicity}" if mode.multiplicity > 1 else ""
+        label = f"{mode.magnitude:.4f}{times}, {in_hertz(mode.frequency_hz)}, {mode.shape}"
+        _mark(ax, mode.eigenvalue, MARKS[place % len(MARKS)], COLOURS[1 + place], label)
+    _mark(ax, rest, ".", "0.4", f"{len(rest)} that die out faster")
+    seconds = result.settling_s
+    settles = "" if seconds is None else f"; settles within 2 % in {seconds:.3g} s"
+    radius = f"spectral radius {result.spectral_radius:.6g} per frame of {1e3 * result.frame_s:g} ms{settles}"
+    _entitle(ax, [f"{result.topology}: {result.verdict}", radius])
+    return ax
+
+
+def locus_picture(found: Locus, ax: Any = None) -> Any:
+    """Draw where eigenvalues go as a parameter grows; return the matplotlib Axes.
+
+    Parameters
+    ----------
+    found
+        The eigenvalues by value.
+    ax
+        The matplotlib Axes to draw into; one of a figure of its own if not given.
+
+    Raises
+    ------
+    ApcError
+        E875 matplotlib is not installed.
+    """
+    ax = _circle(ax)
+    of = found.critical
+    points = np.concatenate(found.eigenvalues)  # conjugates are among them
+    colours = np.repeat(found.values, [len(one) for one in found.eigenvalues])
+    drawn = ax.scatter(points.real, points.imag, c=colours, s=5, linewidths=0, cmap="viridis", zorder=3)
+    ax.figure.colorbar(drawn, ax=ax, label=axis_label(of.parameter, of.unit))
+    _mark(ax, found.now, "x", COLOURS[2], f"now, {quantity(of.present, of.unit)}")
+    for place, one in enumerate(of.crossings[:MOST_NAMED]):
+        if not found.values.size or not found.values[0] <= one.value <= found.values[-1]:
+            continue
+        nearest = found.eigenvalues[int(np.abs(found.values - one.value).argmin())]
+        at = nearest[np.abs(np.abs(nearest) - 1).argmin()]
+        told = "" if np.isnan(one.frequency_hz) else f", {in_hertz(one.frequency_hz)}"
+        label = f"changes at {quantity(one.value, of.unit)}{told}"
+        _mark(ax, at / abs(at), MARKS[place], "none", label)
+    _entitle(ax, [f"{of.topology}: eigenvalues of a frame of {1e3 * found.frame_s:g} ms, packets on time"])
+    return ax
+
+
+def _circle(ax: Any) -> Any:
+    """Return an Axes with the unit circle in it, to scale."""
+    patches = need("matplotlib.patches", "plot")
+    if ax is None:
+        ax = new_figure(SIZE).subplots()
+    ax.add_patch(patches.Circle((0, 0), 1, facecolor="none", edgecolor="0.4", linewidth=0.9))
+    for line in (ax.axhline, ax.axvline):
+        line(0, color="0.8", linewidth=0.6, zorder=0)
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.update_datalim([(-1.05, -1.05), (1.05, 1.05)])
+    ax.set_xlabel("real part")
+    ax.set_ylabel("imaginary part")
+    return ax
+
+
+def _mark(ax: Any, values: Any, mark: str, colour: str, label: str) -> None:
+    """Draw eigenvalues (k,) and their conjugates."""
+    points = np.append(values, np.conj(values))
+    if not points.size:
+        return
+    look = {"markerfacecolor": colour, "markeredgecolor": "0.1" if colour == "none" else colour}
+    size = {".": 4, "x": 7}.get(mark, 9 if colour == "none" else 6)
+    ax.plot(points.real, points.imag, mark, markersize=size, label=label, zorder=4, **look)
+
+
+def _entitle(ax: Any, lines: Sequence[str]) -> None:
+    ax.autoscale_view()
+    ax.set_title("\n".join(one for line in lines for one in textwrap.wrap(line, LETTERS)), fontsize=9)
+    legend_below(ax)

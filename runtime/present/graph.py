@@ -33,6 +33,7 @@ BELOW, BESIDE = 140.0, 170.0  # height and width of the pictures of who hears wh
 MOST_PEERS = 16  # in a picture of who hears whom
 MOST_TICKS = 120  # of one clock along the frame
 FILLS = {"mass": "#e8eff8", "hand": "#fdf3e0", "link": "#f2f2f2"}
+GRAPHS = {"complete": "complete_graph", "ring": "cycle_graph", "star": "star_graph"}  # of networkx
 INK, FAINT = "#1f2933", "#6b7785"
 
 _Places = dict[str, tuple[float, float, float, float]]  # left, top, width and height of each box
@@ -151,12 +152,8 @@ def _draw_peers(ax: Any, scene: Scene, link: SceneLink, colours: dict[str, str])
     fills = [colours[f"group {name}"] for name in owners[:MOST_PEERS]]
     number = len(fills)
     star = link.graph.shape == "star"
-    if link.graph.shape == "complete":
-        graph = networkx.complete_graph(number)
-    elif link.graph.shape == "ring":
-        graph = networkx.cycle_graph(number)
-    elif star:
-        graph = networkx.star_graph(number - 1)
+    if link.graph.shape in GRAPHS:
+        graph = getattr(networkx, GRAPHS[link.graph.shape])(number - star)  # of a star, those around one
     else:
         graph = networkx.DiGraph(pair for pair in link.graph.arcs.tolist() if max(pair) < number)
         graph.add_nodes_from(range(number))

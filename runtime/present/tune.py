@@ -59,16 +59,15 @@ def tuning_text(found: Tuning) -> Lines:
     ]
     yield from table(rows)
     yield ""
-    if found.met:
-        value = measured(found.best, found.error, found.unit)
-        if _is_felt(found):  # found without knowing how far any better one may be
-            value = quantity(found.best, found.unit, BUYS + 1)
-        yield from labelled(("before rounding", f"{value}, the best of {found.looked:,} points"))
-    if found.bounded:
-        better = f"no gains in these ranges do better by {100 * float(SHARE):.3g} %"
-        yield from labelled(("no others", f"{better}, proved in {found.bounded:,} cells"))
-    if found.met:
-        yield from labelled(("margin", _margin(found)))
+    value = measured(found.best, found.error, found.unit)
+    if _is_felt(found):  # found without knowing how far any better one may be
+        value = quantity(found.best, found.unit, BUYS + 1)
+    better = f"no gains in these ranges do better by {100 * float(SHARE):.3g} %"
+    yield from labelled(
+        ("before rounding", f"{value}, the best of {found.looked:,} points" if found.met else ""),
+        ("no others", f"{better}, proved in {found.bounded:,} cells" if found.bounded else ""),
+        ("margin", _margin(found) if found.met else ""),
+    )
     yield from _proof_lines(found)
     if found.binding:
         yield "\n  what binds" if found.met else "\n  what is in the way"

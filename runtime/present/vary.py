@@ -154,7 +154,7 @@ def _count_lines(found: Critical) -> Lines:
 
 def critical_picture(found: Critical, ax: Any) -> Any:
     """Draw where the eigenvalues go; return the matplotlib Axes."""
-    from apc.present.eigenvalues import locus_picture
+    from apc.present.analysis import locus_picture
     from apc.vary.locus import root_locus
 
     return locus_picture(root_locus(found.system, found), ax)

@@ -15,7 +15,7 @@ import pytest
 
 import apc
 from apc.present import animation
-from apc.present.eigenvalues import eigenvalues_picture
+from apc.present.analysis import analysis_picture
 from apc.present.pictures import colours_of, write_figure
 from apc.present.region_picture import panels_picture
 from apc.regions.panels import compare_regions
@@ -52,7 +52,7 @@ def test_as_many_colours_as_are_asked_for(count: int) -> None:
 
 def test_the_eigenvalues_drawn_are_those_of_the_analysis_within_the_circle() -> None:
     found = apc.analyze(compiled(AVERAGE))
-    ax = eigenvalues_picture(found)
+    ax = analysis_picture(found)
     drawn = np.concatenate([line.get_xydata() for line in ax.lines if line.get_marker() != "None"])
     wanted = [mode.eigenvalue for mode in found.modes]
     assert len(drawn) >= len(wanted)
@@ -64,7 +64,7 @@ def test_the_eigenvalues_drawn_are_those_of_the_analysis_within_the_circle() -> 
 
 
 def test_text_in_an_svg_is_text(tmp_path: Path) -> None:
-    write_figure(eigenvalues_picture(apc.analyze(compiled(AVERAGE))).figure, tmp_path / "e.svg")
+    write_figure(analysis_picture(apc.analyze(compiled(AVERAGE))).figure, tmp_path / "e.svg")
     text = (tmp_path / "e.svg").read_text(encoding="utf-8")
     assert re.search(r"<text[^>]*>real part</text>", text)
 
