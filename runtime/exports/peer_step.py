@@ -450,6 +450,7 @@ def _instants(schedule: Schedule) -> tuple[tuple[Instant, ...], tuple[int, ...]]
     found = []
     for _, group in groupby(timed_events(schedule), itemgetter(0)):  # each ends with a length of time
         *listed, move = (event for _, event in group)
+        assert isinstance(move, frames.Propagate), "an instant is over when time goes on"
         ticks = tuple(one.partition for one in listed if isinstance(one, frames.Tick))
         ticked.update(ticks)
         acts = [(one.hold, one.value) for one in listed if isinstance(one, frames.Act)]
