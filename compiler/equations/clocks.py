@@ -256,9 +256,9 @@ class _Clocks:
             return
         if equation.origin == CONNECTION:  # of what a part's equation takes as it is
             sides = {format_expression(side) for side in (equation.left, equation.right)}
-            taking = (own for own in self.given.values() if sides & set(map(format_expression, _leaves(own))))
+            taking = [one for one in self.given.values() if sides & set(map(format_expression, _leaves(one)))]
         else:
-            taking = iter([equation] if clock == CONTINUOUS else [])
+            taking = [equation] if clock == CONTINUOUS else []
         for own in taking if CONTINUOUS in (clock, others) else ():
             if hint := _sampled(own):
                 what = f"`{own.text}` of {own.origin} is on clock {own.clock}, and samples what moves"
