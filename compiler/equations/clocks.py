@@ -22,6 +22,7 @@ first packet arrives a receiver holds the sender's start values; before the firs
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from scipy.cluster.hierarchy import DisjointSet
@@ -39,7 +40,7 @@ from apc.compiler.equations.flatten import (
     flatten_alone,
 )
 from apc.compiler.errors import Mistakes, Place
-from apc.compiler.language.expression import Call, Expr, Name, format_expression, names, walk
+from apc.compiler.language.expression import Call, Expr, Name, format_expression, names, transform, walk
 from apc.compiler.scene.scene import Scene
 
 CONTINUOUS = "continuous"
@@ -111,7 +112,11 @@ def _partitioned(kind: FlatKind, mistakes: Mistakes) -> ClockedKind:
         if hold.clock == CONTINUOUS:
             call = format_expression(Call("hold", (Name((hold.shown,)), hold.delay)))
             what = f"{call} holds {hold.shown}, which is continuous already"
-            mistakes.add("E505", hold.place, what, hint=hold.shown)
+            if (given := clocks.given.get(hold.shown)) and (hint := _sampled(given)):
+                what = f"{call} acts from a tick on, so that {hold.shown} samples what moves"
+                mistakes.add("E505", given.place, what, hint=hint)
+            else:
+                mistakes.add("E505", hold.place, what, hint=hold.shown)
     for one in previous:
         if one.clock == CONTINUOUS:
             mistakes.add("E505", one.place, one.symbol, expected="a variable that belongs to a clock")
@@ -129,6 +134,33 @@ def _partitioned(kind: FlatKind, mistakes: Mistakes) -> ClockedKind:
         members.setdefault(clocks.of(variable), ([], []))[0].append(variable)
     partitions = tuple(Partition(clock, tuple(its), tuple(of)) for clock, (its, of) in members.items())
     return ClockedKind(kind, partitions, samples, holds, previous, receives)
+
+
+# Operators beneath which nothing is sampled once more.
+CROSSING = ("sample", "hold", "previous", "mean", "sum", "max", "min")
+
+
+def _leaves(equation: FlatEquation) -> Iterator[Name]:
+    """Yield the names in an equation."""
+    for side in (equation.left, equation.right):
+        yield from names(side)
+
+
+def _sampled(equation: FlatEquation) -> str:
+    """Return a part's equation with all that is continuous at its connectors sampled, "" where nothing is."""
+    written = equation.written
+    if written is None or equation.clock is None:
+        return ""
+
+    def sample(node: Expr) -> Expr | None:
+        if isinstance(node, Call) and node.function in CROSSING:
+            return node
+        of = node.arguments[0] if isinstance(node, Call) and node.function == "der" else node
+        return Call("sample", (node,)) if isinstance(of, Name) and len(of.parts) > 1 else None
+
+    right = transform(written.right, sample)
+    same = right is written.right
+    return "" if same else f"{format_expression(written.left)} = {format_expression(right)}"
 
 
 class _Clocks:
@@ -222,6 +254,16 @@ class _Clocks:
         if equation.origin == CONNECTION and others == CONTINUOUS and name in self.given:
             self.report_flow(name, self.given[name])
             return
+        if equation.origin == CONNECTION:  # of what a part's equation takes as it is
+            sides = {format_expression(side) for side in (equation.left, equation.right)}
+            taking = [one for one in self.given.values() if sides & set(map(format_expression, _leaves(one)))]
+        else:
+            taking = [equation] if clock == CONTINUOUS else []
+        for own in taking if CONTINUOUS in (clock, others) else ():
+            if hint := _sampled(own):
+                what = f"`{own.text}` of {own.origin} is on clock {own.clock}, and samples what moves"
+                self.mistakes.add("E505", own.place, what, hint=hint)
+                return
         hint = f"one clock for both, or sample(hold({name}))"
         if CONTINUOUS in (clock, others):
             hint = f"sample({name})" if clock == CONTINUOUS else f"hold({name})"

@@ -114,7 +114,7 @@ def closed_frame(
     *,
     weights: Weights | None = None,
     state: Balls | None = None,
-    watch: Callable[[int, int, Balls, object], None] | None = None,
+    watch: Callable[[int, int, Balls, Any], None] | None = None,
 ) -> Balls:
     """Follow all sites of a closed system through one frame, over its state.
 

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from apc.vary.margins import Margins
     from apc.vary.sensitivity import Sensitivities
 
+ROUGH = 1e-2  # of a value: its error is then said to be no slip
 SHOWN = 6  # rows of the table of what moves the radius most; digits of a value in a sentence
 DIGITS = 3  # of a change
 
@@ -80,6 +81,8 @@ def critical_text(found: Critical) -> Lines:
         kind = "jump, " if one.kind == "jump" else ""
         turns = "" if math.isnan(one.frequency_hz) else f", {in_hertz(one.frequency_hz)}"
         yield f"    {kind}stable {one.stable_side} it{turns}, {one.proof}"
+        if one.error > ROUGH * abs(one.value):
+            yield "    no narrower: within its error the bounds on growth leave the verdict open"
     if found.crossings:
         yield ""
     yield f"  scanned {_span(found.scanned, unit)}"

@@ -92,7 +92,7 @@ LOOP = f"{LINE}E503 .* a loop that many values solve, or none"
     ("equations", "x", "expected"),
     [
         (["a.f = F*((z - a.x)/L)^-1", "b.f = -a.f", "z = a.x"], "0 m", LINE + "E512 `own.a.f = .*` .own. holds a constant that is no number"),
-        (["a.f = F*(a.x/L)^(1/3)", "b.f = -a.f", "z = a.x"], "-1 mm", r"E808 der\(m.v\) is nan at the start values"),
+        (["a.f = F*(a.x/L)^(1/3)", "b.f = -a.f", "z = a.x"], "-1 mm", LINE + r"E808 der\(m.v\) is nan at the start"),
         (["a.f = F*log(a.x/L)", "b.f = -a.f", "z = a.x"], "-1 mm", r"E808 der\(m.v\) is nan at the start values"),
         (["a.f = F*sqrt(a.x/L)", "b.f = -a.f", "z = a.x"], "0 m", r"E808 the slope of der\(m.v\) is -?inf at the start values"),
         (["a.x = b.x + z", "b.f = -a.f", "z = if a.x <= 0 then z else z"], "0 m", LINE + "E502 `own.z = if own.a.x <= 0 then own.z else own.z` .own. holds no unknown"),

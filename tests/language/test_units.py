@@ -24,37 +24,19 @@ def read(*texts: str) -> list[Parameter]:
     return _named(texts)
 
 
-VALUES = {
-    "500 N/m": 500,
-    "500N/m": 500,
-    "-4 N": -4,
-    "+.5 m": Fraction(1, 2),
-    "1 ms": Fraction(1, 1000),
-    "1e-3 s": Fraction(1, 1000),
-    "1/90 s": Fraction(1, 90),
-    "-7/3 N": Fraction(-7, 3),
-    "0.1 kg": Fraction(1, 10),
-    "30 mm": Fraction(3, 100),
-    "3 kN/mm": 3_000_000,
-    "1 lb": Fraction(45359237, 10**8),
-    "1 inch": Fraction(254, 10**4),
-    "5 %": Fraction(1, 20),
-    "200 Hz": 200,
-    "5 µs": Fraction(5, 10**6),
-    "0.5": Fraction(1, 2),
-    "5 1/s": 5,
-    "-3 1/min": Fraction(-1, 20),
-    "1/90 1/s": Fraction(1, 90),
-    "2e3 1/m^2": 2000,
-    "2 1/(N*s)": 2,
-    "4 1·1/ms": 4000,
-    "3 (N*s)/m": 3,
-    "3(kN)": 3000,
-    "2 m²": 2,
-    "2 cm**2": Fraction(2, 10**4),
-    "2 m*s^-2": 2,
-    "7 km^(1/1)": 7000,
-}
+def table(text: str) -> dict[str, Fraction]:
+    """Return what stands before each arrow, and the number behind it."""
+    pairs = (one.split(" → ") for one in text.split(";"))
+    return {left.strip(): Fraction(right.strip()) for left, right in pairs}
+
+
+VALUES = table("""
+500 N/m → 500; 500N/m → 500; -4 N → -4; +.5 m → 1/2; 1 ms → 1/1000; 1e-3 s → 1/1000; 1/90 s → 1/90;
+-7/3 N → -7/3; 0.1 kg → 1/10; 30 mm → 3/100; 3 kN/mm → 3000000; 1 lb → 45359237/100000000;
+1 inch → 127/5000; 5 % → 1/20; 200 Hz → 200; 5 µs → 1/200000; 0.5 → 1/2; 5 1/s → 5; -3 1/min → -1/20;
+1/90 1/s → 1/90; 2e3 1/m^2 → 2000; 2 1/(N*s) → 2; 4 1·1/ms → 4000; 3 (N*s)/m → 3; 3(kN) → 3000; 2 m² → 2;
+2 cm**2 → 1/5000; 2 m*s^-2 → 2; 7 km^(1/1) → 7000
+""")
 
 
 def test_values_are_exact_rationals_in_si() -> None:
@@ -63,17 +45,13 @@ def test_values_are_exact_rationals_in_si() -> None:
 
 # What is written, and the unit in which it is shown.
 SHOWN = {
-    **{
-        unit: unit for unit in ("N", "N/m", "N*s/m", "kg", "m", "m/s", "m/s^2", "s", "1/s", "N*m", "W", "N*s")
-    },
-    **{unit: unit for unit in ("N*s", "kg*m^2", "1/(A*K)", "kg^(1/2)", "rad/s^2", "rad/s", "Hz")},
+    **{unit: unit for unit in ("N", "N/m", "N*s/m", "kg", "m", "m/s", "m/s^2", "s", "1/s", "N*m", "W")},
+    **{unit: unit for unit in ("N*s", "kg*m^2", "1/(A*K)", "kg^(1/2)", "rad/s^2", "rad/s", "Hz", "N*m/rad")},
     "kHz": "Hz",
     "rpm": "rad/s",
     "deg": "rad",
-    "N*m/rad": "N*m/rad",
     "%": "1",
-    "N/(m/s)": "N*s/m",
-    "N·s/m": "N*s/m",
+    **dict.fromkeys(("N/(m/s)", "N·s/m"), "N*s/m"),
     "kg*m/N": "s^2",
     "J": "N*m",
     "m^-1*kg^2": "kg^2/m",
@@ -102,9 +80,7 @@ def test_a_unit_is_what_pint_says_it_is() -> None:
 
 
 def test_an_angle_in_degrees_is_right_to_more_than_a_float() -> None:
-    half = Fraction(
-        "1.5707963267948966192313216916397514420985846996875529104874722961539082"
-    )  # OEIS A019669
+    half = Fraction("1.5707963267948966192313216916397514420985846996875529104874")  # OEIS A019669
     [angle] = read("90 deg")
     assert angle.exact is not None
     assert abs(angle.exact - half) < Fraction(1, 10**38)

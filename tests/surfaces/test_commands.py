@@ -85,23 +85,6 @@ def test_json_is_one_document_and_nothing_else(scene: Cli) -> None:
     assert (unstable.code, json.loads(unstable.out)["stable"]) == (0, False), "which is an answer"
 
 
-@pytest.mark.whole
-def test_a_model_works_without_its_topology_and_a_stale_one_is_refused(scene: Cli) -> None:
-    scene("compile")
-    again = "scene.apc: E614 is compiled already. Write: apc analyze scene.apc\n"
-    assert scene("compile scene.apc") == Ran(1, "", again)
-    fresh = scene("analyze --json")
-    write("scene.yaml", AVERAGE.replace("500 N/m,", "5000 N/m,"))
-    stale = (
-        "scene.apc: E605 is stale: scene.yaml has changed since it was compiled. "
-        "Write: apc compile scene.yaml\n"
-    )
-    assert scene("analyze scene.apc") == Ran(1, "", stale)
-    assert json.loads(scene("analyze scene.yaml --json").out)["stable"] is False, "the text decides"
-    Path("scene.yaml").unlink()
-    assert scene("analyze --json") == fresh
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -211,6 +194,17 @@ def test_what_is_not_printed_is_written_out_as_json_has_it() -> None:
     text = str(ApcError(Mistake("E101", Place(f"{ESCAPES}.yaml", 3, 1), "this", "that", ESCAPES, ESCAPES)))
     assert text.isprintable()
     assert text.count(r"\u001b") == 3
+
+
+def test_a_message_fits_the_terminal_and_is_one_line_elsewhere(
+    cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write("scene.yaml", replaced(AVERAGE, ("haptic: 1 ms", "haptic: 1.0001 ms")))
+    piped = cli("check").err
+    monkeypatch.setattr("apc.__main__.sys.stderr.isatty", lambda: True)
+    shown = cli("check").err
+    assert max(map(len, shown.splitlines())) <= 80 < max(map(len, piped.splitlines()))
+    assert shown.startswith("scene.yaml:4:11: E805") and shown.split() == piped.split()
 
 
 @pytest.mark.few(2)

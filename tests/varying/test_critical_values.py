@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -190,6 +191,7 @@ def test_the_error_holds_against_the_full_map_in_50_digits() -> None:
     found = apc.critical(compiled(AVERAGE), STIFFNESS)
     assert found.value is not None and found.error is not None and found.error < 1e-12 * found.value
     assert found.crossings[0].proof.startswith("proved") and found.whole
+    assert "no narrower" in str(replace(found, crossings=(replace(found.crossings[0], error=200.0),)))
     mode = np.exp(2j * np.pi * found.crossings[0].frequency_hz * 0.008)
     sizes = []
     with precision(200):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import apc
+from apc.present.tune import panels_of
 from apc.tuning.demands import read_against, read_demands
 from apc.tuning.front import front
 from tests.commands import Cli, write
@@ -135,6 +136,8 @@ def test_where_nothing_moves_nothing_limits_gains() -> None:
     assert found.proved and found.value == RANGE[K][1] and not found.binding
     assert apc.critical(scene, "wan.delay").value is None
     assert found.plot().get_xlabel().startswith(K)  # of the scene as it is
+    with pytest.raises(apc.ApcError, match="E996 nothing moves"):
+        panels_of(scene, 1)
 
 
 def test_motions_die_out_no_faster_with_any_gains_of_a_grid() -> None:
