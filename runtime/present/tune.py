@@ -145,8 +145,9 @@ def _where(one: Binding) -> str:
 
 
 def _binding_lines(found: Tuning, one: Binding) -> Lines:
-    mode = f"{one.shape} mode at {in_hertz(one.frequency_hz)}" if one.shape else ""
     other = "what is felt" if found.felt else found.aim if _is_felt(found) else "stability"
+    mode = f"{one.shape} mode" if one.shape else "" if math.isnan(one.frequency_hz) else other
+    mode += f" at {in_hertz(one.frequency_hz)}" if mode else ""
     yield from wrapped(": ".join(filter(None, [_where(one), mode])) or other, "    ", "      ")
     for label, value, unit, better in one.buys if found.met and found.aim not in (RADIUS, SETTLING) else ():
         buys = quantity(better, found.unit, BUYS)

@@ -82,13 +82,15 @@ class Rows:
 
     A slope is that over the whole range of a column, or of a number of the box.
     `block` (n,) numbers the scenario and system that each is of, `eigenvalue` (n,) tells those of one block
-    apart, NaN of what has none, and `scenario` (n,) is the place of its scenario.
+    apart, NaN of what has none; `frequency_hz` (n,) is where a gain is largest, NaN of all else; `scenario`
+    (n,) is the place of its scenario.
     """
 
     values: Floats
     slopes: Floats
     block: NDArray[np.intp]
     eigenvalue: Complexes
+    frequency_hz: Floats
     scenario: NDArray[np.intp]
 
 
@@ -309,7 +311,10 @@ class Limits:
         ranges = [*self.demands.columns, *self.demands.box]
         along = np.diag([float(one.high - one.low) for one in ranges])
         along = along if wide else along[: len(chosen)]
-        parts: list[tuple[Floats, Floats, Complexes, int]] = []
+        parts: list[tuple[Floats, Floats, Complexes, float, int]] = []
+        aim = [one for _, one in self.demands.aim.terms if isinstance(one, Felt)]
+        peaks = [one.name == HINF for one in self.demands.felt]
+        peaks += [any(one.name == HINF for one in aim)] * bool(self.demands.aim.terms)
         for place, one in enumerate(scenarios):
             point = np.append(chosen, one.point)
             family = self.family(one.setting)
@@ -319,22 +324,24 @@ class Limits:
                 distinct, which = np.unique(self._numbers(moved), axis=0, return_inverse=True)
                 roots = np.array([family.parts(one) for one in distinct.tolist()])[which.reshape(-1)]
                 grown = np.nan_to_num(np.log(np.maximum(roots, TINY)), nan=BEYOND) - self.allowed
-                parts.append((*_differences(grown, inwards), place))
+                parts.append((*_differences(grown, inwards), math.nan, place))
             else:
                 at = np.tile(self._numbers(point), (len(along), 1))
                 for pair in family.slopes(at, self._numbers(along)):
                     values, slopes, found = _largest(*pair)
-                    parts.append((values - self.allowed, slopes, found, place))
-            for view in self.views:
-                asked = self.asked(one.setting, moved, view=view)
-                if asked.shape[1]:
-                    parts.append((*_differences(asked, inwards), place))
+                    parts.append((values - self.allowed, slopes, found, math.nan, place))
+            still = self.asked(one.setting, moved)[:, np.logical_not(peaks)]
+            parts.append((*_differences(still, inwards), math.nan, place))
+            for frequency, view in zip(self.frequencies, self.views if any(peaks) else (), strict=False):
+                asked = self.asked(one.setting, moved, view=view)[:, peaks]
+                parts.append((*_differences(asked, inwards), frequency, place))
         counts = [len(values) for values, *_ in parts]
         return Rows(
             np.concatenate([values for values, *_ in parts]),
             np.concatenate([slopes for _, slopes, *_ in parts]),
             np.repeat(np.arange(len(parts)), counts),
-            np.concatenate([found for *_, found, _ in parts]),
+            np.concatenate([found for *_, found, _, _ in parts]),
+            np.repeat([frequency for *_, frequency, _ in parts], counts),
             np.repeat([place for *_, place in parts], counts),
         )
 

@@ -39,7 +39,7 @@ from apc.network.nominal import left_out
 from apc.result import Result
 from apc.threads import single_threaded
 from apc.tuning.bound import none_better
-from apc.tuning.demands import PLACE, Demands, Felt
+from apc.tuning.demands import HINF, PLACE, Demands, Felt
 from apc.tuning.limits import BEYOND, RESPONSES, Limits, Scenario, felt_in
 from apc.tuning.optimum import BINDS, Optimum, Search
 from apc.vary.crossing import Told
@@ -263,7 +263,8 @@ class _Work:
         decays = self.limits.by_growth and (self.demands.decay < 1 or self.demands.aim.column is None)
         boxed = self.demands.criterion == PASSIVE and self.demands.box
         felt = self.demands.measured and (self.demands.box or self.demands.delay)
-        return decays or bool(boxed or felt)
+        gains = any(one.name == HINF for one in self.demands.measured)  # right to an error, not bounded by it
+        return decays or gains or bool(boxed or felt)
 
     @property
     def late(self) -> bool:
@@ -636,6 +637,8 @@ class _Work:
                 for own, value in zip(self.demands.box, scenario.point, strict=True)
             ]
             shape, frequency = self._mode(found, scenario, complex(rows.eigenvalue[place]))
+            if not math.isnan(rows.frequency_hz[place]):
+                frequency = float(rows.frequency_hz[place])
             listed.append(Binding(tuple(where), shape, frequency, tuple(buys)))
         return listed
 
