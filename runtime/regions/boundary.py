@@ -146,8 +146,13 @@ class _Knots:
         return np.asarray(~(np.abs(self.pairs.growth) <= JUMP))
 
     def tangents(self, knots: Integers) -> Floats:
-        """Return the unit tangents (k, 2) at some knots."""
-        return _tangents(self.pairs.gradient[knots])
+        """Return the unit tangents (k, 2) at some knots, with falling log|λ| on their left."""
+        gradient = self.pairs.gradient[knots]
+        turned = np.stack([-gradient[:, 1], gradient[:, 0]], axis=1)
+        unit: Floats = turned / np.maximum(
+            np.linalg.norm(turned, axis=1, keepdims=True), np.finfo(np.float64).tiny
+        )
+        return unit
 
 
 def trace(deciding: Eigenvalues, found: Survey, *, tolerance: float, offset: Floats) -> tuple[Arc, ...]:
@@ -198,14 +203,6 @@ def _apart(knots: _Knots, intervals: Integers) -> Integers:
     knots.last[meeting[~_on_one_branch(knots, meeting), 0]] = True
     left: Integers = intervals[apart]
     return left
-
-
-def _tangents(gradient: Floats) -> Floats:
-    """Return unit tangents (k, 2) with the side towards which log|λ| falls on their left."""
-    turned = np.stack([-gradient[:, 1], gradient[:, 0]], axis=1)
-    length = np.linalg.norm(turned, axis=1, keepdims=True)
-    unit: Floats = turned / np.maximum(length, np.finfo(np.float64).tiny)
-    return unit
 
 
 def _halve(
@@ -504,7 +501,21 @@ def _halved(growth: Callable[[Floats], Floats], points: Floats, errors: Floats) 
 def straight_arc(
     points: Floats, errors: Floats, knot: Floats, value: complex, chain: int = 0, rounding: float = 0.0
 ) -> Arc:
-    """Return an arc of straight lines through points (k, 2); at its knot (2,) `value` is the eigenvalue."""
+    """Return an arc of straight lines.
+
+    Parameters
+    ----------
+    points
+        The lines' ends (k, 2) in the unit square, the stable side on the left of their order.
+    errors
+        Bounds on each line's distance from the boundary (k − 1,).
+    knot, value
+        A point (2,) on the boundary or beyond it, and the eigenvalue that decides there.
+    chain
+        Which chain of the survey the arc is on.
+    rounding
+        How far the points themselves may be off.
+    """
     return Arc(
         points=points,
         handles=straight_handles(points),

@@ -78,10 +78,9 @@ def largest(matrices: Sequence[Floats]) -> complex:
     return complex(values[np.argmax(np.abs(values))])
 
 
-def by_system(system: Integers) -> list[tuple[int, Integers | slice]]:
-    """Return each system with its points, all of them as a slice."""
-    used = sorted(set(system.tolist()))
-    return [(s, np.flatnonzero(system == s) if len(used) > 1 else slice(None)) for s in used]
+def by_system(system: Integers) -> list[tuple[int, Integers]]:
+    """Return each system with its points."""
+    return [(s, np.flatnonzero(system == s)) for s in sorted(set(system.tolist()))]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -371,7 +372,7 @@ def _chained(listed: list[Arc]) -> list[Arc]:
 def _after(one: Arc, other: Arc) -> Arc:
     """Return two arcs as one."""
     points = np.concatenate([one.points, other.points[1:]])
-    rest = {
+    rest: dict[str, Any] = {
         name: np.concatenate([getattr(one, name), getattr(other, name)])
         for name in ("handles", "errors", "knots", "values")
     }
@@ -381,7 +382,7 @@ def _after(one: Arc, other: Arc) -> Arc:
 def _swapped(arc: Arc) -> Arc:
     """Return an arc with its coordinates in the other order, and so backwards: the stable side stays left."""
     names = ("points", "handles", "errors", "knots", "values")
-    backwards = {name: getattr(arc, name)[::-1] for name in names}
+    backwards: dict[str, Any] = {name: getattr(arc, name)[::-1] for name in names}
     for name in ("points", "handles", "knots"):
         backwards[name] = backwards[name][..., ::-1]
     backwards["handles"] = backwards["handles"][:, ::-1]

@@ -255,27 +255,23 @@ def _linked(
     follows: dict[Edge, Edge] = {}
     for corner, size in sorted(leaves.items()):
         changes = every[corner]
-        leaving = [edge for edge, out in changes if out]
-        back = [edge for edge, out in changes if not out]
-        if len(changes) > 2 and _centre_is_stable(lattice, corner, size):
-            # Two pieces in a finest cell: each cuts off an unstable corner, its crossings side by side.
-            follows |= zip(leaving, back if changes[0][1] else [*back[1:], back[0]], strict=True)
-        else:
-            follows |= zip(
-                leaving, [back[-1], *back[:-1]] if changes and changes[0][1] else back, strict=True
-            )
+        # Two pieces in a finest cell with a stable middle: each cuts off an unstable corner, its crossings
+        # side by side, and so goes on at the next of the rim. Otherwise it goes to the one before.
+        step = 1 if len(changes) > 2 and _centre_is_stable(lattice, corner, size) else -1
+        for place, (edge, out) in enumerate(changes):
+            if out:
+                follows[edge] = changes[(place + step) % len(changes)][0]
     number = {edge: place for place, edge in enumerate(dict.fromkeys([*follows, *follows.values()]))}
     entered = set(follows.values())
     starts = [edge for edge in follows if edge not in entered]
     chains, closed = [], []
-    left = dict(follows)
     for start in [*starts, *follows]:
-        if start not in left:
+        if start not in follows:
             continue
         chain = [start]
-        while chain[-1] in left:
-            chain.append(left.pop(chain[-1]))
-        loop = len(chain) > 1 and chain[-1] == start
+        while chain[-1] in follows:
+            chain.append(follows.pop(chain[-1]))
+        loop = chain[-1] == start
         chains.append(tuple(number[edge] for edge in (chain[:-1] if loop else chain)))
         closed.append(loop)
     side = lattice.side
