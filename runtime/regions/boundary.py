@@ -1,7 +1,8 @@
 """Boundary curves of a stable region in the unit square, to a stated accuracy.
 
 Takes: a `Eigenvalues` and the `Survey` of its cells.
-Gives: `Arc`, `trace`, `traced`; `trace_steps` for a boundary that has steps; `stable_area`, `relative_to`.
+Gives: `Arc`, `trace`, `traced`; `trace_steps`, `straight_arc` for a boundary that has steps; `stable_area`,
+`relative_to`.
 Guarantees: every point lies on the boundary to rounding; between its points a curve is the cubic Hermite
 interpolant through points and tangents, and that has been measured against the true boundary in the middle
 of every interval. Where one mode takes over from another the curve has a corner, solved for. Steps are known
@@ -33,13 +34,12 @@ from apc.regions.boundary_points import (
     SHORT,
     clear,
     cross,
-    just_inside,
     moved,
     polish,
 )
 from apc.regions.curves import area_beside, handles_of, off_an_arc, straight_handles, tangents
 from apc.regions.deciding import Eigenvalues, Pairs, join
-from apc.regions.survey import Survey, survey
+from apc.regions.survey import Survey, just_inside, survey
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -146,8 +146,13 @@ class _Knots:
         return np.asarray(~(np.abs(self.pairs.growth) <= JUMP))
 
     def tangents(self, knots: Integers) -> Floats:
-        """Return the unit tangents (k, 2) at some knots."""
-        return _tangents(self.pairs.gradient[knots])
+        """Return the unit tangents (k, 2) at some knots, with falling log|λ| on their left."""
+        gradient = self.pairs.gradient[knots]
+        turned = np.stack([-gradient[:, 1], gradient[:, 0]], axis=1)
+        unit: Floats = turned / np.maximum(
+            np.linalg.norm(turned, axis=1, keepdims=True), np.finfo(np.float64).tiny
+        )
+        return unit
 
 
 def trace(deciding: Eigenvalues, found: Survey, *, tolerance: float, offset: Floats) -> tuple[Arc, ...]:
@@ -165,14 +170,9 @@ def trace(deciding: Eigenvalues, found: Survey, *, tolerance: float, offset: Flo
     offset
         What to add to unit coordinates to have them count from zero (2,): lower end over width of the range.
     """
-    if not found.crossings:
+    if not found.chains:
         return ()
-    points, pairs = cross(
-        deciding,
-        np.array([one.stable for one in found.crossings]),
-        np.array([one.unstable for one in found.crossings]),
-        np.array([one.growth for one in found.crossings]),
-    )
+    points, pairs = cross(deciding, found.stable, found.unstable, found.growth)
     members: list[int] = []
     chain: list[int] = []
     key: list[int] = []
@@ -203,14 +203,6 @@ def _apart(knots: _Knots, intervals: Integers) -> Integers:
     knots.last[meeting[~_on_one_branch(knots, meeting), 0]] = True
     left: Integers = intervals[apart]
     return left
-
-
-def _tangents(gradient: Floats) -> Floats:
-    """Return unit tangents (k, 2) with the side towards which log|λ| falls on their left."""
-    turned = np.stack([-gradient[:, 1], gradient[:, 0]], axis=1)
-    length = np.linalg.norm(turned, axis=1, keepdims=True)
-    unit: Floats = turned / np.maximum(length, np.finfo(np.float64).tiny)
-    return unit
 
 
 def _halve(
@@ -352,7 +344,7 @@ def _search(
     out = np.geomspace(1, 2 / np.maximum(_norm(across), COINCIDENT), reach)
     places = np.concatenate([-out[::-1], out])[:, :, None] * across + middle  # (2 · reach, k, 2)
     places = np.asarray(just_inside(places.reshape(-1, 2)))
-    growth = deciding.log_magnitudes(deciding.family.matrices(places), 1)[:, 0].reshape(2 * reach, -1)
+    growth = deciding.growth(places.reshape(-1, 2)).reshape(2 * reach, -1)
     turns = (growth[:-1] < 0) & (growth[1:] >= 0)
     away = np.abs(np.arange(2 * reach - 1) - reach + 1)
     nearest = np.argmin(np.where(turns, away[:, None], reach), axis=0)
@@ -412,7 +404,9 @@ def _arc(deciding: Eigenvalues, knots: _Knots, piece: Integers, chain: int) -> A
     if jumps.any():
         middle = piece[jumps][jumps.sum() // 2]
         value = complex(knots.pairs.value[middle])
-        return _straight(knots.points[piece], knots.error[piece[:-1]], knots.points[middle], value, chain)
+        return straight_arc(
+            knots.points[piece], knots.error[piece[:-1]], knots.points[middle], value, chain, RESOLUTION
+        )
     pairs = knots.pairs.at(piece)
     system = int(pairs.system[0])
     points, along = knots.points[piece], knots.tangents(piece)
@@ -460,11 +454,7 @@ def trace_steps(
         How often the middle of a line is put onto the boundary, where that has no steps; the error is then by
         how far it was off.
     """
-    if not found.crossings:
-        return ()
-    stable = np.array([one.stable for one in found.crossings])
-    unstable = np.array([one.unstable for one in found.crossings])
-    stable, unstable = _closed_in(growth, stable, unstable)
+    stable, unstable = _closed_in(growth, found.stable, found.unstable)
     arcs = []
     for number, (chain, closed) in enumerate(zip(found.chains, found.closed, strict=True)):
         members = [*chain, chain[0]] if closed else list(chain)
@@ -473,7 +463,9 @@ def trace_steps(
         for _ in range(halvings):
             points, errors = _halved(growth, points, errors)
         middle = members[len(members) // 2]  # its unstable side has the motion that grows
-        arcs.append(_straight(points, errors, unstable[middle], leading(unstable[middle]), number))
+        arcs.append(
+            straight_arc(points, errors, unstable[middle], leading(unstable[middle]), number, RESOLUTION)
+        )
     return tuple(arcs)
 
 
@@ -506,8 +498,24 @@ def _halved(growth: Callable[[Floats], Floats], points: Floats, errors: Floats) 
     return np.insert(points, lines + 1, added, axis=0), np.insert(errors, lines, errors[lines])
 
 
-def _straight(points: Floats, errors: Floats, knot: Floats, value: complex, chain: int) -> Arc:
-    """Return an arc of straight lines through points (k, 2), with the eigenvalue beyond one of them."""
+def straight_arc(
+    points: Floats, errors: Floats, knot: Floats, value: complex, chain: int = 0, rounding: float = 0.0
+) -> Arc:
+    """Return an arc of straight lines.
+
+    Parameters
+    ----------
+    points
+        The lines' ends (k, 2) in the unit square, the stable side on the left of their order.
+    errors
+        Bounds on each line's distance from the boundary (k − 1,).
+    knot, value
+        A point (2,) on the boundary or beyond it, and the eigenvalue that decides there.
+    chain
+        Which chain of the survey the arc is on.
+    rounding
+        How far the points themselves may be off.
+    """
     return Arc(
         points=points,
         handles=straight_handles(points),
@@ -515,7 +523,7 @@ def _straight(points: Floats, errors: Floats, knot: Floats, value: complex, chai
         knots=knot[None],
         values=np.array([value], np.complex128),
         system=0,
-        rounding=RESOLUTION,
+        rounding=rounding,
         chain=chain,
         smooth=False,
     )

@@ -1,7 +1,7 @@
 """Newton's method onto the boundary, for many points at once.
 
 Takes: a `Eigenvalues`, and guesses of points and eigenvalues.
-Gives: `cross`, `polish`, `moved`, `clear`, `just_inside`; `SHORT`.
+Gives: `cross`, `polish`, `moved`, `clear`; `SHORT`.
 Guarantees: a point is on the curve log|λ| = 0 of its eigenvalue to rounding, or NaN; one of `cross` is where
 the spectral radius is 1.
 Does not: connect points (see `boundary`).
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.regions.deciding import Eigenvalues, Pairs
-from apc.regions.survey import INSIDE_RIM
+from apc.regions.survey import just_inside
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -63,7 +63,7 @@ def cross(
     low, high = np.zeros(count), np.ones(count)
     along = unstable - stable
     points = unstable.copy()
-    pairs = deciding.leading(just_inside(unstable))
+    pairs = deciding.leading(unstable)
     guess = _quadratic_root(growth, (pairs.gradient * along).sum(axis=1))
     rest = np.arange(count)
     for bracket in range(MOST_BRACKETS):
@@ -77,7 +77,7 @@ def cross(
             arrived = np.isfinite(reached) & (reached >= low[rest]) & (reached <= high[rest])
             looked_at = np.where(arrived, reached, middle)
         spots = stable[rest] + looked_at[:, None] * along[rest]
-        top = deciding.log_magnitudes(deciding.family.matrices(just_inside(spots)), 1)[:, 0]
+        top = deciding.growth(spots)
         good = arrived.copy()
         if arrived.any():
             good[arrived] = top[arrived] <= rounded_growth(spots[arrived], found.gradient[arrived])
@@ -89,7 +89,7 @@ def cross(
         again = rest[out]
         if len(again) and bracket < tries - 1:
             points[again] = spots[out]
-            _put(pairs, again, deciding.leading(just_inside(points[again])))
+            _put(pairs, again, deciding.leading(points[again]))
         rest = rest[~good]
         guess[rest] = (low[rest] + high[rest]) / 2
         if (np.hypot(*along[rest].T) * (high - low)[rest] <= CLOSED).all():
@@ -97,7 +97,7 @@ def cross(
     if not len(rest):
         return points, pairs
     points[rest] = stable[rest] + high[rest, None] * along[rest]
-    _put(pairs, rest, deciding.leading(just_inside(points[rest])))
+    _put(pairs, rest, deciding.leading(points[rest]))
     return points, pairs
 
 
@@ -122,11 +122,6 @@ def _put(pairs: Pairs, places: Integers, new: Pairs) -> None:
         getattr(pairs, name)[places] = getattr(new, name)
 
 
-def just_inside(points: Floats) -> Floats:
-    """Return points a hair inside the unit square, as the survey samples them."""
-    return np.clip(points, INSIDE_RIM, 1 - INSIDE_RIM)
-
-
 def rounded_growth(points: Floats, gradient: Floats) -> Floats:
     """Return up to where log|λ| counts as zero at points of the boundary, looked at a hair inside the rim."""
     shift = np.abs(just_inside(points) - points)
@@ -138,8 +133,7 @@ def clear(deciding: Eigenvalues, points: Floats, pairs: Pairs) -> NDArray[np.boo
     """Say of each point of the boundary whether no other eigenvalue has left the unit circle there."""
     alone: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
     if alone.any():
-        top = deciding.log_magnitudes(deciding.family.matrices(just_inside(points[alone])), 1)[:, 0]
-        alone[alone] = top <= rounded_growth(points[alone], pairs.gradient[alone])
+        alone[alone] = deciding.growth(points[alone]) <= rounded_growth(points[alone], pairs.gradient[alone])
     return alone
 
 

@@ -1,7 +1,7 @@
 """The eigenvalues that decide, of families of matrices over a plane, with their slopes.
 
-Takes: a `Family`: the closed systems of a scene as matrices over the unit square, with their derivatives.
-Gives: `Family`, `Pairs`, `join`; `Eigenvalues`; `log_magnitudes`, `largest`, `by_system`.
+Takes: a `DirectFamily`: the closed systems of a scene as matrices over the unit square, with derivatives.
+Gives: `Pairs`, `join`; `Eigenvalues`; `log_magnitudes`, `largest`, `by_system`.
 Guarantees: all points at once; what is small is computed in few calls. A complex pair is stood for by its
 eigenvalue of positive imaginary part.
 Does not: know what the two coordinates are.
@@ -13,12 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.eigenpairs import Eigenpairs, refined
+from apc.regions.rectangle import DirectFamily
+from apc.regions.survey import just_inside
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -29,24 +30,6 @@ ALIKE = 1e-11
 
 # What is smaller decides nothing, and its logarithm must be finite.
 LEAST_MAGNITUDE = 1e-3
-
-
-class Family(Protocol):
-    """Closed systems whose frame matrices depend on a point (x, y) of the unit square."""
-
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """The number of states of each closed system."""
-
-    @property
-    def errors(self) -> tuple[Floats, ...]:
-        """By how much each system's matrices may be off, entry by entry (n, n)."""
-
-    def matrices(self, points: Floats) -> tuple[Floats, ...]:
-        """Return each system's matrices (k, n, n) at points (k, 2)."""
-
-    def slopes(self, system: int, points: Floats) -> tuple[Floats, Floats]:
-        """Return one system's matrices (k, n, n) and their derivatives (2, k, n, n) over x and y."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,24 +78,24 @@ def largest(matrices: Sequence[Floats]) -> complex:
     return complex(values[np.argmax(np.abs(values))])
 
 
-def by_system(system: Integers) -> list[tuple[int, Integers | slice]]:
-    """Return each system with its points, all of them as a slice."""
-    used = sorted(set(system.tolist()))
-    return [(s, np.flatnonzero(system == s) if len(used) > 1 else slice(None)) for s in used]
+def by_system(system: Integers) -> list[tuple[int, Integers]]:
+    """Return each system with its points."""
+    return [(s, np.flatnonzero(system == s)) for s in sorted(set(system.tolist()))]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Eigenvalues:
     """The eigenvalues of closed systems over the unit square."""
 
-    family: Family
+    family: DirectFamily
 
-    def log_magnitudes(self, matrices: Sequence[Floats], count: int) -> Floats:
-        """Return the logarithms of the `count` largest magnitudes of all systems (k, count), descending."""
-        return log_magnitudes(matrices, count)
+    def growth(self, points: Floats) -> Floats:
+        """Return the log of the spectral radius (k,) a hair inside the square, as the survey samples it."""
+        return log_magnitudes(self.family.matrices(just_inside(points)), 1)[:, 0]
 
     def leading(self, points: Floats) -> Pairs:
-        """Return the eigenvalue of largest magnitude of all systems at each point (k, 2)."""
+        """Return the eigenvalue of largest magnitude at each point (k, 2), a hair inside the square."""
+        points = just_inside(points)
         matrices = self.family.matrices(points)
         values = [np.linalg.eigvals(one) for one in matrices]
         best = np.stack([np.abs(one).max(axis=1) for one in values], axis=1)

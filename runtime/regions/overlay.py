@@ -10,9 +10,10 @@ Does not: find a boundary that a line of the plane crosses twice; draw.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -144,31 +145,20 @@ def overlay_points(system: CompiledSystem, overlay: Overlay, x: Range, y: Range)
         overrides = [Override(x.free, Fraction(at_x)), Override(y.free, Fraction(at_y))]
         return float(overlay.condition.margin(*symbol_values(apply(system, overrides), overlay)))
 
-    def crossing(along: Callable[[float], float], low: float, high: float) -> float | None:
+    def crossings(along: Callable[[float], float], low: float, high: float) -> list[float]:
+        """Return where a line of the plane meets the boundary: one value, or none."""
         first, last = along(low), along(high)
         if first == 0 or last == 0:
-            return low if first == 0 else high
+            return [low if first == 0 else high]
         if (first > 0) == (last > 0):
-            return None
-        return float(brentq(along, low, high, xtol=abs(high - low) * 1e-15, rtol=1e-14))
+            return []
+        return [float(brentq(along, low, high, xtol=abs(high - low) * 1e-15, rtol=1e-14))]
 
-    points = []
     ends_x, ends_y = ((float(one.low), float(one.high)) for one in (x, y))
-    for at in np.linspace(*ends_y, LINES).tolist():
-        found = crossing(lambda value, at=at: margin(value, at), *ends_x)  # type: ignore[misc]
-        points += [(found, at)] if found is not None else []
-    for at in np.linspace(*ends_x, LINES).tolist():
-        found = crossing(lambda value, at=at: margin(at, value), *ends_y)  # type: ignore[misc]
-        points += [(at, found)] if found is not None else []
-    return _in_order(points)
-
-
-def _in_order(points: Sequence[tuple[float, float]]) -> Floats:
-    """Return the points of a monotone curve from its one end to the other, each once."""
-    if not points:
-        return np.empty((0, 2))
-    unique = sorted(set(points))
-    (first_x, first_y), (last_x, last_y) = unique[0], unique[-1]
-    falling = last_y < first_y if last_x != first_x else False
-    ordered = sorted(unique, key=lambda point: (point[0], -point[1] if falling else point[1]))
-    return np.array(ordered, dtype=np.float64)
+    across, up = (np.linspace(*ends, LINES).tolist() for ends in (ends_x, ends_y))
+    rows = [(met, at) for at in up for met in crossings(partial(margin, at_y=at), *ends_x)]
+    columns = [(at, met) for at in across for met in crossings(partial(margin, at), *ends_y)]
+    points = sorted({*rows, *columns})
+    falling = bool(points) and points[-1][1] < points[0][1]
+    points.sort(key=lambda point: (point[0], -point[1] if falling else point[1]))
+    return np.array(points, np.float64).reshape(-1, 2)

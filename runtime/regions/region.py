@@ -32,7 +32,7 @@ from apc.network.nominal import left_out, refuse_channel_number
 from apc.regions.axes import PLACE
 from apc.regions.boundary import Arc, relative_to, stable_area, trace_steps, traced
 from apc.regions.curves import between
-from apc.regions.deciding import Eigenvalues, largest
+from apc.regions.deciding import Eigenvalues, largest, log_magnitudes
 from apc.regions.rectangle import DirectFamily, Rectangle, family_over, rectangle_of
 from apc.regions.strips import BRANCHES, Striped, trace_strips
 from apc.regions.survey import blurred, survey
@@ -400,7 +400,7 @@ def _surveyed(plane: _Plane, cells: int, tolerance: float, told: Told | None) ->
         looked += len(points)
         if told:
             told(f"looking at {counted(looked, 'point')}")
-        return _samples(deciding, plane, points)
+        return _samples(plane, points)
 
     if plane.stepped:
         found = survey(samples, cells=cells)
@@ -419,7 +419,7 @@ def _surveyed(plane: _Plane, cells: int, tolerance: float, told: Told | None) ->
     return Striped(arcs, area, off, found.corners[0], (found.cell, found.cell), found.finest / found.cell)
 
 
-def _samples(deciding: Eigenvalues, plane: _Plane, points: Floats) -> Floats:
+def _samples(plane: _Plane, points: Floats) -> Floats:
     """Return the logarithms of the largest magnitudes, or raise what is wrong with a point."""
     source, rectangle = plane.family.evaluator, plane.family.rectangle
     matrices = plane.family.matrices(points)
@@ -433,7 +433,7 @@ def _samples(deciding: Eigenvalues, plane: _Plane, points: Floats) -> Floats:
                 plane.closed_at(value)
             what = "the scene's frame leaves the range of floating point numbers in part of the rectangle"
             raise ApcError(Mistake("E905", PLACE, what, hint="a smaller range"))
-    return deciding.log_magnitudes(matrices, BRANCHES)
+    return log_magnitudes(matrices, BRANCHES)
 
 
 def _curve(plane: _Plane, arc: Arc, criterion: str) -> Curve:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +26,8 @@ from apc.eigen.relative import relative_bounded
 from apc.eigen.spectrum import mode_near
 from apc.frame.names import Range, parameter_of
 from apc.regions.axes import PLACE
-from apc.regions.boundary import Arc, traced
-from apc.regions.curves import straight_handles, tangents
+from apc.regions.boundary import Arc, straight_arc, traced
+from apc.regions.curves import tangents
 from apc.regions.deciding import Eigenvalues, largest, log_magnitudes
 from apc.regions.rectangle import DirectFamily, Rectangle, family_over, rectangle_of
 from apc.regions.survey import HALVINGS
@@ -183,16 +184,15 @@ def _standing(piece: Piece, other: Range, ends: Sequence[float], prepared: Prepa
     for crossing in found.edges:
         height = min(max((crossing.value - low) / (high - low), 0.0), 1.0)
         heights.append(height)
-        middle = np.array([[(ends[0] + ends[1]) / 2, height]])
         # The stable side is on the left: to the west it is below, to the east above.
         places = ends[::-1] if crossing.stable_side == "below" else ends
         values = line.look(np.array([crossing.value]))[0][0]
         arcs.append(
-            _straight(
+            straight_arc(
                 np.array([[places[0], height], [places[1], height]]),
-                middle,
+                np.array([crossing.error / (high - low) + np.spacing(1.0)]),
+                np.array([(ends[0] + ends[1]) / 2, height]),
                 complex(values[np.argmax(np.abs(values))]),
-                crossing.error / (high - low) + np.spacing(1.0),
             )
         )
     first = found.stable[0]
@@ -200,21 +200,6 @@ def _standing(piece: Piece, other: Range, ends: Sequence[float], prepared: Prepa
     area = float(steps[0 if first else 1 :: 2].sum())
     off = sum(float(arc.errors[0]) for arc in arcs)
     return _Strip(ends[0], ends[1], tuple(arcs), (first, first), area, off)
-
-
-def _straight(points: Floats, knot: Floats, value: complex, error: float) -> Arc:
-    """Return a straight piece of the boundary (2, 2); at its knot (1, 2) `value` is the eigenvalue."""
-    return Arc(
-        points=points,
-        handles=straight_handles(points),
-        errors=np.array([error]),
-        knots=knot,
-        values=np.array([value], np.complex128),
-        system=0,
-        rounding=0.0,
-        chain=0,
-        smooth=False,
-    )
 
 
 def _moving(
@@ -345,11 +330,12 @@ def _edge_piece(
     """Return a piece of the boundary along an edge between strips, and the motion that grows beside it."""
     grows = strips[place] if stable_before else strips[place - 1]
     inside = (1 if stable_before else -1) * INSIDE * (grows.end - grows.start)
-    knot = np.array([[edge + inside, (low + high) / 2]])
+    knot = np.array([edge + inside, (low + high) / 2])
     points = np.array([[edge, low], [edge, high]])
-    leading = largest(source.matrices(rectangle.values(knot)))
+    leading = largest(source.matrices(rectangle.values(knot[None])))
     # Upwards, the left-hand side is the strip before.
-    return _straight(points if stable_before else points[::-1].copy(), knot, leading, float(np.spacing(1.0)))
+    points = points if stable_before else points[::-1].copy()
+    return straight_arc(points, np.array([np.spacing(1.0)]), knot, leading)
 
 
 def _joined(arcs: Sequence[Arc], mode_of: Callable[[Arc], str]) -> list[Arc]:
@@ -384,23 +370,20 @@ def _chained(listed: list[Arc]) -> list[Arc]:
 
 
 def _after(one: Arc, other: Arc) -> Arc:
-    return replace(
-        one,
-        points=np.concatenate([one.points, other.points[1:]]),
-        handles=np.concatenate([one.handles, other.handles]),
-        errors=np.concatenate([one.errors, other.errors]),
-        knots=np.concatenate([one.knots, other.knots]),
-        values=np.concatenate([one.values, other.values]),
-    )
+    """Return two arcs as one."""
+    points = np.concatenate([one.points, other.points[1:]])
+    rest: dict[str, Any] = {
+        name: np.concatenate([getattr(one, name), getattr(other, name)])
+        for name in ("handles", "errors", "knots", "values")
+    }
+    return replace(one, points=points, **rest)
 
 
 def _swapped(arc: Arc) -> Arc:
     """Return an arc with its coordinates in the other order, and so backwards: the stable side stays left."""
-    return replace(
-        arc,
-        points=arc.points[::-1, ::-1].copy(),
-        handles=arc.handles[::-1, ::-1, ::-1].copy(),
-        errors=arc.errors[::-1].copy(),
-        knots=arc.knots[::-1, ::-1].copy(),
-        values=arc.values[::-1].copy(),
-    )
+    names = ("points", "handles", "errors", "knots", "values")
+    backwards: dict[str, Any] = {name: getattr(arc, name)[::-1] for name in names}
+    for name in ("points", "handles", "knots"):
+        backwards[name] = backwards[name][..., ::-1]
+    backwards["handles"] = backwards["handles"][:, ::-1]
+    return replace(arc, **{name: values.copy() for name, values in backwards.items()})

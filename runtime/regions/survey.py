@@ -2,7 +2,7 @@
 
 Takes: a function that tells the logarithms of the largest eigenvalue magnitudes at many points of the unit
 square at once.
-Gives: `Survey`, `Crossing`, `survey`.
+Gives: `Survey`, `survey`; `just_inside`.
 Guarantees: every cell whose corners disagree, and every cell that could, by the second differences measured
 around it, hide a component, is divided, all cells of a level as one batch, down to the finest size; every
 crossing of a cell's edge is linked to the one that follows it with the stable side on its left.
@@ -48,25 +48,18 @@ HALVINGS = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Crossing:
-    """A stretch of a cell's edge that the boundary crosses: from a stable to an unstable point (2,) each."""
-
-    stable: Floats
-    unstable: Floats
-    growth: tuple[float, float]  # log of the spectral radius at both
-    rim: bool  # on the rectangle's own edge
-
-
-@dataclass(frozen=True, slots=True)
 class Survey:
     """The crossings and how they follow one another, the stable side on the left.
 
-    `chains` are lists of crossings by number, `closed` says which of them come back to their first. `corners`
-    says of the rectangle's corners (0, 0), (1, 0), (0, 1), (1, 1) whether they are stable. `cell` is the side
-    of the coarse cells, `finest` of the smallest looked at.
+    A crossing is a stretch of a cell's edge from a `stable` to an `unstable` point (k, 2); `growth` (k, 2) is
+    the log of the spectral radius at both. `chains` are lists of crossings by number, `closed` says which
+    of them come back to their first. `corners` says of the rectangle's corners (0, 0), (1, 0), (0, 1), (1, 1)
+    whether they are stable. `cell` is the side of the coarse cells, `finest` of the smallest looked at.
     """
 
-    crossings: tuple[Crossing, ...]
+    stable: Floats
+    unstable: Floats
+    growth: Floats
     chains: tuple[tuple[int, ...], ...]
     closed: tuple[bool, ...]
     corners: tuple[bool, bool, bool, bool]
@@ -103,18 +96,8 @@ def survey(log_magnitudes: Callable[[Floats], Floats], *, cells: int) -> Survey:
     if (unsure[1:, 1:] & unsure[1:, :-1] & unsure[:-1, 1:] & unsure[:-1, :-1]).any():
         raise blurred()
     suspect = _suspect(grid[None])[0]
-    leaves: dict[Node, int] = {}
+    leaves = {(int(i) * step, int(j) * step): step for j, i in np.argwhere(~suspect)}
     divided = [(int(i) * step, int(j) * step, step) for j, i in np.argwhere(suspect)]
-    stable = grid[..., 0] < 0
-    mixed = _mixed(stable)
-    near = suspect.copy()
-    near[1:] |= suspect[:-1]
-    near[:-1] |= suspect[1:]
-    near[:, 1:] |= suspect[:, :-1]
-    near[:, :-1] |= suspect[:, 1:]
-    # A coarse cell whose corners agree, beside none that was divided, has nothing to tell.
-    for j, i in np.argwhere((mixed | near) & ~suspect):
-        leaves[int(i) * step, int(j) * step] = step
     while True:
         while divided:
             leaves, divided = _divide(lattice, leaves, divided)
@@ -124,6 +107,11 @@ def survey(log_magnitudes: Callable[[Floats], Floats], *, cells: int) -> Survey:
         if not tangled:
             return _linked(lattice, leaves, changes, cells)
         divided = [(*corner, leaves.pop(corner)) for corner in tangled]
+
+
+def just_inside(points: Floats) -> Floats:
+    """Return points a hair inside the unit square, as the survey samples them."""
+    return np.clip(points, INSIDE_RIM, 1 - INSIDE_RIM)
 
 
 class _Lattice:
@@ -137,9 +125,7 @@ class _Lattice:
 
     def point(self, nodes: Iterable[Node]) -> Floats:
         """Return where nodes are in the unit square (k, 2), a hair inside its edges."""
-        points = np.array(list(nodes), np.float64) / self.side
-        inside: Floats = np.clip(points, INSIDE_RIM, 1 - INSIDE_RIM)
-        return inside
+        return just_inside(np.array(list(nodes), np.float64) / self.side)
 
     def sample(self, nodes: Iterable[Node]) -> Floats:
         """Return the values at nodes (k, m), computing those that are new in one batch."""
@@ -186,13 +172,6 @@ def _divide(
                 else:
                     leaves[corner] = h
     return leaves, again
-
-
-def _mixed(stable: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Say of each cell of a grid (n + 1, m + 1) of nodes whether its corners disagree."""
-    corners = stable[:-1, :-1].astype(int) + stable[1:, :-1] + stable[:-1, 1:] + stable[1:, 1:]
-    mixed: NDArray[np.bool_] = (corners > 0) & (corners < 4)
-    return mixed
 
 
 def _suspect(values: Floats) -> NDArray[np.bool_]:
@@ -276,47 +255,38 @@ def _linked(
     follows: dict[Edge, Edge] = {}
     for corner, size in sorted(leaves.items()):
         changes = every[corner]
-        leaving = [edge for edge, out in changes if out]
-        back = [edge for edge, out in changes if not out]
-        if len(changes) > 2 and _centre_is_stable(lattice, corner, size):
-            # Two pieces in a finest cell: each cuts off an unstable corner, its crossings side by side.
-            follows |= zip(leaving, back if changes[0][1] else [*back[1:], back[0]], strict=True)
-        else:
-            follows |= zip(
-                leaving, [back[-1], *back[:-1]] if changes and changes[0][1] else back, strict=True
-            )
+        # Two pieces in a finest cell with a stable middle: each cuts off an unstable corner, its crossings
+        # side by side, and so goes on at the next of the rim. Otherwise it goes to the one before.
+        step = 1 if len(changes) > 2 and _centre_is_stable(lattice, corner, size) else -1
+        for place, (edge, out) in enumerate(changes):
+            if out:
+                follows[edge] = changes[(place + step) % len(changes)][0]
     number = {edge: place for place, edge in enumerate(dict.fromkeys([*follows, *follows.values()]))}
     entered = set(follows.values())
     starts = [edge for edge in follows if edge not in entered]
     chains, closed = [], []
-    left = dict(follows)
     for start in [*starts, *follows]:
-        if start not in left:
+        if start not in follows:
             continue
         chain = [start]
-        while chain[-1] in left:
-            chain.append(left.pop(chain[-1]))
-        loop = len(chain) > 1 and chain[-1] == start
+        while chain[-1] in follows:
+            chain.append(follows.pop(chain[-1]))
+        loop = chain[-1] == start
         chains.append(tuple(number[edge] for edge in (chain[:-1] if loop else chain)))
         closed.append(loop)
     side = lattice.side
-    rim = [_on_rim(edge, side) for edge in number]
+    ends = np.array(list(number), np.float64).reshape(-1, 2, 2) / side
+    growth = [[lattice.values[node][0] for node in edge] for edge in number]
     corners = ((0, 0), (side, 0), (0, side), (side, side))
     return Survey(
-        crossings=tuple(
-            Crossing(
-                np.array(stable, np.float64) / side,
-                np.array(unstable, np.float64) / side,
-                (float(lattice.values[stable][0]), float(lattice.values[unstable][0])),
-                on_rim,
-            )
-            for (stable, unstable), on_rim in zip(number, rim, strict=True)
-        ),
+        stable=ends[:, 0],
+        unstable=ends[:, 1],
+        growth=np.array(growth).reshape(-1, 2),
         chains=tuple(chains),
         closed=tuple(closed),
         corners=tuple(lattice.stable(corner) for corner in corners),  # type: ignore[arg-type] # four of them
         cell=1 / cells,
-        finest=min(leaves.values(), default=side // cells) / side,
+        finest=min(leaves.values()) / side,
     )
 
 
@@ -324,8 +294,3 @@ def _centre_is_stable(lattice: _Lattice, corner: Node, size: int) -> bool:
     """Say whether the middle of a finest cell is stable."""
     middle = (np.array([corner]) + size / 2) / lattice.side
     return bool(lattice.function(middle)[0, 0] < 0)
-
-
-def _on_rim(edge: Edge, side: int) -> bool:
-    """Say whether both nodes of a stretch lie on the same edge of the rectangle."""
-    return any(edge[0][axis] == edge[1][axis] in (0, side) for axis in (0, 1))

@@ -1,7 +1,7 @@
 """Published conditions on the stiffness of a virtual wall: passivity, Z-width, approximate stability.
 
 Takes: the physical quantities of a condition as arrays, in SI.
-Gives: `PublishedCondition`, `CONDITIONS`, and the largest stiffness each allows (`colgate_limit` and so on).
+Gives: `PublishedCondition`, `CONDITIONS`.
 Guarantees: each condition carries its source and its assumptions.
 Does not: know scenes (see `overlay`), or prove that one has the form a condition assumes.
 """
@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
@@ -31,10 +31,10 @@ MEANINGS = {
 
 @dataclass(frozen=True, slots=True)
 class PublishedCondition:
-    """A condition of the literature, limit(…) being the largest stiffness K it allows.
+    """A condition of the literature.
 
-    `symbols` are K and those that `limit` takes, in its order; `margin`, of all of them in their order, is
-    above zero where the condition holds, and continuous. `formula` is the condition as published.
+    `margin`, of all `symbols` in their order, numbers or arrays in SI, is continuous and above zero where the
+    condition holds. `formula` is the condition as published.
     """
 
     name: str
@@ -44,68 +44,12 @@ class PublishedCondition:
     source: str
     assumptions: tuple[str, ...]
     symbols: tuple[str, ...]
-    limit: Callable[..., Floats]
     margin: Callable[..., Floats]
 
     def __str__(self) -> str:
         """Return the condition with its meaning, assumptions and source."""
         assumed = "; ".join(self.assumptions)
         return f"{self.title}: {self.formula} ({self.says})\n  assumes {assumed}\n  source: {self.source}"
-
-
-def colgate_limit(b: ArrayLike, B: ArrayLike, T: ArrayLike) -> Floats:
-    """Return the largest passive stiffness, 2 (b − |B|)/T in N/m, or 0 where b ≤ |B| allows none.
-
-    Parameters
-    ----------
-    b, B
-        Physical damping of the device and damping of the wall, N·s/m.
-    T
-        Sampling period, s.
-    """
-    b, B, T = (np.asarray(value, dtype=np.float64) for value in (b, B, T))
-    return np.asarray(np.maximum(2 * (b - np.abs(B)) / T, 0.0))
-
-
-def gil_limit(b: ArrayLike, B: ArrayLike, T: ArrayLike, t_d: ArrayLike) -> Floats:
-    """Return the largest stable stiffness of the linear condition, (b + B)/(T/2 + t_d) in N/m.
-
-    Parameters
-    ----------
-    b, B
-        Physical damping of the device and damping of the wall, N·s/m.
-    T, t_d
-        Sampling period and delay, s.
-    """
-    b, B, T, t_d = (np.asarray(value, dtype=np.float64) for value in (b, B, T, t_d))
-    return np.asarray((b + B) / (T / 2 + t_d))
-
-
-def diolaiti_limit(b: ArrayLike, T: ArrayLike, t_d: ArrayLike) -> Floats:
-    """Return the largest stiffness that viscous damping pays for, b/(T/2 + t_d) in N/m.
-
-    Parameters
-    ----------
-    b
-        Physical damping of the device, N·s/m.
-    T, t_d
-        Sampling period and delay, s.
-    """
-    return gil_limit(b, 0.0, T, t_d)
-
-
-def abbott_limit(b: ArrayLike, T: ArrayLike, c: ArrayLike, D: ArrayLike) -> Floats:
-    """Return the largest passive stiffness with a quantized position, min(2 b/T, 2 c/D) in N/m.
-
-    Parameters
-    ----------
-    b, T
-        Physical damping of the device, N·s/m, and sampling period, s.
-    c, D
-        Coulomb friction of the device, N, and resolution of its position sensor, m.
-    """
-    b, T, c, D = (np.asarray(value, dtype=np.float64) for value in (b, T, c, D))
-    return np.asarray(np.minimum(2 * b / T, 2 * c / D))
 
 
 CONDITIONS: Mapping[str, PublishedCondition] = {
@@ -124,7 +68,6 @@ CONDITIONS: Mapping[str, PublishedCondition] = {
                 "any passive user",
             ),
             symbols=("K", "b", "B", "T"),
-            limit=colgate_limit,
             margin=lambda K, b, B, T: b - K * T / 2 - np.abs(B),
         ),
         PublishedCondition(
@@ -141,7 +84,6 @@ CONDITIONS: Mapping[str, PublishedCondition] = {
                 "no user holds the device",
             ),
             symbols=("K", "b", "B", "T", "t_d"),
-            limit=gil_limit,
             margin=lambda K, b, B, T, t_d: b + B - K * (T / 2 + t_d),
         ),
         PublishedCondition(
@@ -157,7 +99,6 @@ CONDITIONS: Mapping[str, PublishedCondition] = {
                 "what the sensor's resolution adds is left out",
             ),
             symbols=("K", "b", "T", "t_d"),
-            limit=diolaiti_limit,
             margin=lambda K, b, T, t_d: b - K * (T / 2 + t_d),
         ),
         PublishedCondition(
@@ -172,7 +113,6 @@ CONDITIONS: Mapping[str, PublishedCondition] = {
                 "no delay beyond that",
             ),
             symbols=("K", "b", "T", "c", "D"),
-            limit=abbott_limit,
             margin=lambda K, b, T, c, D: np.minimum(b - K * T / 2, c - K * D / 2),
         ),
     )
