@@ -43,7 +43,10 @@ if TYPE_CHECKING:
 
 ROUGH = 1e-2  # of a value: its error is then said to be no slip
 SHOWN = 6  # rows of the table of what moves the radius most; digits of a value in a sentence
-DIGITS = 3  # of a change
+
+# A change of the radius by less than this share of it, for a change of a number by its own size, can't be
+# told from rounding.
+LEAST_CHANGE = 1e-9
 
 NONE_TOLD = "what moves the radius most: no change of it can be told from rounding"
 
@@ -203,9 +206,8 @@ def sensitivities_text(found: Sensitivities) -> Lines:
     # Eigenvalues that share the radius often change alike, and then one row tells it.
     same: dict[tuple[str, str, str], list[str]] = {}
     for row in found.rows:
-        if abs(row.derivative) > row.error and row.relative:  # else it can't be told from 0
-            change = _change(row.relative / 100, row.error * abs(row.value) / 100)
-            key = (row.parameter, f"{quantity(row.value, row.unit):<15}", change)
+        if abs(row.relative) > LEAST_CHANGE * found.radius:
+            key = (row.parameter, f"{quantity(row.value, row.unit):<15}", f"{row.relative / 100:+.2e}")
             same.setdefault(key, []).append(str(row.mode + 1))
     if not same:
         told = found.note if len(found.active) < 2 else ""
@@ -217,12 +219,6 @@ def sensitivities_text(found: Sensitivities) -> Lines:
         rows.append((*cells, change + which))
     yield from table(rows)
     yield from notes(found.note)
-
-
-def _change(value: float, error: float) -> str:
-    """Return a change to three digits, fewer where its error leaves them open."""
-    known = math.floor(math.log10(abs(value) / error)) if error else DIGITS
-    return f"{value:+.{min(max(known, 1), DIGITS) - 1}e}"
 
 
 def sensitivities_document(found: Sensitivities) -> Plain:

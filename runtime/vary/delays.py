@@ -37,7 +37,7 @@ from apc.vary.batch import BatchEvaluator, batch_evaluator
 from apc.vary.evaluator import Asked
 
 # Pieces of one search: each is some schedules and matrices, a hundredth of a second and more.
-MOST_PIECES = 10_000
+MOST_PIECES = 1_000
 
 # Where in a piece its schedule is looked at: anywhere inside will do, but no two of its steps should be equal
 # there by accident. No time of a scene is a multiple of one part in this prime number.

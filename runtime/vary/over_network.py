@@ -3,14 +3,12 @@
 Takes: a `CompiledSystem` with unreliable links, and its margins over the nominal network.
 Gives: `network_margins`, `network_sensitivities`.
 Guarantees: on either side of a margin, by its error, bounds on the growth of second moments decide, or the
-note says of which they don't; a derivative's error holds where slopes on both sides differ.
+note says of which they don't.
 Does not: vary a delay or a period; look where one growth takes long (see `Growth.quick`); prove that nothing
 changes between two values it looked at.
 
 A derivative at v is the difference quotient D(h) of values at v − h and v + h, extrapolated from two steps
-(Richardson): D = (4 D(h/2) − D(h))/3. Its error is estimated as |D(h/2) − D(h)|, three times the first term
-left out, and half of what the slopes on both sides differ by, extrapolated as well: J = 2 J(h/2) − J(h), next
-to nothing but at a kink; to these comes what the bound on the growth at v allows values to be off by.
+(Richardson): D = (4 D(h/2) − D(h))/3.
 """
 
 from __future__ import annotations
@@ -203,26 +201,23 @@ def network_sensitivities(system: CompiledSystem, prepared: Prepared) -> Sensiti
         for one in free:
             present = value_now(system, one)
             try:
-                told = _derivative(system, one, present, prepared, here)
+                slope = _derivative(system, one, present, prepared)
             except ApcError:  # not even so near can it be judged
-                told = None
-            if told is None:
+                slope = None
+            if slope is None:
                 without.append(one.label)
                 continue
-            slope, error = told
             unit = unit_of(system, one.name)
-            rows.append(Sensitivity(one.label, unit, present, slope, slope * present, error, 0))
+            rows.append(Sensitivity(one.label, unit, present, slope, slope * present, 0))
     rows.sort(key=lambda row: (-abs(row.relative), row.parameter))
-    note = "by differences of two steps: errors are estimates, not bounds"
+    note = "by differences of two steps"
     if without:
         note += f"; not differentiated: {', '.join(without)}"
     return Sensitivities(here.radius, ((complex(here.radius), MOMENTS),), tuple(rows), note)
 
 
-def _derivative(
-    system: CompiledSystem, free: Free, present: float, prepared: Prepared, here: Growth
-) -> tuple[float, float] | None:
-    """Return the derivative of what second moments grow by and its error, None where no step fits.
+def _derivative(system: CompiledSystem, free: Free, present: float, prepared: Prepared) -> float | None:
+    """Return the derivative of what second moments grow by, None where no step fits.
 
     See the head of this module.
     """
@@ -235,13 +230,6 @@ def _derivative(
         overrides = [Override(free, Fraction(value))]
         return growth_at(system, prepared, overrides, PLACE, bounded=False).radius
 
-    steps = [(present + width) - present for width in (step, step / 2)]
-    ends = [(at(present - width), at(present + width)) for width in steps]
-    slopes = [(above - below) / (2 * width) for width, (below, above) in zip(steps, ends, strict=True)]
-    bends = [
-        (above - 2 * here.radius + below) / width for width, (below, above) in zip(steps, ends, strict=True)
-    ]
-    coarse, fine = slopes
-    doubt = max(here.high - here.radius, here.radius - here.low)
-    error = abs(fine - coarse) + abs(2 * bends[1] - bends[0]) / 2 + 4 * doubt / step
-    return (4 * fine - coarse) / 3, error
+    widths = [(present + width) - present for width in (step, step / 2)]
+    coarse, fine = ((at(present + width) - at(present - width)) / (2 * width) for width in widths)
+    return (4 * fine - coarse) / 3

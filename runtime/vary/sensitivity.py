@@ -2,10 +2,10 @@
 
 Takes: a `CompiledSystem`.
 Gives: `Sensitivity`, `Sensitivities`, `sensitivities`; `varied`.
-Guarantees: the derivative is that of the motion that decides, whatever is rigid left out, to rounding; each
-name can be set as it stands; where several eigenvalues share the radius, one row for each of them and no
-gradient that belongs to none.
-Does not: vary times, or the number of peers; prove a derivative: it decides nothing.
+Guarantees: the derivative is that of the motion that decides, whatever is rigid left out, to rounding, which
+an eigenvalue nearby makes worse; each name can be set as it stands; where several eigenvalues share the
+radius, one row for each of them and no gradient that belongs to none.
+Does not: vary times, or the number of peers; bound the error of a derivative: it decides nothing.
 
 For a simple eigenvalue, M v = λ v and w M = λ w,   dλ = w dM v / (w v),   d|λ| = Re(λ̄ dλ)/|λ|. A cluster of
 equal eigenvalues with a full set of vectors moves as the eigenvalues of W dM V, W V = 1.
@@ -23,11 +23,10 @@ from apc.analysis.analysis import Prepared, lifted_groups, prepare, prepare_at_s
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.timings import part
 from apc.compiler.words import counted
-from apc.eigen.eigenpairs import driving_parts, eigenpairs, inverses
+from apc.eigen.eigenpairs import driving_parts, eigenpairs
 from apc.eigen.modes import split
 from apc.eigen.spectrum import solve_spectrum
 from apc.finite_equations import finite_equations
-from apc.frame.discretize import UNIT
 from apc.frame.names import Free, parameter_of
 from apc.network.nominal import channel_numbers
 from apc.result import Result
@@ -51,9 +50,6 @@ WORST = 1e8
 # How far, relatively, a parameter is moved to see whether what was left out as rigid stays so.
 BESIDE = 2.0**-10
 
-# Roundings of an entry of a frame's matrix and of its derivative, estimated.
-ROUNDINGS = 4096
-
 NO_MATRIX = "what moves it most: not looked for: the present values have no frame matrix of their own"
 
 
@@ -61,9 +57,8 @@ NO_MATRIX = "what moves it most: not looked for: the present values have no fram
 class Sensitivity:
     """How one of the eigenvalues that make the spectral radius follows one parameter.
 
-    `derivative` is d|λ|/dp in 1/unit, `error` what rounding leaves open of it; `relative` is p·d|λ|/dp, the
-    change of the radius for a change of the parameter by its own size. `mode` counts the eigenvalues that
-    share the radius, from 0.
+    `derivative` is d|λ|/dp in 1/unit; `relative` is p·d|λ|/dp, the change of the radius for a change of the
+    parameter by its own size. `mode` counts the eigenvalues that share the radius, from 0.
     """
 
     parameter: str
@@ -71,7 +66,6 @@ class Sensitivity:
     value: float
     derivative: float
     relative: float
-    error: float
     mode: int
 
 
@@ -128,15 +122,10 @@ def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -
             """Say whether something that is rigid in the scene as it is moves where these vary."""
             return any(np.abs(one.values).max() > most for one in clusters_of(together) or ())
 
-        def bends(together: Sequence[Free]) -> bool:
-            """Say whether what is rigid follows these: nothing bounds what rounding does to it then."""
-            return not all(np.isfinite(one.rounding).all() for one in clusters_of(together) or ())
-
         zero = [one for one in free if not parameter_of(system, one).value]
         rest = [one for one in free if one not in zero]
         loose = [one for one in zero if frees([one])]
-        for moves in (frees, bends):
-            loose += [one for one in rest if one not in loose and moves([one])] if moves(rest) else []
+        loose += [one for one in rest if frees([one])] if frees(rest) else []
         listed = [[one for one in rest if one not in loose], *([one] for one in zero if one not in loose)]
         rows: list[Sensitivity] = []
         clusters: list[_Cluster] = []
@@ -190,14 +179,13 @@ def varied(system: CompiledSystem) -> list[Free]:
 class _Cluster:
     """Eigenvalues (c,) that are one within rounding, of the closed system of this name.
 
-    `rates` (m, c, c) are W M' V for each of m parameters, W V = 1; `rounding` (m,) is what rounding leaves
-    open of them; `still` (m,) says which leave alone what is rigid. `condition` is that of the vectors.
+    `rates` (m, c, c) are W M' V for each of m parameters, W V = 1; `still` (m,) says which leave alone what
+    is rigid. `condition` is that of the vectors.
     """
 
     name: str
     values: Complexes
     rates: Complexes
-    rounding: Floats
     still: NDArray[np.bool_]
     condition: float
 
@@ -207,7 +195,6 @@ def _rows(system: CompiledSystem, free: Free, one: _Cluster, column: int, first:
     parameter = parameter_of(system, free)
     moves = np.linalg.eigvals(one.rates[column])
     growth = np.sort((one.values.conj() * moves).real / np.abs(one.values))[::-1]
-    error = float(one.rounding[column])
     return [
         Sensitivity(
             parameter=free.label,
@@ -215,11 +202,10 @@ def _rows(system: CompiledSystem, free: Free, one: _Cluster, column: int, first:
             value=parameter.value,
             derivative=rate,
             relative=rate * parameter.value,
-            error=error,
             mode=first + number,
         )
         for number, rate in enumerate(growth.tolist())
-        if np.isfinite(rate) and np.isfinite(error)
+        if np.isfinite(rate)
     ]
 
 
@@ -248,17 +234,15 @@ def _clusters(system: CompiledSystem, free: Sequence[Free], prepared: Prepared) 
     for one in beside:
         still &= np.isfinite(one).all(axis=(1, 2))
     found = []
-    for name, (matrix, slopes), (error,) in zip(family.names, pairs, family.errors(here[None]), strict=True):
+    for name, (matrix, slopes) in zip(family.names, pairs, strict=True):
         if not matrix.shape[1]:
             continue
-        own = _of_system(name, matrix[0], error, slopes[: len(free)], here, still)
+        own = _of_system(name, matrix[0], slopes[: len(free)], still)
         if not all(one.condition < WORST for one in own):  # peers in a chain share eigenvalues, no motion
             own = []
             for states in _alone(matrix[0], slopes):
                 block = np.index_exp[..., states[:, None], states]
-                own += _of_system(
-                    name, matrix[0][block], error[block], slopes[block][: len(free)], here, still
-                )
+                own += _of_system(name, matrix[0][block], slopes[block][: len(free)], still)
         found += own
     sizes = [float(np.abs(one.values).max()) for one in found]
     least = max(sizes, default=0.0) - SHARED * max(1.0, *sizes, 0.0)
@@ -277,35 +261,10 @@ def _alone(matrix: Floats, slopes: Floats) -> list[Places]:
     return list(own.values()) or [np.arange(len(matrix))]
 
 
-def _turned(
-    matrix: Floats, off: Floats, slopes: Floats, value: complex, left: Complexes, right: Complexes
-) -> Floats:
-    """Return what slopes (m, n, n) make of how far rounding `off` (n, n) turns an eigenvalue's vectors, (m,).
-
-    Notes
-    -----
-    To first order an E that is added to the matrix adds w E S M′ v + w M′ S E v, S being the inverse of
-    M − λ on all other motions: the larger, the nearer another eigenvalue is.
-    """
-    n, c = right.shape
-    bordered = np.block([[matrix - value * np.eye(n), right], [left, np.zeros((c, c))]])
-    rest = inverses(bordered)[:n, :n]
-    into = np.abs(left) @ off @ np.abs(rest @ slopes @ right)
-    out_of = np.abs(left @ slopes @ rest) @ off @ np.abs(right)
-    return np.asarray((into + out_of).max(axis=(1, 2), initial=0.0))
-
-
-def _of_system(
-    name: str, matrix: Floats, error: Floats, slopes: Floats, here: Floats, still: NDArray[np.bool_]
-) -> list[_Cluster]:
-    """Return the largest eigenvalues of a matrix (n, n), and what its slopes (m, n, n) do to them.
-
-    `error` (n, n) bounds what the matrix is off by; the slopes are taken to be off as much, relatively.
-    """
+def _of_system(name: str, matrix: Floats, slopes: Floats, still: NDArray[np.bool_]) -> list[_Cluster]:
+    """Return the largest eigenvalues of a matrix (n, n), and what its slopes (m, n, n) do to them."""
     pairs = eigenpairs(matrix)
     sizes = np.abs(pairs.values)
-    off = error + ROUNDINGS * len(matrix) * UNIT * np.abs(matrix)
-    rounded = float(off.max() / np.abs(matrix).max(initial=np.finfo(np.float64).tiny))
     least = sizes.max() - SHARED * max(1.0, sizes.max()) - 2 * CLOSE * max(sizes.max(), CLOSE)
     left_over = set(np.flatnonzero((pairs.values.imag >= 0) & (sizes >= least)).tolist())
     found = []
@@ -320,14 +279,8 @@ def _of_system(
         size = float(np.linalg.svd(product, compute_uv=False)[-1])
         norms = float(np.linalg.norm(own.left, 2) * np.linalg.norm(own.right, 2))
         condition = norms / size if size > 0 else np.inf
-        rates, rounding = np.zeros((len(slopes), len(near), len(near)), np.complex128), np.zeros(len(slopes))
+        rates = np.zeros((len(slopes), len(near), len(near)), np.complex128)
         if condition < WORST:
-            left = np.asarray(np.linalg.solve(product, own.left), dtype=np.complex128)
-            rates = left @ slopes @ own.right
-            felt = np.abs(left) @ np.abs(slopes) @ np.abs(own.right)
-            # A change by all of the value that is less than the matrix is rounded by can't be told.
-            told = np.divide(float(sizes.max()), np.abs(here), out=np.zeros(len(here)), where=here != 0)
-            rounding = rounded * (condition * felt.max(axis=(1, 2), initial=0.0) + told)
-            rounding += _turned(matrix, off, slopes, value, left, own.right)
-        found.append(_Cluster(name, own.values, rates, rounding, still, condition))
+            rates = np.asarray(np.linalg.solve(product, own.left) @ slopes @ own.right, np.complex128)
+        found.append(_Cluster(name, own.values, rates, still, condition))
     return found

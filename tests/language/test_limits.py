@@ -113,8 +113,8 @@ def test_peers_on_a_complete_graph_have_no_limit() -> None:
 @pytest.mark.whole
 def test_delays_are_searched_and_varied_only_so_far() -> None:
     assert told(lambda: apc.critical(compiled(AVERAGE), "lan.delay", upper="1e6 s")) == [
-        "critical value: E846 from 0 to 1e+06 (SI) events coincide at more than 10,000 values of lan.delay, "
-        "the most that are searched. Write: a range up to 10 s"
+        "critical value: E846 from 0 to 1e+06 (SI) events coincide at more than 1,000 values of lan.delay, "
+        "the most that are searched. Write: a range up to 1 s"
     ]
     late = compiled(replaced(AVERAGE, (DELAY, "delay: 2 s}")))
     for x in ("contact.stiffness=500 N/m:900 N/m", "lan.delay=0 s:2 s"):

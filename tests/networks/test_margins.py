@@ -47,8 +47,7 @@ def test_derivatives_are_those_of_moments_followed_event_by_event() -> None:
     ):
         row, expected = found[name], (up - down) / (2 * step)
         # The program's own differences are right to some 1e-6 of them: 1e-10 of a radius over such a step.
-        assert abs(row.derivative - expected) <= row.error + 3e-6 * abs(expected)
-        assert row.error < 1e-3 * abs(row.derivative)
+        assert row.derivative == pytest.approx(expected, rel=3e-6)
 
 
 @pytest.mark.whole
