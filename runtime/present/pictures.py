@@ -84,14 +84,14 @@ def check_picture(path: Path, option: str = "--plot", more: Sequence[str] = ()) 
     Raises
     ------
     ApcError
-        E878 the suffix, E601 the place, E887 or E875 a library that is missing.
+        E601 the place, E878 the suffix, E887 or E875 a library that is missing.
     """
+    check_target(path)
     suffix = check_suffix(path, (*FORMATS, *more), option)
     if suffix in SUFFIXES:
         check_table_path(path, option)
-    check_target(path)
     if suffix in FORMATS:
-        need("matplotlib.figure", "plot")
+        need("matplotlib", "plot")
     return suffix
 
 
