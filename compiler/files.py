@@ -5,17 +5,15 @@ Takes: paths. Gives: `read_file`, `check_file`, `RefusedError`, `files_below`, `
 `unwritable`, `is_special`, `is_stdout`, and for what is written piece by piece `begin_file`, `finish_file`,
 `drop_file`, `partial_name`; `unlink_link`.
 Guarantees: only a regular file of bounded size is read, by whatever links it is reached, and nothing is
-waited for. What is written is there whole or not at all, and what a writer left that was killed goes with the
-next: a file is replaced by one of its mode and owner unless it is read-only, a link stays and its file is
-written; a device or pipe, or what standard output writes to, is written to, never replaced.
+waited for. What is written is there whole or not at all: a file is replaced by one of its mode and owner
+unless it is read-only, a link stays and its file is written; a device or pipe, or what standard output writes
+to, is written to, never replaced.
 Does not: know a format, or say at which line a file was named.
 """
 
 from __future__ import annotations
 
-import glob
 import os
-import platform
 import shlex
 import shutil
 import stat
@@ -37,8 +35,6 @@ NO_NAME = OSError, ValueError  # what the system and Python say of a name that c
 STDOUT = 1  # the descriptor of standard output
 KERNELS = ("/proc", "/sys")  # file systems whose files are answers of the kernel
 KERNELS_OWN = "is an answer of the system's kernel"
-
-UNFINISHED = ".unfinished"  # how the name of a temporary file ends that goes with the next writer
 
 T = TypeVar("T")
 Why = Literal["missing", "folder", "special", "large", "forbidden", "unreadable"]
@@ -295,9 +291,6 @@ def unwritable(path: Path, error: Exception) -> ApcError:
 def begin_file(path: Path) -> Path:
     """Make the empty temporary file of a path: beside what it leads to, so that a rename puts it there.
 
-    What writers of the same path left that were killed on this machine is removed, unless another process has
-    got the number of the one that wrote it.
-
     Raises
     ------
     OSError
@@ -315,25 +308,9 @@ def begin_file(path: Path) -> Path:
     elif target.exists() and not (target.stat().st_mode & 0o222 and os.access(target, os.W_OK)):
         raise PermissionError(None, "it is read-only")
     # The name of the target need not fit: a temporary's is longer.
-    prefix = f".{target.name[:24]}.{platform.node()}."
-    handle, name = tempfile.mkstemp(UNFINISHED, f"{prefix}{os.getpid()}.", folder)
+    handle, name = tempfile.mkstemp(".unfinished", f".{target.name[:24]}.", folder)
     os.close(handle)
-    with suppress(OSError):  # a folder may be written to and not be read
-        for left in folder.glob(f"{glob.escape(prefix)}*{UNFINISHED}"):
-            _remove_left(left, left.name.removeprefix(prefix).partition(".")[0])
     return Path(name)
-
-
-def _remove_left(temporary: Path, process: str) -> None:
-    """Remove a temporary file of this user's whose writer, a process of this machine, is no more."""
-    try:
-        found = temporary.lstat()
-        if stat.S_ISREG(found.st_mode) and found.st_uid == os.geteuid() and process.isdecimal():
-            os.kill(int(process), 0)  # sends nothing
-    except ProcessLookupError:
-        temporary.unlink(missing_ok=True)
-    except (OSError, OverflowError, AttributeError):  # not on Windows, where to kill is to end
-        return
 
 
 def finish_file(temporary: Path, path: Path) -> None:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-import signal
 import stat
-import subprocess
 import sys
 import threading
 from collections.abc import Callable
@@ -23,14 +21,13 @@ from apc.compiler.errors import ApcError
 from apc.compiler.files import (
     RefusedError,
     begin_file,
-    drop_file,
     finish_file,
     read_file,
     write_file,
     write_texts,
 )
 from tests.commands import Cli, folder, write
-from tests.topologies import AVERAGE, ROOT, replaced, told
+from tests.topologies import AVERAGE, replaced, told
 
 FIFO = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes")
 OUT = Path("r.csv")
@@ -180,39 +177,7 @@ def test_standard_output_is_written_to_whatever_it_is_and_goes_on(capfd: pytest.
     assert capfd.readouterr() == ("", "")
 
 
-# ---- what a writer that was killed has left, and what others write ----
-
-KILLED = """
-import os, signal
-from pathlib import Path
-from apc.compiler.files import write_file
-
-def write(temporary):
-    temporary.write_text("half")
-    os.kill(os.getpid(), signal.SIGKILL)
-
-write_file(Path("r.csv"), write)
-"""
-
-
-def kill_a_writer() -> None:
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    assert (
-        subprocess.run([sys.executable, "-c", KILLED], env=environment, check=False).returncode
-        == -signal.SIGKILL
-    )
-
-
-def test_what_killed_writers_left_goes_with_the_next() -> None:
-    held = begin_file(OUT)
-    kill_a_writer()
-    kill_a_writer()  # which takes the place of the one before
-    assert len(folder()) == 2
-    drop_file(held)
-    kill_a_writer()
-    assert len(folder()) == 1
-    write_file(OUT, fill("whole"))
-    assert (OUT.read_text(), folder()) == ("whole", ["r.csv"])
+# ---- what others write ----
 
 
 def test_what_others_are_writing_stays() -> None:
@@ -224,19 +189,6 @@ def test_what_others_are_writing_stays() -> None:
         finish_file(temporary, OUT)
         assert OUT.read_text() == text
     assert folder() == ["r.csv"]
-
-
-@FIFO
-def test_what_is_no_file_of_ours_is_no_temporary() -> None:
-    name = begin_file(OUT)
-    drop_file(name)
-    write("mine.txt", "mine")
-    for make in (os.mkfifo, Path.mkdir, lambda one: one.symlink_to("mine.txt")):
-        make(name)
-        write_file(OUT, fill("whole"))
-        assert os.path.lexists(name)
-        name.rmdir() if name.is_dir() else name.unlink()
-    assert Path("mine.txt").read_text() == "mine"
 
 
 @pytest.mark.whole
