@@ -38,6 +38,9 @@ Complex = NDArray[np.complex128]
 # What is told beside the responses.
 BESIDE = ("low_frequency", "network_viscosity", "hinf", "h2")
 
+# What is left out of the largest gains where copies are apart in modes of peers that differ, too.
+COUPLED = "largest gains leave out how far the copies of peers that differ move apart together"
+
 # The harmonics of the frame rate that are looked at beside the fundamental.
 ALIASES = (0, 1, -1)
 
@@ -66,11 +69,12 @@ class Slow:
 
 @dataclass(frozen=True, slots=True)
 class Extremes:
-    """H∞ norms of one mode: of the velocity of devices, and of how far a copy is from the others, a newton.
+    """H∞ norms of one mode: of the velocity of devices, and of how far a copy is from the mean, a newton.
 
     `on_ticks` with forces held, and motions read, at the instants at which something happens; `sampled_data`
     with forces of any course, whose largest gain is `gains` (k,) at each frequency that was asked for.
-    `of` is what moves; a copy's is None in a mode in which all move alike.
+    `of` is what moves: a device ("velocity"), or a copy less the mean of all copies ("error") where peers
+    that are alike move apart. How far peers that differ move apart together is not told.
     """
 
     mode: str
@@ -213,6 +217,7 @@ def feel(
         "of the map: the scene is unstable": verdict.stable is False,
         "of slow motions nothing is told: something of the scene is slower still": not slow
         and "low_frequency" in beside,
+        COUPLED: "hinf" in beside and bool(answers.error[0]),
         "what noise does is not told: the fastest clock has a phase": steady and not h2 and "h2" in beside,
     }
     return Feel(

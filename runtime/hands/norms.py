@@ -44,7 +44,10 @@ ROUNDED = 1e-12
 
 @dataclass(frozen=True, slots=True)
 class Peak:
-    """An H∞ norm, in SI a newton, ± `error`, and the frequency in Hz where the gain is so large."""
+    """An H∞ norm, in SI a newton, ± `error`, and the frequency in Hz where the gain is so large.
+
+    Of what grows the norm is infinite, and the frequency that of the fastest motion.
+    """
 
     norm: float
     error: float
@@ -133,7 +136,8 @@ def _peak(
     gains = gains_at(value_of(a), b, c, d, turn * frequency_hz)
     gain, angle = peak_gain(value_of(a), b, c, d)
     if not np.isfinite(gain):
-        return Peak(np.inf, 0.0, 0.0), gains
+        fastest = max(np.linalg.eigvals(value_of(a)), key=abs)
+        return Peak(np.inf, 0.0, float(np.abs(np.angle(fastest))) / turn), gains
     # What the state's matrix is off by moves the gain there, to first order, by so much.
     still = np.exp(1j * angle) * np.eye(len(b)) - value_of(a)
     left, right = np.abs(np.linalg.solve(still.T, c.T)).T, np.abs(np.linalg.solve(still, b))

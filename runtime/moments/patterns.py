@@ -15,6 +15,7 @@ A_b; second moments X_s, of the frames that begin in pattern s, move by
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,9 +43,8 @@ MOST_CHANNELS = 6
 # Up to so many numbers, a map of moments is written out.
 FEW = 400
 
-# Of larger ones, how many vectors are looked in, for how many eigenvalues and how often from the start: first
-# a few, and where none is found one alone.
-VECTORS, TRIES = 60, ((4, 40), (1, 1000))
+# Of larger ones, how many vectors are looked in, for how many eigenvalues, and how often from the start.
+VECTORS, TOGETHER, RESTARTED = 60, 4, (40, 1000)
 
 # What is left of a system of equations that is solved in as many vectors, relatively, and how often it starts
 # again.
@@ -206,18 +206,18 @@ def largest(step: Callable[[Floats], Floats], start: Floats) -> float:
     Notes
     -----
     The eigenvalue is real, and no other is larger in magnitude. A few are asked for: alone, the first that an
-    iteration finds may be one near to it.
+    iteration finds may be one near to it. NaN where these don't come out.
     """
     if start.size <= FEW:
         return float(np.linalg.eigvals(np.array([step(column) for column in np.eye(start.size)])).real.max())
     linalg = load_pool("scipy.sparse.linalg")
     operator = linalg.LinearOperator((start.size, start.size), matvec=step, dtype=np.float64)
-    found: list[float] = []
-    for count, restarts in TRIES:
-        try:
+    for restarts in RESTARTED:
+        # Those that have come out where others have not may be any.
+        with suppress(linalg.ArpackNoConvergence):
             values = linalg.eigs(
                 operator,
-                count,
+                TOGETHER,
                 which="LR",
                 v0=start,
                 ncv=VECTORS,
@@ -225,12 +225,8 @@ def largest(step: Callable[[Floats], Floats], start: Floats) -> float:
                 tol=1e-13,
                 return_eigenvectors=False,
             )
-        except linalg.ArpackNoConvergence as slow:  # the largest come first
-            values = slow.eigenvalues
-        found = values.real.tolist()
-        if found:
-            break
-    return max(found, default=np.nan)
+            return float(values.real.max())
+    return np.nan
 
 
 def settled(step: Callable[[Floats], Floats], added: Floats) -> Floats:

@@ -31,7 +31,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake
 from apc.eigen.eigenpairs import eigenvalues
 from apc.frame.overrides import Override, apply
-from apc.hands.feel import feel
+from apc.hands.feel import COUPLED, feel
 from apc.threads import load_pool
 from apc.tuning.demands import HINF, PLACE, SUBJECT, Demands, Felt
 from apc.vary.batch import BatchEvaluator, MatrixSource
@@ -381,6 +381,9 @@ def felt_in(
         elif one.name == "error_h2" and told.h2 and told.h2[0].error_m is not None:
             value, off = told.h2[0].error_m, told.h2[0].errors[0] or 0.0
         elif one.name == HINF:
+            if COUPLED in told.notes:
+                what = f"{one.label} is not told of peers that differ, which move apart together"
+                raise ApcError(Mistake("E996", SUBJECT, what, hint="feel.error_h2"))
             for mode in (mode for mode in told.hinf if mode.of == "error"):
                 peak = mode.sampled_data
                 own = (peak.norm, peak.error, peak.frequency_hz)

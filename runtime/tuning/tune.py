@@ -224,10 +224,11 @@ class _Work:
 
     def __post_init__(self) -> None:
         self.limits = Limits(self.system, prepare(self.system), self.demands, self.until)
-        if self.demands.felt:  # what can't be felt anywhere is refused before anything is looked for
-            felt_in(
-                self.system, [one for one in self.demands.felt if one.name in RESPONSES], self.limits.prepared
-            )
+        # What can't be felt anywhere is refused before anything is looked for.
+        asked = [one for one in self.demands.felt if one.name in RESPONSES]
+        asked += [one for one in self.demands.measured if one.name == HINF]
+        if asked:
+            felt_in(self.system, asked, self.limits.prepared)
         self.every = self.limits.every()
         self.present = np.array([float(value_now(self.system, one.free)) for one in self.demands.free])
         first = len(self.every) // len(self.limits.settings)
