@@ -131,6 +131,8 @@ TWICE = (
         (scene(3, 500.0, more=", on_loss: zero"), "lan takes no difference where a packet is missed"),
         (scene(3, 500.0, more=", jitter: 2 ms"), "lan has jitter"),
         (TWICE, "lan sends more than one packet in a frame of 0.016 s"),
+        # Of two packets between ticks of the forces one is heard only where the other is lost.
+        (scene(3, 500.0, delay="9 ms").replace("haptic: 1 ms", "haptic: 16 ms"), "lan sends more than one"),
         (scene(200, 500.0, more=", graph: ring"), "200 peers on a graph that is not complete are too many"),
     ],
 )
