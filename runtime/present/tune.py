@@ -58,7 +58,8 @@ def tuning_text(found: Tuning) -> Lines:
         for one in found.gains
     ]
     yield from table(rows)
-    yield ""
+    if found.met or found.proofs:
+        yield ""
     value = measured(found.best, found.error, found.unit)
     if _is_felt(found):  # found without knowing how far any better one may be
         value = quantity(found.best, found.unit, BUYS + 1)

@@ -288,9 +288,10 @@ class Limits:
         found = np.full((len(numbers), len(asked), 3), np.inf)
         _, scene = self.settings[setting]
         free = [one.free for one in (*self.demands.free, *self.demands.box)]
-        for row, point in zip(found, map(tuple, numbers.tolist()) if asked else (), strict=False):
+        for place, point in enumerate(map(tuple, numbers.tolist()) if asked else ()):
+            row = found[place]
             if (setting, point, len(asked)) not in self.felt:
-                if row is not found[0] and self.late:
+                if place and self.late:
                     break
                 pairs = zip(free, map(Fraction, point), strict=True)
                 with contextlib.suppress(ApcError):

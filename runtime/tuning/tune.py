@@ -336,7 +336,7 @@ class _Work:
     def _settled(self, found: Optimum) -> tuple[list[Fraction], list[Proved], Scenario | None]:
         """Return gains as they are typed, what is proved of them, and a scenario that they don't bear."""
         column = self.demands.aim.column
-        shares = [0.0] if column is None or self._unproved else BACK_IN_BOX if self.demands.over else BACK
+        shares = [0.0] if column is None else BACK if self._unproved or not self.demands.over else BACK_IN_BOX
         if not found.multipliers.any():  # the end of a range, which leaves room
             shares = [0.0, *shares]
         place, middle = 0, None
@@ -360,7 +360,8 @@ class _Work:
             last = self.late or place + 1 == len(shares)
             if held or last:
                 proofs, failed = self._proofs(gains, whole=last)
-                if failed is not None or last or all(one.proof.stable for one in proofs):
+                proved = self._unproved or all(one.proof.stable for one in proofs)
+                if failed is not None or last or proved:
                     return gains, proofs, failed
             place += 1
 
