@@ -384,7 +384,7 @@ def felt_in(
         elif one.name == HINF:
             if COUPLED in told.notes:
                 what = f"{one.label} is not told of peers that differ, which move apart together"
-                raise ApcError(Mistake("E996", SUBJECT, what, hint="feel.error_h2"))
+                raise ApcError(Mistake("E996", PLACE, what, hint="feel.error_h2"))
             for mode in (mode for mode in told.hinf if mode.of == "error"):
                 peak = mode.sampled_data
                 own = (peak.norm, peak.error, peak.frequency_hz)
