@@ -460,9 +460,10 @@ def peer_groups(
         value that is not finite.
     """
     used = [jacobians[group.kind] for group in system.groups]
-    group = _by_matrices if all(site.parameters_suffice for site in used) else _by_start
     try:
-        return group(system, jacobians, schedules, numbers, exchange)
+        if all(site.parameters_suffice for site in used):
+            return _by_matrices(system, jacobians, schedules, numbers, exchange)
+        return _by_start(system, jacobians, schedules, numbers, exchange)
     except ApcError as error:
         where = system.origin.topology, system.origin.texts
         raise ApcError(at_its_part(one, *where) for one in error.mistakes) from None
