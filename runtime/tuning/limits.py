@@ -264,8 +264,11 @@ class Limits:
             weights = [abs(weight) for weight, one in aim.terms if isinstance(one, Felt)]
             short = (-1 if aim.larger else 1) * (self.sums(setting, points, demands) - level)
             beyond = short + off[:, count:] @ weights
-            found = np.column_stack([found, beyond / aim.scale])
-        return np.asarray(np.clip(np.nan_to_num(found, nan=BEYOND), NONE, BEYOND))
+            # Far beyond by its logarithm: gains beside a resonance are large, and slopes still lead away.
+            far = beyond / aim.scale
+            far = np.where(far > 1, 1 + np.log(np.maximum(far, 1)), far)
+            found = np.column_stack([found, far])
+        return np.maximum(np.nan_to_num(found, nan=BEYOND, posinf=BEYOND, neginf=NONE), NONE)
 
     def sums(self, setting: int, points: Floats, view: Demands | None = None) -> Floats:
         """Return the weighted sum that is the aim (k,) at points (k, m + b), NaN where nothing is known."""
