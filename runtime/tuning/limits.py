@@ -268,7 +268,8 @@ class Limits:
             far = beyond / aim.scale
             far = np.where(far > 1, 1 + np.log(np.maximum(far, 1)), far)
             found = np.column_stack([found, far])
-        return np.maximum(np.nan_to_num(found, nan=BEYOND, posinf=BEYOND, neginf=NONE), NONE)
+        found = np.nan_to_num(found, nan=BEYOND, posinf=BEYOND, neginf=NONE)
+        return np.asarray(np.maximum(found, NONE))
 
     def sums(self, setting: int, points: Floats, view: Demands | None = None) -> Floats:
         """Return the weighted sum that is the aim (k,) at points (k, m + b), NaN where nothing is known."""
