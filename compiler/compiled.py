@@ -168,7 +168,8 @@ class Parameter:
     `minimum` is the least value allowed; `open_minimum` says that the least value itself is excluded.
     `exact` is the rational that `value` is the nearest float to, as 5/3; None where `value` was given as a
     float, in the shortest decimal that means it. Times that depend on a parameter are computed from `number`:
-    a tick decides by equality.
+    a tick decides by equality. `display_unit` is the unit in which the scene writes the value, and in which
+    people are shown it, as Modelica's displayUnit; empty where that is `unit`.
     """
 
     name: str
@@ -180,6 +181,7 @@ class Parameter:
     maximum: float | None = None
     about: str = ""
     exact: Fraction | None = None
+    display_unit: str = ""
 
     @property
     def number(self) -> Fraction:

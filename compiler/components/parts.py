@@ -263,7 +263,7 @@ def read_entry(entry: PartEntry, scope: Scope, mistakes: Mistakes, index: int = 
         if isinstance(item, Number):
             words = item.words
             if node is None and item.default is not None:
-                return Binding(item.default, None, unit.dimension, entry.place)
+                return Binding(item.default, None, unit.dimension, entry.place, unit.text)
         if node is None or node is _FAULTY:
             return None
         what, known = (item.name, unit.dimension, unit.text), (scope.dimension, scope.names)

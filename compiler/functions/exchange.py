@@ -289,7 +289,16 @@ def _named(
     unit, formula = format_dimension(value.dimension), _formula(value.expression)
     least, most = (None if one is None else float(one) for one in (minimum, maximum))
     return Parameter(
-        name, unit, float(value.number), formula, least, open_minimum, most, about=about, exact=value.number
+        name,
+        unit,
+        float(value.number),
+        formula,
+        least,
+        open_minimum,
+        most,
+        about=about,
+        exact=value.number,
+        display_unit=value.unit if value.unit != "1" else "",
     )
 
 

@@ -24,6 +24,7 @@ from apc.compiler.language.units import parse_quantity, parse_unit, quantity
 from apc.compiler.language.vectors import number_of
 from apc.compiler.source.nodes import Node, Scalar
 from apc.compiler.source.reading import brief, either_comma, fault, text_of, unknown
+from apc.compiler.words import with_unit
 
 PEERS = ("peers",)
 
@@ -44,26 +45,30 @@ _WORD_NUMBER = re.compile(r"[+-]?\.?(nan|inf|infinity)\b", re.IGNORECASE)
 
 @dataclass(frozen=True, slots=True)
 class Binding:
-    """A number as written: `number` in SI, or an `expression` over names."""
+    """A number as written: `number` in SI and the `unit` it was written in, or an `expression` over names."""
 
     number: Fraction | None
     expression: Expr | None
     dimension: Dimension
     place: Place
+    unit: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """A number, in SI; `expression` is its tree when it depends on other parameters."""
+    """A number, in SI; `expression` is its tree if it depends on others; `unit` is that of its `Binding`."""
 
     number: Fraction
     dimension: Dimension
     expression: Expr | None
     place: Place
+    unit: str = ""
 
     def __str__(self) -> str:
-        """Return the number with its SI unit."""
-        return format_si(float(self.number), self.dimension)
+        """Return the number in the unit in which it was written, without one in SI."""
+        if not self.unit:
+            return format_si(float(self.number), self.dimension)
+        return with_unit(f"{float(self.number / parse_unit(self.unit, self.place).scale):.6g}", self.unit)
 
 
 class AlreadyReportedError(ApcError):
@@ -148,7 +153,7 @@ def read_binding(
         of `quantity`, `parse_expression` and `dimension_of`.
     """
     text, place = text_of(node, what, f"{what}: 1 {unit}"), node.place
-    number = dict(words).get(text)
+    number, own = dict(words).get(text), ""
     if number is None:
         _refuse_marks(text, place, what)
         _refuse_computed(text, place, what, unit)
@@ -162,8 +167,9 @@ def read_binding(
             return Binding(None, tree, dimension, place)
         _refuse_beside(text, place, what, names_known)
         _refuse_mixture(text, place, what, names_known)
-        number = quantity(text, place, what=what, unit=unit).value
-    return Binding(number, None, dimension, place)
+        read = quantity(text, place, what=what, unit=unit)
+        number, own = read.value, read.unit.text
+    return Binding(number, None, dimension, place, own)
 
 
 def _refuse_marks(text: str, place: Place, what: str) -> None:
@@ -259,7 +265,7 @@ def settle(binding: Binding, number_of: Callable[[tuple[str, ...]], Fraction]) -
     """Return what a binding comes to, given what its names come to. Raises ApcError if it has no value."""
     if binding.expression is None:
         assert binding.number is not None
-        return Value(binding.number, binding.dimension, None, binding.place)
+        return Value(binding.number, binding.dimension, None, binding.place, binding.unit)
     number = Fraction(evaluate(binding.expression, number_of, binding.place))
     return Value(number, binding.dimension, binding.expression, binding.place)
 
@@ -271,7 +277,7 @@ def read_free(node: Node, what: str, others: Collection[str]) -> Binding:
         return Binding(None, _tree(text, place), DIMENSIONLESS, place)
     _refuse_beside(text, place, what, others)
     parsed = parse_quantity(text, node.place)
-    return Binding(parsed.value, None, parsed.unit.dimension, node.place)
+    return Binding(parsed.value, None, parsed.unit.dimension, node.place, parsed.unit.text)
 
 
 def resolve_in_order(

@@ -24,7 +24,7 @@ from apc.compiler.language.vectors import by_vector, whole_and_index
 from apc.compiler.scene.instances import Part
 from apc.compiler.scene.links import SceneLink
 from apc.compiler.scene.scene import Scene
-from apc.compiler.words import counted, with_unit
+from apc.compiler.words import counted
 
 ROLES = {"masses": "mass", "couplers": "coupler", "hands": "hand"}
 LONGEST_ARRAY = 4  # with more elements an array is one box
@@ -153,7 +153,7 @@ def _quantities(part: Part, entries: list[tuple[str, Value]]) -> str:
 
 
 def _quantity(part: Part, name: str, value: Value) -> str:
-    """Return a number in the unit that its component declares, or the word that stands for it."""
+    """Return a number as the scene or its component writes it, or the word that stands for it."""
     declared = part.component.parameter(name) or part.component.variable(name)
     assert isinstance(declared, Number | Variable)
     for word, number in declared.words if isinstance(declared, Number) else ():
@@ -161,8 +161,7 @@ def _quantity(part: Part, name: str, value: Value) -> str:
             return word
     if value.dimension == SECOND:
         return seconds(value.number)
-    unit = declared.unit
-    return with_unit(f"{float(value.number / unit.scale):.6g}", unit.text.replace("*", "·"))
+    return str(replace(value, unit=value.unit or declared.unit.text)).replace("*", "·")
 
 
 def seconds(number: Fraction) -> str:

@@ -30,7 +30,7 @@ from apc.eigen.modes import split
 from apc.eigen.peers import PeerGroup, Runs
 from apc.eigen.ratios import NotRational, Ratio, Ratios, open_site
 from apc.frame.exchange import Exchange
-from apc.frame.names import Free, Range, find
+from apc.frame.names import Free, Range, Unit, find
 from apc.frame.overrides import Override, apply, check_bounds
 from apc.frame.parameters import exact_numbers, scope_of
 from apc.frame.site import LinearSite
@@ -80,7 +80,7 @@ def parse_range(system: CompiledSystem, text: str) -> Range:
             raise _malformed(text)
         low, high = option_values(name, parameter.unit, (first, last), _PLACE)
     _check_limits(parameter, low, high, name)
-    return Range(free, parameter.unit, low, high)
+    return Range(free, Unit.of(parameter), low, high)
 
 
 def _malformed(text: str) -> ApcError:

@@ -22,7 +22,7 @@ from apc.compiler.crowd import peers_of, recounted
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
 from apc.compiler.language.evaluation import exact_value
 from apc.compiler.words import with_unit
-from apc.frame.names import GIVEN, OVERRIDE, Free, find, unit_of
+from apc.frame.names import GIVEN, OVERRIDE, Free, Unit, as_shown, find, unit_of
 from apc.frame.parameters import Scope, columns_of, scope_of
 
 N = TypeVar("N", Parameter, Timing)
@@ -218,7 +218,8 @@ def check_bounds(
     low, high, value = parameter.minimum, parameter.maximum, parameter.value
 
     def told(number: float) -> str:
-        return with_unit(f"{number:g}", parameter.unit)
+        by, unit = as_shown(number, Unit.of(parameter))
+        return with_unit(f"{number * by:g}", unit)
 
     def out(expected: str, number: float) -> None:
         mistakes.add(code, place, name, expected=f"{expected} {told(number)}", got=told(value))

@@ -22,7 +22,7 @@ from apc.compiler.compiled import (
     counts_peers,
     group_count,
 )
-from apc.frame.names import Free, is_named, named_times, parameter_of, values_by_group
+from apc.frame.names import Free, Unit, is_named, named_times, parameter_of, values_by_group
 from apc.frame.parameters import columns_of
 from apc.result import Result
 
@@ -99,7 +99,7 @@ def _span(system: CompiledSystem, group: Group, parameter: Parameter) -> tuple[f
 def _number(one: Parameter, name: str, low: float, high: float) -> Settable:
     about = one.about
     return Settable(
-        name, low, high, one.unit, one.minimum, one.open_minimum, one.maximum, _text(one), "", about
+        name, low, high, Unit.of(one), one.minimum, one.open_minimum, one.maximum, _text(one), "", about
     )
 
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apc.compiler.words import counted, known_digits, measured, with_unit, wrapped
+from apc.compiler.words import counted, known_digits, wrapped
 from apc.present.forms import (
     MEANT,
     Lines,
@@ -29,7 +29,9 @@ from apc.present.forms import (
     radius_text,
     reached,
     record,
+    span,
     table,
+    uncertain,
 )
 from apc.present.pictures import COLOURS, new_figure
 from apc.tables import Column, Row, Tabled
@@ -176,16 +178,13 @@ def _varied(one: Scheme, key: str, feet: dict[str, int]) -> tuple[str, str]:
 
 def _reach(found: Critical) -> str:
     """Return in words how far a scene is stable."""
-    low, high = (f"{one:.6g}" for one in found.scanned)
     if found.value is None:
         if not found.enters:
             return f"{found.verdict.partition(' ')[0]} whatever it is"
         if found.verdict.startswith("stable"):
-            return f"none up to {with_unit(high, found.unit)}"
-        return f"{found.verdict.partition(' ')[0]} from {low} to {with_unit(high, found.unit)}"
-    value = quantity(found.value, found.unit, 15)
-    if found.error:
-        value = measured(found.value, found.error, found.unit)
+            return f"none up to {quantity(found.scanned[1], found.unit)}"
+        return f"{found.verdict.partition(' ')[0]} from {span(*found.scanned, found.unit)}"
+    value = uncertain(found.value, found.error or 0.0, found.unit).removesuffix(", exact")
     return value if found.stable_side == "below" else f"{value}, stable above it"
 
 

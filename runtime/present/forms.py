@@ -2,7 +2,7 @@
 
 Takes: frozen values, texts.
 Gives: `Plain`, `document`, `record`, `picked`, `reached`, `json_text`; `radius_text`, `quantity`,
-`axis_label`, `listed`; `Lines`, `notes`, `sentences`, `labelled`, `table`; `MEANT`.
+`uncertain`, `span`, `axis_label`, `listed`; `Lines`, `notes`, `sentences`, `labelled`, `table`; `MEANT`.
 Guarantees: a document is made of what JSON has words for; the same value gives the same text; a line is at
 most 80 columns wide where its words allow it.
 Does not: know a result.
@@ -18,6 +18,7 @@ from fractions import Fraction
 from typing import Any
 
 from apc.compiler.words import measured, with_unit, wrapped
+from apc.frame.names import as_shown
 from apc.later import Later
 from apc.result import Result
 
@@ -125,14 +126,21 @@ def radius_text(radius: float, error: float, beyond: tuple[float, float] | None 
 
 
 def quantity(value: float, unit: str, digits: int = 6) -> str:
-    """Return a number to so many digits with its unit, a time below a second in ms."""
+    """Return a number in SI to so many digits with the unit in which people are shown it."""
     by, shown = as_shown(value, unit)
     return with_unit(f"{value * by:.{digits}g}", shown)
 
 
-def as_shown(value: float, unit: str) -> tuple[float, str]:
-    """Return what a number is multiplied by to be shown, and the unit it then has: ms of a time below 1 s."""
-    return (1e3, "ms") if unit == "s" and 0 < abs(value) < 1 else (1.0, unit)
+def uncertain(value: float, error: float, unit: str) -> str:
+    """Return a number in SI with its error, in the unit in which people are shown it."""
+    by, shown = as_shown(value, unit)
+    return measured(value * by, error * by, shown) if error else f"{quantity(value, unit, 15)}, exact"
+
+
+def span(low: float, high: float, unit: str) -> str:
+    """Return what lies between two numbers in SI, with their unit behind both; as `quantity` does."""
+    by, shown = as_shown(max(abs(low), abs(high)), unit)
+    return with_unit(f"{low * by:.6g} to {high * by:.6g}", shown)
 
 
 def axis_label(name: str, unit: str) -> str:

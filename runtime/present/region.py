@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.words import counted, known_digits, measured, with_unit
+from apc.compiler.words import counted, known_digits, measured
+from apc.frame.names import as_shown
 from apc.present.analysis import range_document
-from apc.present.forms import MEANT, Lines, Plain, notes, picked, quantity, sentences, table
+from apc.present.forms import MEANT, Lines, Plain, notes, picked, quantity, sentences, span, table
 from apc.present.region_picture import panel_letter, panels_picture, region_picture  # noqa: F401 -- looked up
 from apc.tables import Column, Row, Tabled
 
@@ -33,7 +34,7 @@ MOST_CURVES = 12
 def region_text(found: Region) -> Lines:
     """Yield what `apc region` prints of one region."""
     axes = [
-        (letter, one.free.label, with_unit(f"{float(one.low):.6g} to {float(one.high):.6g}", one.unit))
+        (letter, one.free.label, span(float(one.low), float(one.high), one.unit))
         for letter, one in (("x", found.x), ("y", found.y))
     ]
     off, percent = found.stable_area_error, 100 / float(found.rectangle.width.prod())
@@ -47,7 +48,7 @@ def region_text(found: Region) -> Lines:
     if found.curves:
         yield ""
         rows = [("boundary", "frequency [Hz]", "from (x, y)", "to (x, y)", "error")]
-        yield from table([*rows, *map(_row, found.curves[:MOST_CURVES])])
+        yield from table([*rows, *(_row(found, curve) for curve in found.curves[:MOST_CURVES])])
         left = len(found.curves) - MOST_CURVES
         if left > 0:
             yield f"  and {left} more (--json lists all)"
@@ -77,16 +78,19 @@ def _words(found: Region) -> str:
     return "stable in the whole rectangle" if found.corner else "stable nowhere in the rectangle"
 
 
-def _row(curve: Curve) -> tuple[str, ...]:
+def _row(found: Region, curve: Curve) -> tuple[str, ...]:
     low, high = (f"{one:.4g}" for one in curve.frequency_hz)
-    span = "–" if low == "nan" else low if low == high else f"{low} to {high}"
-    end = "closed" if curve.closed else _point(curve, -1)
-    return f"{curve.mode:.11}", span, _point(curve, 0), end, f"{curve.error:.0e}"
+    frequency = "–" if low == "nan" else low if low == high else f"{low} to {high}"
+    end = "closed" if curve.closed else _point(found, curve, -1)
+    return f"{curve.mode:.11}", frequency, _point(found, curve, 0), end, f"{curve.error:.0e}"
 
 
-def _point(curve: Curve, place: int) -> str:
-    """Return a point of a curve, whose error is relative to each coordinate."""
-    return "({}, {})".format(*(known_digits(one, curve.error * abs(one), 6) for one in curve.points[place]))
+def _point(found: Region, curve: Curve, place: int) -> str:
+    """Return a point of a curve in the units of the axes; its error is relative to each coordinate."""
+    by = [as_shown(float(axis.high), axis.unit)[0] for axis in (found.x, found.y)]
+    return "({}, {})".format(
+        *(known_digits(one, curve.error * abs(one), 6) for one in curve.points[place] * by)
+    )
 
 
 def region_document(found: Region) -> Plain:

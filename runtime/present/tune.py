@@ -17,10 +17,10 @@ import numpy as np
 
 from apc.compiler.compiled import LENGTH
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.words import counted, enumerated, in_hertz, measured, with_unit, wrapped
+from apc.compiler.words import counted, enumerated, in_hertz, wrapped
 from apc.frame.overrides import Override, apply
 from apc.present.analysis import range_document, range_text
-from apc.present.forms import MEANT, Lines, Plain, labelled, notes, quantity, record, table
+from apc.present.forms import MEANT, Lines, Plain, labelled, notes, quantity, record, span, table, uncertain
 from apc.present.pictures import COLOURS, legend_below, new_figure
 from apc.present.region_picture import draw_panel
 from apc.regions.panels import Panel
@@ -53,14 +53,14 @@ def tuning_text(found: Tuning) -> Lines:
             one.parameter,
             quantity(float(one.value), one.unit, TYPED),
             quantity(one.best, one.unit),
-            with_unit(f"{one.low:.6g} to {one.high:.6g}", one.unit),
+            span(one.low, one.high, one.unit),
         )
         for one in found.gains
     ]
     yield from table(rows)
     if found.met or found.proofs:
         yield ""
-    value = measured(found.best, found.error, found.unit)
+    value = uncertain(found.best, found.error, found.unit)
     if _is_felt(found):  # found without knowing how far any better one may be
         value = quantity(found.best, found.unit, BUYS + 1)
     better = f"no gains in these ranges do better by {100 * float(SHARE):.3g} %"

@@ -15,19 +15,21 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
-from apc.compiler.words import counted, in_hertz, known_digits, measured, with_unit, wrapped
+from apc.compiler.words import counted, in_hertz, known_digits, with_unit, wrapped
+from apc.frame.names import as_shown
 from apc.optional import need
 from apc.present.forms import (
     MEANT,
     Lines,
     Plain,
-    as_shown,
     document,
     notes,
     quantity,
     record,
     sentences,
+    span,
     table,
+    uncertain,
 )
 
 if TYPE_CHECKING:
@@ -36,7 +38,6 @@ if TYPE_CHECKING:
     from apc.frame.settable import Parameters, Settable
     from apc.sweeps.sweep import Sweep
     from apc.vary.critical import Critical
-    from apc.vary.crossing import Crossing
     from apc.vary.many import Analyses
     from apc.vary.margins import Margins
     from apc.vary.sensitivity import Sensitivities
@@ -77,10 +78,7 @@ def critical_text(found: Critical) -> Lines:
         yield from _count_lines(found)
         return
     for one in found.crossings:
-        exact = f"{quantity(one.value, unit, 15)}, exact"
-        by, shown = as_shown(one.value, unit)
-        value = measured(one.value * by, one.error * by, shown) if one.error else exact
-        yield f"  {value}"
+        yield f"  {uncertain(one.value, one.error, unit)}"
         kind = "jump, " if one.kind == "jump" else ""
         turns = "" if math.isnan(one.frequency_hz) else f", {in_hertz(one.frequency_hz)}"
         yield f"    {kind}stable {one.stable_side} it{turns}, {one.proof}"
@@ -105,7 +103,8 @@ def _stable_ranges(found: Critical) -> str:
         if found.counted:
             value = f"{math.floor(one.boundary) + (one.stable_side == 'above'):,d}"
         else:
-            value = quantity(_on_stable_side(one), found.unit)
+            by, shown = as_shown(one.value, found.unit)
+            value = with_unit(f"{_on_stable_side(one.value * by, one.error * by, one.stable_side):g}", shown)
         if one.stable_side == "above":
             begin = value
             continue
@@ -116,15 +115,14 @@ def _stable_ranges(found: Critical) -> str:
     return f"stable with {found.parameter} {', and '.join(ranges)}" if ranges else ""
 
 
-def _on_stable_side(crossing: Crossing) -> float:
+def _on_stable_side(value: float, error: float, side: str) -> float:
     """Return a crossing as far inside as its error, to no digit that the error hides."""
-    inward = -crossing.error if crossing.stable_side == "below" else crossing.error
+    inward = -error if side == "below" else error
     if not math.isfinite(inward):
-        return crossing.value
-    known = Decimal(crossing.value).adjusted() - Decimal(crossing.error).adjusted() if inward else SHOWN
-    rounding = ROUND_FLOOR if crossing.stable_side == "below" else ROUND_CEILING
-    context = Context(min(max(known, 1), SHOWN), rounding)
-    return float(context.create_decimal_from_float(crossing.value + inward))
+        return value
+    known = Decimal(value).adjusted() - Decimal(error).adjusted() if inward else SHOWN
+    context = Context(min(max(known, 1), SHOWN), ROUND_FLOOR if side == "below" else ROUND_CEILING)
+    return float(context.create_decimal_from_float(value + inward))
 
 
 def _span(ends: tuple[float, float], unit: str) -> str:
@@ -280,7 +278,7 @@ def sweep_text(found: Sweep) -> Lines:
     yield f"{found.topology}: {found.points:,} points{where}"
     yield from notes(*found.made_of["left_out"])
     for axis in found.grid.axes:
-        ends = with_unit(f"{float(axis.values[0]):g} … {float(axis.values[-1]):g}", axis.unit)
+        ends = span(float(axis.values[0]), float(axis.values[-1]), axis.unit)
         yield f"  {axis.free.label}: {ends}, {counted(len(axis.values), 'value')}"
     yield from _verdict_lines(found.counts, found.messages)
     yield from (f"  note: {one}" for one in found.notes)
@@ -314,12 +312,13 @@ def parameters_text(found: Parameters) -> Lines:
 def _value(one: Settable) -> str:
     if one.low == one.high:
         return quantity(one.low, one.unit, 9)
-    return with_unit(f"{one.low:.4g} to {one.high:.4g}", one.unit)
+    return span(one.low, one.high, one.unit)
 
 
 def _limits(one: Settable) -> str:
-    low = "" if one.minimum is None else f"{'>' if one.open_minimum else '≥'} {one.minimum:.9g}"
-    high = "" if one.maximum is None else f"≤ {one.maximum:.9g}"
+    by, _ = as_shown(max(abs(one.low), abs(one.high)), one.unit)
+    low = "" if one.minimum is None else f"{'>' if one.open_minimum else '≥'} {one.minimum * by:.9g}"
+    high = "" if one.maximum is None else f"≤ {one.maximum * by:.9g}"
     return ", ".join(limit for limit in (low, high) if limit)
 
 

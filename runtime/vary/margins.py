@@ -26,7 +26,7 @@ from apc.eigen.modes import arrange
 from apc.eigen.peers import states_of
 from apc.eigen.spectrum import DRIFTS, finite
 from apc.finite_equations import finite_equations
-from apc.frame.names import Free, named_times, parameter_of, unit_of, value_now
+from apc.frame.names import Free, Unit, named_times, parameter_of, unit_of, value_now
 from apc.result import Result
 from apc.threads import single_threaded
 from apc.vary.crossing import ESTIMATE, Crossing, search
@@ -208,7 +208,7 @@ def _along(system: CompiledSystem, free: Free, line: MatrixLine | AnalysedLine |
     if not found.enters:
         return None
     lost = [one for one in found.edges if one.stable_side == "below"]
-    present, unit = value_now(system, free), parameter_of(system, free).unit
+    present, unit = value_now(system, free), Unit.of(parameter_of(system, free))
     return _margin(free.label, unit, present, lost[0] if lost else None, found.scanned[1])
 
 

@@ -27,7 +27,7 @@ from apc.eigen.eigenpairs import driving_parts, eigenpairs
 from apc.eigen.modes import split
 from apc.eigen.spectrum import solve_spectrum
 from apc.finite_equations import finite_equations
-from apc.frame.names import Free, parameter_of
+from apc.frame.names import Free, Unit, parameter_of
 from apc.network.nominal import channel_numbers
 from apc.result import Result
 from apc.threads import single_threaded
@@ -198,7 +198,7 @@ def _rows(system: CompiledSystem, free: Free, one: _Cluster, column: int, first:
     return [
         Sensitivity(
             parameter=free.label,
-            unit=parameter.unit,
+            unit=Unit.of(parameter),
             value=parameter.value,
             derivative=rate,
             relative=rate * parameter.value,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import inspect
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
@@ -49,6 +50,23 @@ def test_setting_changes_a_copy_and_is_as_good_as_writing(model: apc.CompiledSys
     path.write_text(replaced(text, ("500 N/m,", "5 N/mm,"), ("delay: 8 ms", "delay: 16 ms")), "utf-8")
     assert apc.analyze(changed) == apc.analyze(model, set=settings) == apc.analyze(path)
     assert apc.analyze(changed).verdict == "unstable"
+
+
+def test_people_read_the_scene_s_own_units_and_programs_si(model: apc.CompiledSystem) -> None:
+    own = compiled(replaced(AVERAGE, ("500 N/m,", "0.5 N/mm,"), ("mass: 0.1 kg", "mass: 100 g")))
+    stiffness, mass = "coordination.stiffness", "device.mass"
+    axes = {"x": f"{stiffness}=0 N/m:2000 N/m", "y": f"{mass}=0.05 kg:0.2 kg"}
+    for ask, said in (
+        (lambda scene: apc.critical(scene, stiffness), "below 1.09641 N/mm\n"),
+        (lambda scene: apc.critical(scene, mass), "is now 100 g\n"),
+        (lambda scene: apc.parameters(scene), "0.5 N/mm "),
+        (lambda scene: apc.region(scene, **axes), f"{mass}             50 to 200 g"),
+        (lambda scene: apc.prove_box(scene, {mass: "±5%"}), f"{mass} from 95 g to 105 g"),
+    ):
+        found = ask(own)
+        assert said in str(found), str(found)
+        plain, same = (json.dumps(one.to_dict() | {"origin": None}) for one in (found, ask(model)))
+        assert plain == same
 
 
 def test_results_are_frozen_and_plain_data(model: apc.CompiledSystem) -> None:
