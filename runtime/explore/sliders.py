@@ -22,7 +22,7 @@ from apc.compiler.compiled import CompiledSystem, group_count
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import with_unit
 from apc.frame.linearize import start_names
-from apc.frame.names import Free, Range, named_times, parameter_of, unit_of
+from apc.frame.names import Free, Range, as_shown, named_times, parameter_of, unit_of
 from apc.frame.overrides import Override, parse_override
 from apc.vary.evaluator import free_parameters
 from apc.vary.margins import STIFFNESSES, coupler_parameters
@@ -114,10 +114,9 @@ def _slider(
 
 
 def text_of(value: Fraction, unit: str) -> str:
-    """Return a value as `--set` takes it; a time in milliseconds."""
-    if unit == "s":
-        return f"{_digits(value * 1000)} ms"
-    return with_unit(_digits(value), unit)
+    """Return a value as `--set` takes it, in the unit in which people are shown it."""
+    by, shown = as_shown(float(value), unit)
+    return with_unit(_digits(value * by), shown)
 
 
 def _digits(value: Fraction) -> str:

@@ -62,7 +62,7 @@ class Unit(str):
         return cls(parameter.unit, parameter.display_unit)
 
 
-def as_shown(value: float, unit: str) -> tuple[float, str]:
+def as_shown(value: float, unit: str) -> tuple[Fraction, str]:
     """Return what a number in SI is multiplied by to be shown, and the unit it then has.
 
     That is the unit in which the scene writes it; without one a time below 1 s is shown in ms.
@@ -72,8 +72,8 @@ def as_shown(value: float, unit: str) -> tuple[float, str]:
         # Imported here: the language of quantities, which a scene in SI never needs.
         from apc.compiler.language.units import parse_unit
 
-        return float(1 / parse_unit(display, OVERRIDE).scale), display
-    return (1e3, "ms") if unit == "s" and 0 < abs(value) < 1 else (1.0, unit)
+        return 1 / parse_unit(display, OVERRIDE).scale, display
+    return (Fraction(1000), "ms") if unit == "s" and 0 < abs(value) < 1 else (Fraction(1), unit)
 
 
 @dataclass(frozen=True, slots=True)

@@ -87,7 +87,7 @@ def _row(found: Region, curve: Curve) -> tuple[str, ...]:
 
 def _point(found: Region, curve: Curve, place: int) -> str:
     """Return a point of a curve in the units of the axes; its error is relative to each coordinate."""
-    by = [as_shown(float(axis.high), axis.unit)[0] for axis in (found.x, found.y)]
+    by = [float(as_shown(float(axis.high), axis.unit)[0]) for axis in (found.x, found.y)]
     return "({}, {})".format(
         *(known_digits(one, curve.error * abs(one), 6) for one in curve.points[place] * by)
     )
