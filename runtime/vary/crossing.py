@@ -57,8 +57,8 @@ HALF, WIDER, TRIES = 1e-13, 4.0, 24
 # The same where no more is wanted than where stability is first lost: floats mostly hold it.
 FIRST_HALF = 1e-10
 
-# Steps of Newton's method.
-NEWTON = 12
+# Steps of Newton's method, and how much longer than what is wanted its last may be: it squares what is off.
+NEWTON, LAST_STEP = 12, 1e3
 
 # A bracket this wide, relative to the value, with one verdict on both sides has no crossing.
 NOWHERE = 1e-6
@@ -387,7 +387,7 @@ def _crossing(
     relative to the value.
     """
     low, high = ends
-    value = _root(stretch, ends, growth)
+    value = _root(stretch, ends, growth, half)
     side = "below" if rising else "above"
     width = half * (abs(value) or high - low)
     for _ in range(TRIES):
@@ -418,8 +418,11 @@ def _crossing(
     return Crossing(value, min(width, high - low), side, grows.frequency_hz, "crossing", ESTIMATE)
 
 
-def _root(stretch: Stretch, ends: Sequence[float], growth: Sequence[float]) -> float:
-    """Return where floats see the largest magnitude pass 1: by Newton's method, or else by Brent's."""
+def _root(stretch: Stretch, ends: Sequence[float], growth: Sequence[float], off: float) -> float:
+    """Return where floats see the largest magnitude pass 1, off by so much relatively.
+
+    By Newton's method, whose last step squares what it was off by, or else by Brent's.
+    """
 
     def at(value: float) -> tuple[float, float]:
         found = _sampled(stretch, np.array([value]))
@@ -436,11 +439,11 @@ def _root(stretch: Stretch, ends: Sequence[float], growth: Sequence[float]) -> f
         new = value - height / rate if rate else math.nan
         if not low <= new <= high:
             break
-        if abs(new - value) <= HALF * abs(new):
+        if abs(new - value) <= LAST_STEP * off * abs(new):
             return new
         value = new
     if at(low)[0] * at(high)[0] >= 0:  # an end lies on the circle as far as floats know
         return min(low, high, key=lambda end: abs(at(end)[0]))
     # Imported where Newton's method fails: it takes as long as an analysis.
     brentq = load_pool("scipy.optimize").brentq
-    return float(brentq(lambda value: at(value)[0], low, high, xtol=5e-324, rtol=1e-15))
+    return float(brentq(lambda value: at(value)[0], low, high, xtol=5e-324, rtol=max(off / 2, 1e-15)))
