@@ -1,8 +1,8 @@
 """What a person calls a parameter or a timing, and what stands behind the name.
 
 Takes: a `CompiledSystem` and a name such as `contact.stiffness`, `right.hand.force` or `links.lan.delay`.
-Gives: `Unit`, `as_shown`, `Free`, `Range`, `proposed_range`, `find`, `is_named`, `named_times`,
-`parameter_of`, `value_now`, `unit_of`, `values_by_group`, `notes_for_all_groups`.
+Gives: `Free`, `Range`, `proposed_range`, `find`, `is_named`, `named_times`, `parameter_of`, `value_now`,
+`unit_of`, `values_by_group`, `notes_for_all_groups`.
 Guarantees: a name that means nothing raises, with the nearest real one.
 Does not: read or change values.
 """
@@ -25,6 +25,7 @@ from apc.compiler.compiled import (
 )
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.words import with_unit
+from apc.frame.units import Unit
 
 # The sections of a topology, which a name may start with.
 SECTIONS = ("clocks", "couplers", "hands", "links", "masses", "parameters")
@@ -40,40 +41,6 @@ HELD = ("hand.mass", "hand.damping", "hand.stiffness")
 
 # Where a mistake in an override stands, when it came from no line of a file.
 OVERRIDE = Place("--set")
-
-
-class Unit(str):
-    """A unit in SI by its text, with the unit in which people are shown a value: the one the scene uses.
-
-    Results hold values in SI and this unit, so that plain data is in SI; texts convert by `as_shown`.
-    """
-
-    display: str
-
-    def __new__(cls, text: str, display: str = "") -> Unit:
-        """Return the unit; one without a unit for display is shown as it is."""
-        unit = super().__new__(cls, text)
-        unit.display = display
-        return unit
-
-    @classmethod
-    def of(cls, parameter: Parameter) -> Unit:
-        """Return the unit of a parameter."""
-        return cls(parameter.unit, parameter.display_unit)
-
-
-def as_shown(value: float, unit: str) -> tuple[Fraction, str]:
-    """Return what a number in SI is multiplied by to be shown, and the unit it then has.
-
-    That is the unit in which the scene writes it; without one a time below 1 s is shown in ms.
-    """
-    display = getattr(unit, "display", "")
-    if display and display != unit:
-        # Imported here: the language of quantities, which a scene in SI never needs.
-        from apc.compiler.language.units import parse_unit
-
-        return 1 / parse_unit(display, OVERRIDE).scale, display
-    return (Fraction(1000), "ms") if unit == "s" and 0 < abs(value) < 1 else (Fraction(1), unit)
 
 
 @dataclass(frozen=True, slots=True)

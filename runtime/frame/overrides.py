@@ -22,8 +22,9 @@ from apc.compiler.crowd import peers_of, recounted
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
 from apc.compiler.language.evaluation import exact_value
 from apc.compiler.words import with_unit
-from apc.frame.names import GIVEN, OVERRIDE, Free, Unit, as_shown, find, unit_of
+from apc.frame.names import GIVEN, OVERRIDE, Free, find, unit_of
 from apc.frame.parameters import Scope, columns_of, scope_of
+from apc.frame.units import Unit, as_shown
 
 N = TypeVar("N", Parameter, Timing)
 

@@ -22,8 +22,9 @@ from apc.compiler.compiled import (
     counts_peers,
     group_count,
 )
-from apc.frame.names import Free, Unit, is_named, named_times, parameter_of, values_by_group
+from apc.frame.names import Free, is_named, named_times, parameter_of, values_by_group
 from apc.frame.parameters import columns_of
+from apc.frame.units import Unit
 from apc.result import Result
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.words import counted, known_digits, measured
-from apc.frame.names import as_shown
+from apc.frame.units import as_shown
 from apc.present.analysis import range_document
 from apc.present.forms import MEANT, Lines, Plain, notes, picked, quantity, sentences, span, table
 from apc.present.region_picture import panel_letter, panels_picture, region_picture  # noqa: F401 -- looked up

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from numpy.typing import NDArray
 
 from apc.compiler.words import counted, in_hertz, known_digits, with_unit, wrapped
-from apc.frame.names import as_shown
+from apc.frame.units import as_shown
 from apc.optional import need
 from apc.present.forms import (
     MEANT,

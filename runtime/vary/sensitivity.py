@@ -27,7 +27,8 @@ from apc.eigen.eigenpairs import driving_parts, eigenpairs
 from apc.eigen.modes import split
 from apc.eigen.spectrum import solve_spectrum
 from apc.finite_equations import finite_equations
-from apc.frame.names import Free, Unit, parameter_of
+from apc.frame.names import Free, parameter_of
+from apc.frame.units import Unit
 from apc.network.nominal import channel_numbers
 from apc.result import Result
 from apc.threads import single_threaded
