@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,25 +115,26 @@ def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -
         systems = split(*lifted_groups(system, prepared=start))
         most = solve_spectrum(systems, in_balls=False).spectral_radius + SHARED
 
-        def clusters_of(together: Sequence[Free]) -> list[_Cluster] | None:
+        @cache
+        def clusters_of(*together: Free) -> list[_Cluster] | None:
             found = _clusters(system, together, start)
             # Equations have edges that points step over.
             return _clusters(system, together, prepared) if found is None and start is not prepared else found
 
-        def frees(together: Sequence[Free]) -> bool:
+        def frees(*together: Free) -> bool:
             """Say whether something that is rigid in the scene as it is moves where these vary."""
-            return any(np.abs(one.values).max() > most for one in clusters_of(together) or ())
+            return any(np.abs(one.values).max() > most for one in clusters_of(*together) or ())
 
         zero = [one for one in free if not parameter_of(system, one).value]
         rest = [one for one in free if one not in zero]
-        loose = [one for one in zero if frees([one])]
-        loose += [one for one in rest if frees([one])] if frees(rest) else []
+        loose = [one for one in zero if frees(one)]
+        loose += [one for one in rest if frees(one)] if frees(*rest) else []
         listed = [[one for one in rest if one not in loose], *([one] for one in zero if one not in loose)]
         rows: list[Sensitivity] = []
         clusters: list[_Cluster] = []
         notes, untied = [], [one.label for one in loose]
         for together in listed:
-            found = clusters_of(together)
+            found = clusters_of(*together)
             if found is None:
                 return Sensitivities(0.0, (), (), NO_MATRIX)
             clusters, first = clusters or found, 0

@@ -48,8 +48,8 @@ SAME = 1e-9
 # Eigenvalues of the truth that differ by more differ.
 APART = 1e-30
 
-# What rounding may do to a derivative, of which three digits are printed, relative to it and to the radius, at
-# least so much, over the value: as many digits are lost as the condition of its eigenvalue has.
+# What rounding may do to a derivative, of which three digits are printed, relative to it and to the radius,
+# at least so much, over the value: as many digits are lost as the condition of its eigenvalue has.
 ROUNDED, LEAST = 1e-7, 1e-3
 
 # What is left of modes smaller than this at a frame's end drowns; radians that an angle may be off by.
