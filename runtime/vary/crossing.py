@@ -57,8 +57,8 @@ HALF, WIDER, TRIES = 1e-13, 4.0, 24
 # The same where no more is wanted than where stability is first lost: floats mostly hold it.
 FIRST_HALF = 1e-10
 
-# Steps of Newton's method, and how much longer than what is wanted its last may be: it squares what is off.
-NEWTON, LAST_STEP = 12, 1e3
+# Steps of Newton's method.
+NEWTON = 12
 
 # A bracket this wide, relative to the value, with one verdict on both sides has no crossing.
 NOWHERE = 1e-6
@@ -419,10 +419,7 @@ def _crossing(
 
 
 def _root(stretch: Stretch, ends: Sequence[float], growth: Sequence[float], off: float) -> float:
-    """Return where floats see the largest magnitude pass 1, off by so much relatively.
-
-    By Newton's method, whose last step squares what it was off by, or else by Brent's.
-    """
+    """Return where floats see the largest magnitude pass 1, off by so much: by Newton's method, or Brent's."""
 
     def at(value: float) -> tuple[float, float]:
         found = _sampled(stretch, np.array([value]))
@@ -439,7 +436,7 @@ def _root(stretch: Stretch, ends: Sequence[float], growth: Sequence[float], off:
         new = value - height / rate if rate else math.nan
         if not low <= new <= high:
             break
-        if abs(new - value) <= LAST_STEP * off * abs(new):
+        if abs(new - value) <= off * abs(new):
             return new
         value = new
     if at(low)[0] * at(high)[0] >= 0:  # an end lies on the circle as far as floats know
