@@ -419,7 +419,7 @@ def _crossing(
 
 
 def _root(stretch: Stretch, ends: Sequence[float], growth: Sequence[float], off: float) -> float:
-    """Return where floats see the largest magnitude pass 1, off by so much: by Newton's method, or Brent's."""
+    """Return where floats see the largest magnitude pass 1, off by so much; by Newton's or Brent's method."""
 
     def at(value: float) -> tuple[float, float]:
         found = _sampled(stretch, np.array([value]))
