@@ -122,7 +122,7 @@ def read_archive(path: Path) -> Archive:
         name = made_from.topology
         if name in ("", "..") or PurePath(name).name != name or name not in dict(made_from.texts):
             raise ValueError
-        numbers = (one for change in made_from.changes for one in change)
+        numbers = (pair for change in made_from.changes for pair in change)
         if not all(name == HANDS_CHANGE or _RATIONAL.fullmatch(value) for name, value in numbers):
             raise ValueError
     except (ValueError, RecursionError):  # what is nested too deeply

@@ -50,8 +50,8 @@ def with_heard(groups: Sequence[Group], kinds: Sequence[Kind], links: Sequence[L
     heard = {count_of(link.name): _heard(link, groups, kinds) for link in links}
     found = []
     for place, group in enumerate(groups):
-        values = [one for one in group.values if one.name not in heard]
-        columns = [one for one in group.columns if one.name not in heard]
+        values = [value for value in group.values if value.name not in heard]
+        columns = [column for column in group.columns if column.name not in heard]
         for name, by_group in heard.items():
             if name in kinds[group.kind].parameters:
                 number = by_group[place]
@@ -75,7 +75,7 @@ def _heard(
     counts = [group.count for group in groups]
     peers, shape = sum(counts), link.graph.shape
     if shape == "complete":
-        sends = [any(one.link == link.name for one in kinds[group.kind].sends) for group in groups]
+        sends = [any(send.link == link.name for send in kinds[group.kind].sends) for group in groups]
         total = sum(itertools.compress(counts, sends))
         return [Fraction(total - does) for does in sends]
     heard = np.full(peers, min(2, peers - 1) if shape == "ring" else 1, dtype=object)
@@ -84,7 +84,7 @@ def _heard(
     if shape == "arcs":
         heard = heard_sums(link, peers)
     parts = np.split(heard, np.cumsum(counts)[:-1])
-    return [Fraction(one[0]) if np.all(one == one[0]) else one.astype(np.float64) for one in parts]
+    return [Fraction(part[0]) if np.all(part == part[0]) else part.astype(np.float64) for part in parts]
 
 
 def recounted(system: CompiledSystem, counts: Mapping[str, Fraction], place: Place) -> CompiledSystem:
@@ -112,7 +112,7 @@ def recounted(system: CompiledSystem, counts: Mapping[str, Fraction], place: Pla
     groups = [replace(group, count=int(counts[group.name])) for group in system.groups]
     for group in system.groups:
         count, name = counts[group.name], group_count(group.name)
-        own = [one.name for one in group.columns if one.name not in others]
+        own = [column.name for column in group.columns if column.name not in others]
         with mistakes:
             if count == group.count:
                 continue
@@ -136,8 +136,8 @@ def recounted(system: CompiledSystem, counts: Mapping[str, Fraction], place: Pla
         system,
         groups=with_heard(groups, system.kinds, system.links),
         parameters=tuple(
-            replace(one, value=float(others[one.name])) if one.name in others else one
-            for one in system.parameters
+            replace(parameter, value=float(others[parameter.name])) if parameter.name in others else parameter
+            for parameter in system.parameters
         ),
     )
 

@@ -172,7 +172,10 @@ class Mistakes:
         """All mistakes in file order."""
         any_name = "|".join(map(re.escape, self.names)) or "(?!)"  # without names, nothing
         named = re.compile(rf"(?<!\w)({any_name})(?!\w)")
-        once = {(one.place, one.code, named.sub("…", one.sentence)): one for one in reversed(self._found)}
+        once = {
+            (mistake.place, mistake.code, named.sub("…", mistake.sentence)): mistake
+            for mistake in reversed(self._found)
+        }
         return tuple(sorted(once.values(), key=lambda mistake: (mistake.place, mistake.code)))
 
     def raise_if_any(self) -> None:

@@ -208,10 +208,10 @@ def _raise(error: OSError) -> None:
     raise error
 
 
-def same_file(one: Path, other: Path) -> bool:
+def same_file(path: Path, other: Path) -> bool:
     """Return whether two paths lead to one file that exists."""
     with suppress(OSError, ValueError):
-        return one.samefile(other)
+        return path.samefile(other)
     return False
 
 

@@ -39,7 +39,7 @@ class Interpolation:
     def value(self, at: Any, number: Callable[[float], Any] = float) -> Any:
         """Return what the table says at a number of some kind, which a float is turned into by `number`."""
         place = bisect.bisect_right(self.times, float(at))
-        low, start = (number(float(one[max(place - 1, 0)])) for one in (self.numbers, self.times))
+        low, start = (number(float(values[max(place - 1, 0)])) for values in (self.numbers, self.times))
         return low + self.slope(at, number) * (at - start) if 0 < place < len(self.times) else low
 
     def slope(self, at: Any, number: Callable[[float], Any] = float) -> Any:
@@ -48,7 +48,9 @@ class Interpolation:
         if place in (0, len(self.times)):
             return number(0.0)
         columns = self.times, self.numbers
-        (start, end), (low, high) = (map(number, one[place - 1 : place + 1].tolist()) for one in columns)
+        (start, end), (low, high) = (
+            map(number, column[place - 1 : place + 1].tolist()) for column in columns
+        )
         return (high - low) / (end - start)
 
     def values(self, at: Any) -> Any:
@@ -81,10 +83,10 @@ def function_of(table: Interpolation) -> Any:
 
 def table_of(function: Any) -> Interpolation:
     """Return the table that a function of CasADi's looks up: one of `function_of`, or a derivative of it."""
-    for one in (function, *function.find_functions()):
-        for k in range(one.n_instructions()):
-            if one.instruction_id(k) == casadi.OP_CONST:
-                constant = one.instruction_MX(k).to_DM()
+    for item in (function, *function.find_functions()):
+        for k in range(item.n_instructions()):
+            if item.instruction_id(k) == casadi.OP_CONST:
+                constant = item.instruction_MX(k).to_DM()
                 if constant.size1() == 2:
                     times, numbers = np.asarray(constant)
                     return Interpolation(times, numbers)

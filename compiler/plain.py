@@ -181,7 +181,7 @@ def straight(function: Any) -> PlainFunction:
     }
     called = _called(function, [k for k, code in enumerate(codes) if code == casadi.OP_CALL])
     constants, tables = dict.fromkeys(texts.values()), dict.fromkeys(table for _, table in called.values())
-    number = {one: starts[-1] + place for place, one in enumerate((*constants, *tables))}
+    number = {item: starts[-1] + place for place, item in enumerate((*constants, *tables))}
     work = [0] * function.sz_w()
     operations: list[tuple[Any, ...]] = []
     results = [[0] * function.nnz_out(i) for i in range(function.n_out())]
@@ -219,7 +219,7 @@ def _called(function: Any, calls: Sequence[int]) -> dict[int, tuple[str, Interpo
     known: dict[bytes, Interpolation] = {}  # of equal rows, which are one table
     found = {}
     for k in calls:
-        one = expressions[k].which_function()
-        table = table_of(one)
-        found[k] = one.name(), known.setdefault(table.times.tobytes() + table.numbers.tobytes(), table)
+        item = expressions[k].which_function()
+        table = table_of(item)
+        found[k] = item.name(), known.setdefault(table.times.tobytes() + table.numbers.tobytes(), table)
     return found

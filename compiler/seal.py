@@ -29,7 +29,7 @@ def cache_folder() -> Path | None:
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         if os.name == "posix":
-            everyone = (one.stat() for one in (folder, *folder.resolve().parents))
+            everyone = (path.stat() for path in (folder, *folder.resolve().parents))
             if (
                 folder.is_symlink()
                 or folder.stat().st_uid != os.geteuid()

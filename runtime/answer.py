@@ -253,13 +253,13 @@ def proved_box(
         what = "with every passive hand values are judged one by one, and of ranges that of a link's delay"
         hint = "apc region --hands passive, or apc critical --hands passive"
         raise ApcError(Mistake("E930", Place("--box"), what, hint=hint))
-    if any(is_delay(system, one.free) for one in box):
+    if any(is_delay(system, interval.free) for interval in box):
         at_each = partial(proved_at, passive=passive, cells=cells, inside=inside)
         return prove_over_delay(system, box, at_each, nominal=not passive and not unreliable(system))
     from apc.analysis.box_proof import prove_box
 
     numbers = channel_numbers(system)
-    if unreliable(system) or any(one.free.name in numbers for one in box):
+    if unreliable(system) or any(interval.free.name in numbers for interval in box):
         from apc.moments.mean_square_box import prove_box as prove_over_network
 
         return prove_over_network(system, box, cells=cells)

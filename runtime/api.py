@@ -266,7 +266,7 @@ def critical(
     from apc.vary import critical as crossings
 
     system = _model(model, set)
-    low, high = (None if one is None else _quantity(system, parameter, one) for one in (lower, upper))
+    low, high = (None if item is None else _quantity(system, parameter, item) for item in (lower, upper))
     return crossings.critical(system, parameter, lower=low, upper=high, criterion=criterion)
 
 
@@ -308,7 +308,7 @@ def compare(
     from apc.comparison import comparison
 
     listed = _several(models, "compare")
-    return comparison.compare([_model(one, set) for one in listed], over=over, criterion=criterion, at=at)
+    return comparison.compare([_model(scene, set) for scene in listed], over=over, criterion=criterion, at=at)
 
 
 @checked
@@ -785,8 +785,8 @@ def sweep(
     system = _model(model, set)
     _check_out(model, system, path)
     values = {
-        name: one if isinstance(one, str) else [_quantity(system, name, value) for value in one]
-        for name, one in over.items()
+        name: text if isinstance(text, str) else [_quantity(system, name, value) for value in text]
+        for name, text in over.items()
     }
     return points.sweep(system, values, of=of, criterion=criterion, out=path, jobs=jobs, cluster=cluster)
 
@@ -1024,7 +1024,7 @@ def report(
     from apc.present.report import check_report_path, save_report
     from apc.reports import contents
 
-    paths = [_path(one, "report") for one in _several(files, "report")]
+    paths = [_path(scene, "report") for scene in _several(files, "report")]
     for path in paths:
         if out is not None:
             check_topology_outputs(path, {"out=": Path(out)})

@@ -69,16 +69,16 @@ def _fits(value: Any, hint: Any) -> bool:
     if hint is Any:
         return True
     if origin in (Union, UnionType):
-        return any(_fits(value, one) for one in inner)
+        return any(_fits(value, item) for item in inner)
     if origin is Literal:
         return isinstance(value, str)
     if origin is Mapping:
         return isinstance(value, Mapping) and all(
-            _fits(one, inner[1]) for one in value.values() if isinstance(one, list | tuple)
+            _fits(item, inner[1]) for item in value.values() if isinstance(item, list | tuple)
         )
     if origin is tuple:
         return isinstance(value, tuple | list) and len(value) == len(inner) and all(map(_fits, value, inner))
     if origin in (Sequence, Iterable):
         listed = isinstance(value, Iterable) and not isinstance(value, Mapping | bytes)
-        return listed and (origin is Iterable or all(_fits(one, inner[0]) for one in value))
+        return listed and (origin is Iterable or all(_fits(item, inner[0]) for item in value))
     return isinstance(value, WIDER.get(hint, hint if hint is not None else type(None)))

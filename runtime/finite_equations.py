@@ -44,7 +44,8 @@ def finite_equations(scene: str) -> Iterator[None]:
         yield
     except ApcError as error:
         raise ApcError(
-            replace(one, place=Place(scene)) if one.place == SOMEWHERE else one for one in error.mistakes
+            replace(mistake, place=Place(scene)) if mistake.place == SOMEWHERE else mistake
+            for mistake in error.mistakes
         ) from error
     except (ZeroDivisionError, OverflowError) as error:
         raise _mistake(scene) from error

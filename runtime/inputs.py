@@ -165,12 +165,12 @@ def open_scene(
     from apc.frame.overrides import apply, parse_override
 
     overrides = [parse_override(system, text) for text in settings]
-    for place, one in enumerate(overrides):
-        if any(one.free == other.free for other in overrides[:place]):
-            what = f"{one.free.label} is set twice"
+    for place, override in enumerate(overrides):
+        if any(override.free == other.free for other in overrides[:place]):
+            what = f"{override.free.label} is set twice"
             raise ApcError(Mistake("E621", OVERRIDE, what, "one value", hint=f'--set "{settings[place]}"'))
     if told is not None:
-        for note in notes_for_all_groups(system, [one.free for one in overrides]):
+        for note in notes_for_all_groups(system, [override.free for override in overrides]):
             told(note)
     return apply(system, overrides)
 
@@ -262,7 +262,7 @@ def check_outputs(path: Path, texts: Iterable[str], outputs: Mapping[str, Path |
     def read(file: Path) -> bool:
         # `Path.is_file` raises for a name that is too long, which whoever writes it says.
         is_file = os.path.isfile(file)  # noqa: PTH113 -- see above
-        return is_file and any(same_file(file, one) or _is_below(file, one) for one in named)
+        return is_file and any(same_file(file, path) or _is_below(file, path) for path in named)
 
     given = [(option, output) for option, output in outputs.items() if output is not None]
     for place, (option, output) in enumerate(given):

@@ -44,7 +44,7 @@ def read_arrays(data: bytes, expected: Mapping[str, tuple[str, int]], most: int)
         members = archive.zip.infolist()  # type: ignore[union-attr] # it is None when closed
     except Exception:  # of NumPy's, of zipfile's, of what unpacks, of what reads a header
         raise DamageError("it is no archive of arrays as NumPy writes them") from None
-    if sum(one.file_size for one in members) > most:
+    if sum(member.file_size for member in members) > most:
         raise DamageError(f"it unpacks to more than {most >> 20} MiB")
     found = {}
     for member in members:

@@ -40,10 +40,10 @@ def option_value(option: str, text: str, *, what: str, unit: str) -> Fraction:
     try:
         return Fraction(quantity(text, Place(option), what=what, unit=unit).value)
     except ApcError as error:
-        hints = [one.hint.replace(f"{what}: ", "") for one in error.mistakes]
+        hints = [mistake.hint.replace(f"{what}: ", "") for mistake in error.mistakes]
         raise ApcError(
-            replace(one, hint=f'{option} "{hint}"' if hint else "")
-            for one, hint in zip(error.mistakes, hints, strict=True)
+            replace(mistake, hint=f'{option} "{hint}"' if hint else "")
+            for mistake, hint in zip(error.mistakes, hints, strict=True)
         ) from None
 
 

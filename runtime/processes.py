@@ -114,8 +114,8 @@ def local_processes(
         yield Workers(submit, 2 * jobs, trouble)
     finally:
         held.close()
-        for one in list((pool._processes or {}).values()):  # one that was stopped sees no lifeline
-            one.kill()
+        for process in list((pool._processes or {}).values()):  # one that was stopped sees no lifeline
+            process.kill()
         pool.shutdown(wait=True, cancel_futures=True)
         lifeline.close()
 

@@ -41,14 +41,14 @@ def check_suffix(path: Path, known: Iterable[str], option: str) -> str:
     suffix = path.suffix.lower()
     if suffix in names:
         return suffix
-    if not suffix and is_special(path) and (texts := [one for one in TEXTS if one in names]):
+    if not suffix and is_special(path) and (texts := [text for text in TEXTS if text in names]):
         return texts[0]
     wanted = names[0] if len(names) == 1 else f"one of {', '.join(names)}"
     what, proposed = f"the suffix of {option.removesuffix('=')}", Path(path.name or "result")
     if path == DASH:  # whoever writes it wants standard output, which takes text
         told = (
             Path("/dev/stdout")
-            if any(one in names for one in TEXTS)
+            if any(text in names for text in TEXTS)
             else Path("result").with_suffix(names[0])
         )
         raise ApcError(Mistake("E878", Place(str(path)), what, wanted, "none", written(option, told)))

@@ -138,13 +138,13 @@ class Csv(Writer):
 
     def __init__(self, path: Path, columns: Sequence[Column], about: tuple[str, str]) -> None:
         super().__init__(path, columns, about)
-        self.file.write(_lines([[one.heading for one in columns]]))
+        self.file.write(_lines([[column.heading for column in columns]]))
         self.file.flush()
         self.whole = self.file.tell()
 
     def write(self, cells: Sequence[Any], count: int) -> None:
         """Keep room for so many rows, then write them."""
-        columns = [_listed(one) if isinstance(one, np.ndarray) else one for one in cells]
+        columns = [_listed(cell) if isinstance(cell, np.ndarray) else cell for cell in cells]
         text = _lines(zip(*columns, strict=True))
         self.keep(self.whole + len(text))
         self.file.seek(self.whole)
@@ -182,8 +182,10 @@ class Parquet(Writer):
         self.arrow = need("pyarrow", "data")
         parquet = need("pyarrow.parquet", "data")
         types = {"number": self.arrow.float64(), "count": self.arrow.int64(), "text": self.arrow.string()}
-        names = [one.heading for one in columns]
-        fields = [self.arrow.field(name, types[one.kind]) for name, one in zip(names, columns, strict=True)]
+        names = [column.heading for column in columns]
+        fields = [
+            self.arrow.field(name, types[column.kind]) for name, column in zip(names, columns, strict=True)
+        ]
         self.schema = self.arrow.schema(fields, metadata=dict([about]))
         self.table_writer = parquet.ParquetWriter(self.file, self.schema)
         letters = len("".join(names).encode())
@@ -195,10 +197,10 @@ class Parquet(Writer):
         """Keep room for so many rows, then write them."""
         if not self.written:
             raise OSError(0, "half a row group can't be written on")
-        types = [one.type for one in self.schema]
+        types = [item.type for item in self.schema]
         pairs = zip(cells, types, strict=True)
-        arrays = [self.arrow.array(one, type=kind, from_pandas=True) for one, kind in pairs]  # NaN is empty
-        block = SWOLLEN * sum(max(8 * count, one.nbytes) for one in arrays) + HEADERS * len(arrays)
+        arrays = [self.arrow.array(item, type=kind, from_pandas=True) for item, kind in pairs]  # NaN is empty
+        block = SWOLLEN * sum(max(8 * count, array.nbytes) for array in arrays) + HEADERS * len(arrays)
         self.keep(self.file.tell() + block + self.end + self.note)
         self.written = False
         self.table_writer.write_table(self.arrow.Table.from_arrays(arrays, schema=self.schema))
@@ -281,22 +283,22 @@ def read_table(path: Path, columns: Sequence[Column]) -> tuple[NDArray[Any], ...
     """Return columns of a table that `write_table` wrote, as floats, NaN where nothing is, or as objects."""
     if path.suffix == ".parquet":
         parquet = need("pyarrow.parquet", "data")
-        table = parquet.read_table(path, columns=[one.heading for one in columns])
-        cells = [table.column(one.heading).to_pylist() for one in columns]
+        table = parquet.read_table(path, columns=[column.heading for column in columns])
+        cells = [table.column(column.heading).to_pylist() for column in columns]
     else:
         with path.open(encoding="utf-8", newline="") as file:
             lines = csv.reader(file)
             heading = next(lines)
-            places = [heading.index(one.heading) for one in columns]
+            places = [heading.index(column.heading) for column in columns]
             rows = [[row[place] for place in places] for row in lines]
         read = {"number": float, "count": int, "text": str}
         cells = [
-            [read[one.kind](row[place]) if row[place] or one.kind == "text" else None for row in rows]
-            for place, one in enumerate(columns)
+            [read[column.kind](row[place]) if row[place] or column.kind == "text" else None for row in rows]
+            for place, column in enumerate(columns)
         ]
     return tuple(
-        np.array(own, dtype=np.float64 if one.kind == "number" else object)
-        for one, own in zip(columns, cells, strict=True)
+        np.array(own, dtype=np.float64 if column.kind == "number" else object)
+        for column, own in zip(columns, cells, strict=True)
     )
 
 

@@ -76,11 +76,11 @@ class ComponentNames:
         }
         # `others` alone stands for count(others).
         known |= computed | {PEERS: DIMENSIONLESS, ("time",): SECOND, (OTHERS,): DIMENSIONLESS}
-        for one in component.parameters:
-            if not isinstance(one, Option) and one.unit is not None:  # a number or a table
-                known[(one.name,)] = one.unit.dimension
-            elif getattr(one, "role", "") == "clock":
-                known[(interval_of(one.name),)] = SECOND
+        for parameter in component.parameters:
+            if not isinstance(parameter, Option) and parameter.unit is not None:  # a number or a table
+                known[(parameter.name,)] = parameter.unit.dimension
+            elif getattr(parameter, "role", "") == "clock":
+                known[(interval_of(parameter.name),)] = SECOND
         known |= {(OTHERS, send.name): send.dimension for send in component.sends}
         self.dimensions = {_whole(path): dimension for path, dimension in known.items()}
         self.sizes: dict[Path, int | None] = {**sizes_of(known)}
@@ -102,7 +102,7 @@ class ComponentNames:
                 each = written or (send.expression,)
                 named = entries(send.name, len(each) if len(each) > 1 else 0)
                 pairs = zip(named, each, strict=True)
-                sent += [replace(send, name=n, expression=one, dimension=dimension) for n, one in pairs]
+                sent += [replace(send, name=n, expression=item, dimension=dimension) for n, item in pairs]
         own = self.component
         if not mistakes:
             for send in sends:
@@ -137,9 +137,9 @@ class ComponentNames:
         self.sizes |= {name: self._size(*written) or 0 for name, written in waiting.items()}
         _settle(waiting, self._inferred, self.dimensions)
         return [
-            (one, _known(self.dimensions[name]))
+            (text, _known(self.dimensions[name]))
             for name in reversed(undeclared)
-            for one in entries(name[0], self.sizes[name] or 0)
+            for text in entries(name[0], self.sizes[name] or 0)
         ]
 
     def _size(self, expression: Expr, where: Where) -> int | None:
@@ -190,7 +190,7 @@ class ComponentNames:
         """Refuse a send of what is heard: that is known at ticks of the clock, not of the link."""
         for heard in names(send.expression):
             if heard.parts[0] == OTHERS:
-                name = next(one for n in count(1) if (one := f"sent{n}",) not in self.dimensions)
+                name = next(text for n in count(1) if (text := f"sent{n}",) not in self.dimensions)
                 what = f"{send.name} is sent at ticks of the link, and {format_expression(heard)} is heard at"
                 sample = f"{{{send.name}: sample(hold({name}))}}"
                 hint = f"{name} = {send.text} among the equations, and sends: {sample}"
@@ -296,10 +296,10 @@ def _settle(
 
 def _visible_names(component: Component) -> Iterator[tuple[Path, Dimension]]:
     """Yield what may be named of a component from outside: its variables and its connectors' potentials."""
-    yield from (((one.name,), one.unit.dimension) for one in component.variables)
+    yield from (((variable.name,), variable.unit.dimension) for variable in component.variables)
     yield from (((name,), dimension) for name, dimension in component.locals)
     for name, connector in component.connectors:
-        yield from (((name, one.name), one.unit.dimension) for one in connector.potentials)
+        yield from (((name, potential.name), potential.unit.dimension) for potential in connector.potentials)
     for inner in component.inner:
         yield from (((inner.name, *path), its) for path, its in _visible_names(inner.component))
 

@@ -111,7 +111,7 @@ def read_variables(root: Body, section: str = "variables") -> tuple[Variable, ..
         about, limit = body.text("about"), body.text("limit", "limit: force_limit")
         unit, size = _unit_and_size(body, name)
         starts = _entry_by_entry(body, "start", name, unit, size)
-        return [Variable(one, unit, start, about, key.place, limit) for one, start in starts]
+        return [Variable(text, unit, start, about, key.place, limit) for text, start in starts]
 
     return tuple(chain(*root.each(section, "{x: {unit: m}}", read)))
 
@@ -190,10 +190,10 @@ def _numbers(name: str, body: Body) -> list[Number]:
             words[key.text] = _number(node, key.text, unit)
             check(words[key.text], node, f"{key.text} of {first}")
     defaults = _entry_by_entry(body, "default", name, unit, size, words)
-    for one, default in defaults:
-        check(default, nodes.get("default"), f"the default of {one}")
+    for text, default in defaults:
+        check(default, nodes.get("default"), f"the default of {text}")
     named = tuple(words.items())
-    return [replace(model, name=one, default=default, words=named) for one, default in defaults]
+    return [replace(model, name=text, default=default, words=named) for text, default in defaults]
 
 
 def _unit_and_size(body: Body, name: str) -> tuple[Unit, int]:
@@ -227,7 +227,7 @@ def _entry_by_entry(
 
     def read(node: Node, _: str) -> list[Fraction | None]:
         nodes = list_of(node, key, size, "0") if size else (node,)
-        return [_number(one, name, unit, words) for one in nodes]
+        return [_number(node, name, unit, words) for node in nodes]
 
     named = names_of(name, size)
     values = body.read(key, read, [None] * len(named))

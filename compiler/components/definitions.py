@@ -133,7 +133,7 @@ def _read_declarations(root: Body, library: Definitions, mistakes: Mistakes) -> 
 
 def _check_limits(variables: Iterable[Variable], numbers: Iterable[Number], mistakes: Mistakes) -> None:
     """Record limits of variables that are no number of the same dimension of the component around."""
-    known = {one.name: one.unit.dimension for one in numbers}
+    known = {number.name: number.unit.dimension for number in numbers}
     for variable in variables:
         limit, due, what = variable.limit, variable.unit.dimension, f"the limit of {variable.name}"
         if limit and limit not in known:
@@ -161,12 +161,12 @@ def _overridden(
     """Return the inherited declarations, those declared again replaced in their place, then the new ones."""
     inherited = by_vector(base)
     for name, items in by_vector(own).items():
-        before = [one.name for one in inherited.get(name, items)]
-        if before != [one.name for one in items]:
+        before = [text.name for text in inherited.get(name, items)]
+        if before != [item.name for item in items]:
             size = "a number" if before == [name] else f"a vector of {len(before)}"
             what = f"{name} is {size} in what this component extends"
             mistakes.add("E205", items[0].place, what, hint="another name")
-    return tuple({one.name: one for one in (*base, *own)}.values())
+    return tuple({item.name: item for item in (*base, *own)}.values())
 
 
 def _with_inner(root: Body, outer: Component, library: Definitions, mistakes: Mistakes) -> Component:

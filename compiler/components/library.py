@@ -121,7 +121,7 @@ def _read(path: Path) -> Source:
         if b"component" in text or b"connector" in text:
             raise
         what, expected = "a file of a library", "YAML that defines a component or connector"
-        places = [replace(one.place, source_line="") for one in error.mistakes]
+        places = [replace(mistake.place, source_line="") for mistake in error.mistakes]
         raise ApcError(Mistake("E219", place, what, expected) for place in places) from None
 
 

@@ -182,7 +182,7 @@ class Parts:
             with Mistakes():  # which are reported where it is asked for
                 if (component := self.library.component(name)) is not None:
                     connectors = {connector for connector, _ in component.connectors}
-                    known = connectors | {one.name for one in (*component.parameters, *component.variables)}
+                    known = connectors | {item.name for item in (*component.parameters, *component.variables)}
                     if known >= keys and (section != "hands" or connectors == {"flange"}):
                         fitting.append((name != usual, len(known), name))
         return min(fitting, default=(True, 0, usual))[-1]
@@ -236,7 +236,7 @@ def read_entry(entry: PartEntry, scope: Scope, mistakes: Mistakes, index: int = 
     # What names something; inside a component, a table is one of the outer's.
     naming = ("clock", "link") if within is None else ("clock", "link", "table")
     starts = [variable for variable in component.variables if variable.start is not None]
-    named = (whole_and_index(one.name)[0] for one in (*component.parameters, *starts))
+    named = (whole_and_index(item.name)[0] for item in (*component.parameters, *starts))
     common = PART_KEYS if within is None else ("count",)
     keys = dict.fromkeys(("type", *common, *dict(component.connectors), *named))
     nodes = Body(entry.body, keys, f"{entry.name} ({component.name})", mistakes).nodes
@@ -246,7 +246,7 @@ def read_entry(entry: PartEntry, scope: Scope, mistakes: Mistakes, index: int = 
             values: tuple[Node, ...] = (_FAULTY,) * len(vector)
             with mistakes:
                 values = _vector(nodes[name], name, vector, scope)
-            nodes.update(zip((one.name for one in vector), values, strict=True))
+            nodes.update(zip((item.name for item in vector), values, strict=True))
 
     def due(parameter: Parameter) -> str:
         """Return what to write for a parameter that must be given; nothing of one that may be left out."""
@@ -305,15 +305,15 @@ def read_entry(entry: PartEntry, scope: Scope, mistakes: Mistakes, index: int = 
 
     missing = dict[str, str]()
     for name, parameters in by_vector(component.parameters).items():
-        wanted = [due(one) for one in parameters if one.name not in nodes]
+        wanted = [due(parameter) for parameter in parameters if parameter.name not in nodes]
         if any(wanted):
             missing[name] = wanted[0] if len(wanted) == 1 else f"[{', '.join(wanted)}]"
     if missing:
         hint = ", ".join(f"{key}: {value}" for key, value in missing.items())
         what = f"{entry.name} has no {enumerated(tuple(missing))}"
         mistakes.add("E201", entry.place, what, hint=hint)
-    references = [one for one in component.parameters if isinstance(one, Reference)]
-    described = (one.name for one in references if one.role not in naming)
+    references = [parameter for parameter in component.parameters if isinstance(parameter, Reference)]
+    described = (reference.name for reference in references if reference.role not in naming)
     connections = []
     for name, kind in component.connectors:
         with mistakes:
@@ -324,7 +324,7 @@ def read_entry(entry: PartEntry, scope: Scope, mistakes: Mistakes, index: int = 
         mistakes.add("E210", entry.place, f"{entry.name} joins {targets[0][0]} to itself")
     return Entry(
         each(component.numbers, number),
-        each((one for one in component.parameters if isinstance(one, Option)), option),
+        each((parameter for parameter in component.parameters if isinstance(parameter, Option)), option),
         each(references, reference),
         tuple((name, nodes[name]) for name in described if name in nodes),
         each(starts, number),
@@ -340,7 +340,7 @@ def _vector(node: Node, name: str, vector: Sequence[Number | Variable], scope: S
         tree = parse_expression(node.text, place)
         found = written_out(tree, lambda parts: sizes.get(parts, 0), node.text, place)
         if found is not None and len(found) == len(vector):
-            return tuple(replace(node, text=format_expression(one)) for one in found)
+            return tuple(replace(node, text=format_expression(item)) for item in found)
     return list_of(node, name, len(vector), _one(vector[0].unit))
 
 
@@ -359,10 +359,10 @@ def _joined(
         fitting = (part.name for part in free if part.connectors(kind))
         what = f"{name} does not say what its {connector} is joined to"
         hint = f"{connector}: {next(fitting, GROUND)}"
-        for one in parts.values():  # who joins the part without saying which of its connectors is meant
-            for key, value in one.body.entries:
-                if isinstance(value, Scalar) and value.text == name and key.text in one.connectors(kind):
-                    hint = f"{one.name}: {{{key.text}: {name}.{connector}}}"
+        for item in parts.values():  # who joins the part without saying which of its connectors is meant
+            for key, value in item.body.entries:
+                if isinstance(value, Scalar) and value.text == name and key.text in item.connectors(kind):
+                    hint = f"{item.name}: {{{key.text}: {name}.{connector}}}"
         raise fault("E210", entry.place, what, hint=hint)
     text = text_of(node, connector, f"{connector}: device")
     if text == GROUND:
@@ -378,7 +378,7 @@ def _joined(
         raise AlreadyReportedError
     if part is None:
         what = f"{name} joins its {connector} to {brief(other)}, which is no part of {scope.whole}"
-        raise unknown("E206", node.place, what, other, [*(one for one in parts if one != name), GROUND])
+        raise unknown("E206", node.place, what, other, [*(part for part in parts if part != name), GROUND])
     element = _element(part, first, last, entry, index, connector, node.place)
     return element, _its_connector(part, named, connector, kind, entry.section == "hands", node.place)
 

@@ -47,7 +47,9 @@ class Aliases:
     def substitute(self, expression: Term) -> Term:
         """Return the expression in the names kept."""
         held = self.moving.derivatives(expression)
-        return expression.xreplace({s: self.value(*one) for s, one in held.items() if one[0] in self.stands})
+        return expression.xreplace(
+            {s: self.value(*pair) for s, pair in held.items() if pair[0] in self.stands}
+        )
 
     def shown(self, expression: Term) -> Term:
         """Return an expression in which derivatives have their own names."""
@@ -81,8 +83,8 @@ class Aliases:
         parts = [part.as_coeff_Mul() for part in Add.make_args(expression)]
         if len(parts) > 2 or any(name not in held for _, name in parts):
             return False
-        (factor, one), (other, two) = parts[0], parts[-1]
-        pair = sorted((held[one], held[two]), key=lambda it: (it[1], -self.rank[it[0]]))
+        (factor, item), (other, two) = parts[0], parts[-1]
+        pair = sorted((held[item], held[two]), key=lambda it: (it[1], -self.rank[it[0]]))
         (goes, low), (stays, high) = pair
         sign = 0 if len(parts) == 1 else -1 if factor == other else 1
         named = sign == 1 or high == 0 or (stays, high) in self._velocities()

@@ -71,13 +71,13 @@ def solve_blocks(
         E502 equations or unknowns left over.
     """
     known = frozenset(unknowns)
-    held = [one.expression.free_symbols & known for one in residuals]
+    held = [residual.expression.free_symbols & known for residual in residuals]
     steps: list[Step] = []
     for rows, own in balanced(residuals, held, unknowns, problem):
         block = [residuals[row] for row in rows]
         with problem.mistakes:
             solved = _solved(block, own, problem)
-            parts = [one.expressions if isinstance(one, ImplicitBlock) else one[1:] for one in solved]
+            parts = [step.expressions if isinstance(step, ImplicitBlock) else step[1:] for step in solved]
             if any(is_no_number(expression) for part in parts for expression in part):
                 raise problem.no_number(block)  # what was divided may cancel
             steps += solved
@@ -124,11 +124,11 @@ def balanced(
 def _solved(block: Sequence[Residual], unknowns: Sequence[Symbol], problem: Problem) -> Sequence[Step]:
     """Return what gives the unknowns of one block, explicit where it is linear in them."""
     known = frozenset(unknowns)
-    linear = [form for one in block if (form := linear_form(one.expression, known)) is not None]
+    linear = [form for residual in block if (form := linear_form(residual.expression, known)) is not None]
     if len(linear) == len(block):
         steps, free = eliminate(linear, unknowns, problem.divisors)
         if free:
-            what = f"depend on each other and don't determine {listed([one.name for one in free])}"
+            what = f"depend on each other and don't determine {listed([item.name for item in free])}"
             raise problem.fault("E511", block, f"{problem.where} {what}: {listed(block)}")
         return steps
     loop = _torn(block, unknowns, problem.divisors)
@@ -181,7 +181,7 @@ def _torn(block: Sequence[Residual], unknowns: Sequence[Symbol], divisors: Divis
         else:
             inner.append((ready[1].name, solved(*ready)))
             del left[ready[0]], remaining[ready[1]]
-    names, guesses = (tuple(one.name for one in some) for some in (unknowns, torn))
+    names, guesses = (tuple(item.name for item in some) for some in (unknowns, torn))
     return ImplicitBlock(names, guesses, tuple(inner), tuple(block[i].expression for i in left))
 
 
@@ -190,7 +190,7 @@ def _is_open(residuals: Sequence[Term], guesses: Sequence[Symbol], divisors: Div
     if len(guesses) > MOST_GUESSES:
         return False
     try:
-        slopes = sympy.Matrix([[slope(one, guess) for guess in guesses] for one in residuals])
+        slopes = sympy.Matrix([[slope(residual, guess) for guess in guesses] for residual in residuals])
     except NoDerivativeError:
         return False
     with dotprodsimp(False):  # which would expand it
@@ -200,7 +200,7 @@ def _is_open(residuals: Sequence[Term], guesses: Sequence[Symbol], divisors: Div
 
 def _pieces(term: Term) -> Iterator[Term]:
     """Yield what a term is between its corners, each choice of branches and signs by itself."""
-    node = next((one for one in sympy.preorder_traversal(term) if isinstance(one, If | sympy.sign)), None)
+    node = next((item for item in sympy.preorder_traversal(term) if isinstance(item, If | sympy.sign)), None)
     if node is None:
         yield term
     else:

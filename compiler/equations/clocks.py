@@ -91,23 +91,23 @@ def check_alone(component: Component, place: Place, mistakes: Mistakes) -> None:
     clocks = _Clocks(flat, mistakes)
     for name, connector in component.connectors:
         for potential, flow in zip(connector.potentials, connector.flows, strict=True):
-            one, other = (f"{component.name}.{name}.{its.name}" for its in (potential, flow))
-            if clocks.pinned(one) == CONTINUOUS != clocks.of(other) and other in clocks.given:
+            text, other = (f"{component.name}.{name}.{its.name}" for its in (potential, flow))
+            if clocks.pinned(text) == CONTINUOUS != clocks.of(other) and other in clocks.given:
                 clocks.report_flow(other, clocks.given[other])
 
 
 def _partitioned(kind: FlatKind, mistakes: Mistakes) -> ClockedKind:
     clocks = _Clocks(kind, mistakes)
     crossings = [
-        one
-        if isinstance(one, SampleCrossing)
-        else replace(one, clock=clocks.of(getattr(one, "variable", one.symbol)))
-        for one in kind.crossings
+        crossing
+        if isinstance(crossing, SampleCrossing)
+        else replace(crossing, clock=clocks.of(getattr(crossing, "variable", crossing.symbol)))
+        for crossing in kind.crossings
     ]
-    samples = tuple(one for one in crossings if isinstance(one, SampleCrossing))
-    holds = tuple(one for one in crossings if isinstance(one, HoldCrossing))
-    previous = tuple(one for one in crossings if isinstance(one, PreviousCrossing))
-    receives = tuple(one for one in crossings if isinstance(one, ReceiveCrossing))
+    samples = tuple(crossing for crossing in crossings if isinstance(crossing, SampleCrossing))
+    holds = tuple(crossing for crossing in crossings if isinstance(crossing, HoldCrossing))
+    previous = tuple(crossing for crossing in crossings if isinstance(crossing, PreviousCrossing))
+    receives = tuple(crossing for crossing in crossings if isinstance(crossing, ReceiveCrossing))
     for hold in holds:
         if hold.clock == CONTINUOUS:
             call = format_expression(Call("hold", (Name((hold.shown,)), hold.delay)))
@@ -117,9 +117,14 @@ def _partitioned(kind: FlatKind, mistakes: Mistakes) -> ClockedKind:
                 mistakes.add("E505", given.place, what, hint=hint)
             else:
                 mistakes.add("E505", hold.place, what, hint=hold.shown)
-    for one in previous:
-        if one.clock == CONTINUOUS:
-            mistakes.add("E505", one.place, one.symbol, expected="a variable that belongs to a clock")
+    for previous_crossing in previous:
+        if previous_crossing.clock == CONTINUOUS:
+            mistakes.add(
+                "E505",
+                previous_crossing.place,
+                previous_crossing.symbol,
+                expected="a variable that belongs to a clock",
+            )
     for send in kind.sends:
         for variable in map(format_expression, names(send.expression)):
             clocks.check_start(variable, send.place)
@@ -174,10 +179,14 @@ class _Clocks:
         self.mistakes = mistakes
         self.variables = {variable.name: variable.start for variable in kind.variables}
         self.given: dict[str, FlatEquation] = {}
-        self._crossings = {one.symbol: one for one in kind.crossings}
+        self._crossings = {crossing.symbol: crossing for crossing in kind.crossings}
         self._sets = DisjointSet()
-        crossed = (one.clock for one in kind.crossings if isinstance(one, SampleCrossing))
-        named = {CONTINUOUS, *crossed, *(one.clock for one in kind.equations if one.clock is not None)}
+        crossed = (crossing.clock for crossing in kind.crossings if isinstance(crossing, SampleCrossing))
+        named = {
+            CONTINUOUS,
+            *crossed,
+            *(equation.clock for equation in kind.equations if equation.clock is not None),
+        }
         self._clocks = {clock: clock for clock in named}  # of each set that has one, by its root
         self._reported: set[str] = set()  # parts whose clocked flow was reported
         hearing: dict[str, FlatEquation] = {}
@@ -256,7 +265,11 @@ class _Clocks:
             return
         if equation.origin == CONNECTION:  # of what a part's equation takes as it is
             sides = {format_expression(side) for side in (equation.left, equation.right)}
-            taking = [one for one in self.given.values() if sides & set(map(format_expression, _leaves(one)))]
+            taking = [
+                flat_equation
+                for flat_equation in self.given.values()
+                if sides & set(map(format_expression, _leaves(flat_equation)))
+            ]
         else:
             taking = [equation] if clock == CONTINUOUS else []
         for own in taking if CONTINUOUS in (clock, others) else ():
@@ -267,7 +280,7 @@ class _Clocks:
         hint = f"one clock for both, or sample(hold({name}))"
         if CONTINUOUS in (clock, others):
             hint = f"sample({name})" if clock == CONTINUOUS else f"hold({name})"
-        words = [CONTINUOUS if one == CONTINUOUS else f"on clock {one}" for one in (clock, others)]
+        words = [CONTINUOUS if text == CONTINUOUS else f"on clock {text}" for text in (clock, others)]
         what = f"in `{equation.text}` of {equation.origin}, {name} is {words[0]} and the rest is {words[1]}"
         self.mistakes.add("E505", equation.place, what, hint=hint)
 

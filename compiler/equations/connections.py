@@ -30,8 +30,8 @@ def connection_equations(parts: Sequence[Part], mistakes: Mistakes) -> Iterator[
     connectors = {(part.name, own): type_ for part in parts for own, type_ in part.component.connectors}
     meeting = {terminal: [terminal] for terminal in connectors}
 
-    def join(one: Terminal, other: Terminal) -> None:
-        joining, joined = meeting[one], meeting[other]
+    def join(pair: Terminal, other: Terminal) -> None:
+        joining, joined = meeting[pair], meeting[other]
         if joining is not joined:
             joined.extend(joining)
             meeting.update(dict.fromkeys(joining, joined))

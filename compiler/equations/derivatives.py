@@ -37,7 +37,7 @@ class Moving:
         """Return the variables and derivatives an expression holds, in the order of their names."""
         orders = {s: s.name.count("der(") for s in in_order(expression.free_symbols)}
         found = {s: (s.name[4 * order : len(s.name) - order], order) for s, order in orders.items()}
-        return {s: one for s, one in found.items() if one[0] in self.variables}
+        return {s: pair for s, pair in found.items() if pair[0] in self.variables}
 
     def differentiate(self, expression: Term) -> Term:
         """Return the time derivative. Raises NoDerivativeError if a held force would have to give it."""

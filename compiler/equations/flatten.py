@@ -216,7 +216,7 @@ def flatten(scene: Scene) -> FlatSystem:
 
 def _delay_names(kind: FlatKind) -> set[str]:
     """Return the numbers of parts that a hold's delay is or depends on: of the schedule, not of equations."""
-    delays = [one.delay for one in kind.crossings if isinstance(one, HoldCrossing)]
+    delays = [crossing.delay for crossing in kind.crossings if isinstance(crossing, HoldCrossing)]
     found = {format_expression(name) for delay in delays for name in names(delay)}
     for part in reversed(kind.parts):  # what an inner part's number depends on is a number of an outer part
         for name, value in part.values:
@@ -254,18 +254,18 @@ def _flat_kind(name: str, parts: Sequence[Part], mistakes: Mistakes) -> FlatKind
     for part in parts:
         writer, component = _PartWriter(part, crossings, mistakes), part.component
         own: list[tuple[str, Dimension, Variable | None]] = [
-            *((one.name, one.unit.dimension, one) for one in component.variables),
+            *((variable.name, variable.unit.dimension, variable) for variable in component.variables),
             *((local, dimension, None) for local, dimension in component.locals),
             *(
-                (f"{connector}.{one.name}", one.unit.dimension, None)
+                (f"{connector}.{variable.name}", variable.unit.dimension, None)
                 for connector, type_ in component.connectors
                 if connector not in writer.passed  # else it is the inner part's
-                for one in (*type_.potentials, *type_.flows)
+                for variable in (*type_.potentials, *type_.flows)
             ),
         ]
-        variables += [FlatVariable(f"{part.name}.{its}", unit, one) for its, unit, one in own]
+        variables += [FlatVariable(f"{part.name}.{its}", unit, variable) for its, unit, variable in own]
         for equation in component.equations:
-            left, right = (writer.written(one, equation) for one in (equation.left, equation.right))
+            left, right = (writer.written(item, equation) for item in (equation.left, equation.right))
             equations.append(FlatEquation(left, right, part.name, writer.clock, equation.place, equation))
         for send in component.sends:
             if writer.link is None:
@@ -315,7 +315,7 @@ class _PartWriter:
         """Return an expression in whole names; `heard` in a reduction, where alone others can be named."""
 
         def whole(node: Expr) -> Expr | None:
-            reads = isinstance(node, Name | Call) and any(one.parts[0] == OTHERS for one in names(node))
+            reads = isinstance(node, Name | Call) and any(name.parts[0] == OTHERS for name in names(node))
             match node:
                 case Name():
                     return self._name(node) if heard or not reads else self._each(node)
@@ -397,10 +397,10 @@ class _PartWriter:
         elif not isinstance(node, Call) or node.function in POINTWISE:
             return None
         elif (back and node.function in ("mean", "sum")) and not any(
-            isinstance(one, Call) and one.function == "age" for one in walk(node)
+            isinstance(call, Call) and call.function == "age" for call in walk(node)
         ):
             return None  # of what was heard before
-        name = next(one for n in count(1) if (one := f"y{n}",) not in self.names.dimensions)
+        name = next(text for n in count(1) if (text := f"y{n}",) not in self.names.dimensions)
         shown = format_expression(node)
         hint = f"{name} = {shown}, and {name}: {{unit: …, start: 0}} among the variables"
         self._report("E505", node, f"{shown} inside {function}", expected="a variable", hint=hint)
@@ -413,11 +413,11 @@ class _PartWriter:
         variable = shown = self._whole(held)
         if dimension is not None:
             taken = {name for (name, *_) in self.names.variables}
-            free = (one for n in count(1) if (one := f"held{n}") not in taken)
+            free = (text for n in count(1) if (text := f"held{n}") not in taken)
             variable = Name((*self.part.name.split("."), next(islice(free, len(self.held), None))))
             equation = FlatEquation(variable, shown, self.part.name, self.clock, where.place)
             self.held.append((FlatVariable(format_expression(variable), dimension), equation))
-        for moving in (name for one in delay for name in names(one)):
+        for moving in (name for item in delay for name in names(item)):
             if moving.parts in self.names.variables or moving.parts[0] in ("time", OTHERS):
                 what, got = "the delay of a hold", format_expression(moving)
                 self._report("E505", moving, what, expected="parameters only", got=got)
@@ -463,7 +463,7 @@ class _PartWriter:
         if head in ("peers", "time"):
             return node
         declared, whole = component.parameter(head), Name((*part, head))
-        words = {word: value for one in component.numbers for word, value in one.words}
+        words = {word: value for number in component.numbers for word, value in number.words}
         if head in words and declared is None:
             return Number(words[head])
         divided = self.part.shared and getattr(declared, "divided", False)

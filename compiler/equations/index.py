@@ -127,9 +127,11 @@ class IndexReduction:
         for name in names:
             self.order[name] += 1
         # Each factor of a product stands beside the slopes of all the others.
-        grown = (sum(size(term) ** 2 for term in sympy.Add.make_args(one.expression)) for one in blocking)
+        grown = (
+            sum(size(term) ** 2 for term in sympy.Add.make_args(residual.expression)) for residual in blocking
+        )
         if any(self.order[name] > HIGHEST_ORDER for name in names) or max(grown) > LARGEST:
-            shown = ", ".join(dict.fromkeys(one.shown for one in blocking))
+            shown = ", ".join(dict.fromkeys(residual.shown for residual in blocking))
             what = f"no number of derivatives of these equations determines what they hold: {shown}"
             raise self.problem.fault("E509", blocking, what)
         for row, residual in zip(rows, blocking, strict=True):
@@ -176,15 +178,16 @@ class IndexReduction:
         Elimination column by column; a factor that moves, such as 2·x, may vanish and is no pivot.
         """
         where, divisors = self.problem.where, self.problem.divisors
-        symbols = {derivative(*one): one for one in candidates}
+        symbols = {derivative(*candidate): candidate for candidate in candidates}
         constraints = [self.residuals[row] for row in rows]
         linear: list[Mapping[Term, Term]] = []
-        for one in constraints:
-            form = linear_form(one.expression, symbols.keys())
+        for constraint in constraints:
+            form = linear_form(constraint.expression, symbols.keys())
             if form is None:  # else a derivative is linear in the highest derivatives
-                what = f"in the constraint {one.shown} a condition hangs on a derivative that it ties down"
+                shown = constraint.shown
+                what = f"in the constraint {shown} a condition hangs on a derivative that it ties down"
                 hint = "a condition on positions, parameters or time"
-                raise self.problem.fault("E509", [one], f"{where}: {what}", hint)
+                raise self.problem.fault("E509", [constraint], f"{where}: {what}", hint)
             linear.append(form[0])
         system = Elimination(linear, divisors, "", LARGEST)
         chosen = []

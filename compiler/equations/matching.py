@@ -47,7 +47,7 @@ def match(
     """
     n = len(held)
     node = {unknown: j for j, unknown in enumerate(unknowns, n)}
-    edges = [sorted(node[one] for one in its) for its in held]
+    edges = [sorted(node[item] for item in its) for its in held]
     holds = _graph(edges + [[]] * len(node))
     partner = maximum_bipartite_matching(holds[:n, n:], perm_type="row").tolist()
     graph = _graph(edges + [[i] if i >= 0 else [] for i in partner])
@@ -58,7 +58,7 @@ def match(
 
     def reached(starts: Iterable[int], along: Any) -> Block[Unknown]:
         walks = (breadth_first_order(along, start, return_predecessors=False) for start in starts)
-        return split({int(one) for walk in walks for one in walk})
+        return split({int(item) for walk in walks for item in walk})
 
     left_over = sorted({*range(n)}.difference(partner))
     under = reached([j for j, i in enumerate(partner, n) if i < 0], graph.T.tocsr())
@@ -70,5 +70,5 @@ def match(
 def _graph(edges: Sequence[Sequence[int]]) -> Any:
     """Return the adjacency matrix of a graph, by where the edges of each of its nodes end."""
     ends = np.cumsum([0, *map(len, edges)])
-    places = np.array([one for its in edges for one in its], dtype=np.int32)
+    places = np.array([number for its in edges for number in its], dtype=np.int32)
     return csr_array((np.ones(len(places)), places, ends), shape=(len(edges), len(edges)))

@@ -109,7 +109,7 @@ def _linear_parts(term: Term, values: Set[Symbol]) -> dict[tuple[Symbol | None, 
 
     None if it isn't a sum of such.
     """
-    bent = any(not one.free_symbols.isdisjoint({*values, AGE}) for one in term.atoms(sympy.Function))
+    bent = any(not atom.free_symbols.isdisjoint({*values, AGE}) for atom in term.atoms(sympy.Function))
     form = None if bent else linear_form(term, values)
     if form is None:
         return None

@@ -97,6 +97,6 @@ Definition = Term | ImplicitBlock  # what gives an unknown its value
 
 def listed(texts: Sequence[str | Residual]) -> str:
     """Join the first few texts, or equations, and say how many more there are."""
-    shown = [one.shown if isinstance(one, Residual) else one for one in texts[:MOST_LISTED]]
+    shown = [text.shown if isinstance(text, Residual) else text for text in texts[:MOST_LISTED]]
     more = len(texts) - MOST_LISTED
     return ", ".join(shown) + (f" and {more} more" if more > 0 else "")

@@ -82,7 +82,7 @@ class SortedKind:
         found: dict[str, Definition] = {}
         for step in (step for part in self.partitions for step in part.assignments):
             found |= dict.fromkeys(step.unknowns, step) if isinstance(step, ImplicitBlock) else dict([step])
-        return {symbol(name): one for name, one in (found | dict((*self.aliases, *self.samples))).items()}
+        return {symbol(name): item for name, item in (found | dict((*self.aliases, *self.samples))).items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,26 +132,31 @@ def _sorted(kind: ClockedKind, divisors: Divisors, mistakes: Mistakes) -> Sorted
     """Sort and solve a kind. Raises ApcError with what stands in the way of the continuous equations."""
 
     def problem(where: str, part: Partition) -> Problem:
-        place = next((one.place for one in (*part.equations, *kind.flat.equations)), Place("topology"))
+        place = next(
+            (equation.place for equation in (*part.equations, *kind.flat.equations)), Place("topology")
+        )
         return Problem(where, place, divisors, mistakes)
 
     heard: dict[str, Heard] = {}
     reductions: dict[Symbol, Term] = {}
     for crossing in kind.receives:
         reductions[symbol(crossing.symbol)], parts = taken_apart(crossing, mistakes)
-        heard |= {one.symbol: one for one in parts if one.symbol not in heard}
+        heard |= {part.symbol: part for part in parts if part.symbol not in heard}
     partitions = []
     for part in kind.partitions[1:]:
         its = problem(f"the equations of clock {part.clock}", part)
         with mistakes:
             equal = zip(part.equations, _sides(part.equations, None, its), strict=True)
-            residuals = [Residual((left - right).xreplace(reductions), one) for one, (left, right) in equal]
+            residuals = [
+                Residual((left - right).xreplace(reductions), flat_equation)
+                for flat_equation, (left, right) in equal
+            ]
             steps = solve_blocks(residuals, [symbol(name) for name in part.variables], its)
             partitions.append(SortedPartition(part.clock, steps))
     states, aliases, steps, read = _sorted_continuous(
         kind, problem("the continuous equations", kind.partitions[0])
     )
-    samples = zip((one.symbol for one in kind.samples), read, strict=False)
+    samples = zip((sample.symbol for sample in kind.samples), read, strict=False)
     sends = zip(kind.flat.sends, read[len(kind.samples) :], strict=True)
     return SortedKind(
         kind,
@@ -160,7 +165,10 @@ def _sorted(kind: ClockedKind, divisors: Divisors, mistakes: Mistakes) -> Sorted
         (SortedPartition(CONTINUOUS, steps), *partitions),
         tuple(samples),
         tuple(heard.values()),
-        tuple(SortedSend(one.name, one.link, format_dimension(one.dimension), it) for one, it in sends),
+        tuple(
+            SortedSend(flat_send.name, flat_send.link, format_dimension(flat_send.dimension), it)
+            for flat_send, it in sends
+        ),
     )
 
 
@@ -178,14 +186,17 @@ def _sorted_continuous(
     sides = _sides((*equations, *reads), moving.differentiate, problem)
     aliases = Aliases(moving, started)
     residuals = aliases.remove(
-        [Residual(left - right, one) for one, (left, right) in zip(equations, sides, strict=False)]
+        [Residual(left - right, equation) for equation, (left, right) in zip(equations, sides, strict=False)]
     )
     values = zip(reads, sides[len(equations) :], strict=True)
-    read = [Residual(aliases.substitute(value), one) for one, (_, value) in values]
-    if none := [one for one in (*residuals, *read) if is_no_number(one.expression)]:
+    read = [Residual(aliases.substitute(value), flat_equation) for flat_equation, (_, value) in values]
+    if none := [residual for residual in (*residuals, *read) if is_no_number(residual.expression)]:
         raise problem.no_number(none)
     # A derivative that has a name of its own, or that is read, is asked for, even if no equation holds it.
-    asked = [*aliases.velocities, *(it for one in read for it in moving.derivatives(one.expression).values())]
+    asked = [
+        *aliases.velocities,
+        *(it for residual in read for it in moving.derivatives(residual.expression).values()),
+    ]
     orders = {name: 0 for name in variables if name not in aliases.stands} | dict(
         sorted(asked, key=itemgetter(1))
     )
@@ -193,19 +204,19 @@ def _sorted_continuous(
     solving, unknowns, differentiated = reduction.reduced({*map(aliases.value, started)})
     states = tuple(aliases.shown(s).name for s in differentiated)
     for state in (state for state in states if state not in started):
-        holder = next((one for one in equations if f"der({state})" in one.text), equations[0])
+        holder = next((equation for equation in equations if f"der({state})" in equation.text), equations[0])
         what = f"{state} is a state, by `{holder.text}` ({holder.origin}), and has no start value"
         hint = f"{state.rpartition('.')[2]}: {{…, start: …}}"
         if state.startswith("der("):
             hint = f"{state} = v, with a start value for v"
         problem.mistakes.add("E510", holder.place, what, hint=hint)
-    shown = [Residual(aliases.shown(one.expression), one.equation) for one in solving]
+    shown = [Residual(aliases.shown(residual.expression), residual.equation) for residual in solving]
     steps = solve_blocks(shown, [aliases.shown(s) for s in unknowns], problem)
     below = {v: aliases.shown(derivative(x, order - 1)).name for (x, order), v in aliases.velocities.items()}
     rates = [(f"der({x})", symbol(v)) for v, x in below.items() if x in states]
     known = [rate for rate in rates if rate[1].name in states]
     steps = (*known, *steps, *(rate for rate in rates if rate not in known))
-    return states, aliases.assignments(), steps, [aliases.shown(one.expression) for one in read]
+    return states, aliases.assignments(), steps, [aliases.shown(residual.expression) for residual in read]
 
 
 def _sides(

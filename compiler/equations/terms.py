@@ -208,8 +208,8 @@ def differential(expression: Term, rate: Callable[[Symbol], Term]) -> Term:
 
 def linear_form(expression: Term, unknowns: Set[Symbol]) -> LinearForm | None:
     """Return the coefficients and the rest of Σ coefficient·unknown + rest, or None if it isn't linear."""
-    functions = (one for one in expression.atoms(sympy.Function) if not isinstance(one, If))
-    if any(not unknowns.isdisjoint(one.free_symbols) for one in functions):
+    functions = (atom for atom in expression.atoms(sympy.Function) if not isinstance(atom, If))
+    if any(not unknowns.isdisjoint(function.free_symbols) for function in functions):
         return None
     slopes: dict[Symbol, list[Term]] = {}
     for term in sympy.Add.make_args(expression):
@@ -259,11 +259,15 @@ def _written(term: Term) -> Expr:
 def _written_product(term: Term) -> Expr:
     """Return a product as a quotient, the number in front first."""
     number, rest = term.as_coeff_Mul()
-    below = [one for one in sympy.Mul.make_args(rest) if one.is_Pow and one.exp.is_negative]
-    above = [one for one in (number, *sympy.Mul.make_args(rest)) if one != 1 and one not in below]
+    below = [
+        make_argument
+        for make_argument in sympy.Mul.make_args(rest)
+        if make_argument.is_Pow and make_argument.exp.is_negative
+    ]
+    above = [item for item in (number, *sympy.Mul.make_args(rest)) if item != 1 and item not in below]
     whole = _times(above or [ONE])
-    return Call("/", (whole, _times(1 / one for one in below))) if below else whole
+    return Call("/", (whole, _times(1 / item for item in below))) if below else whole
 
 
 def _times(factors: Iterable[Term]) -> Expr:
-    return functools.reduce(lambda one, other: Call("*", (one, other)), map(_written, factors))
+    return functools.reduce(lambda item, other: Call("*", (item, other)), map(_written, factors))

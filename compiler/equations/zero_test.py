@@ -42,8 +42,8 @@ class Divisors:
 
     def define(self, name: Symbol, expression: Term) -> None:
         """Let a symbol stand for an expression."""
-        for one in (self._any, self._least, *self._groups):
-            one.known[name] = one(expression)
+        for item in (self._any, self._least, *self._groups):
+            item.known[name] = item(expression)
 
     def is_zero(self, expression: Term) -> bool:
         """Return whether an expression is zero for all values of its symbols."""
@@ -79,7 +79,9 @@ class _Residues:
             return True
         if not expression.has(sympy.Function):
             return False
-        numbers = {s: sympy.Rational(one) for s, one in self.given.items() if isinstance(one, Fraction)}
+        numbers = {
+            s: sympy.Rational(number) for s, number in self.given.items() if isinstance(number, Fraction)
+        }
         return _is_identity(expression.xreplace(numbers))
 
     def __call__(self, node: Term) -> Residue:
@@ -130,4 +132,4 @@ def _is_identity(expression: Term) -> bool:
     point = {s: sympy.Rational(chance.randrange(1, 999), 499) for s in in_order(expression.free_symbols)}
     if not abs(complex(expression.xreplace(point).evalf(30, maxn=60))) < NEARLY:
         return False
-    return any(sympy.simplify(one) == 0 for one in (expression, expression.rewrite(sympy.exp)))
+    return any(sympy.simplify(item) == 0 for item in (expression, expression.rewrite(sympy.exp)))

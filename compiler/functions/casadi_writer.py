@@ -65,9 +65,11 @@ class Writer:
         self.kind = kind
         self.definitions = kind.definitions
         self.tables = {f"{part.name}.{table.name}": table for part in flat.parts for table in part.tables}
-        self.started = {one.name for one in flat.variables if one.start}
+        self.started = {variable.name for variable in flat.variables if variable.start}
         self.known: dict[Symbol, Any] = {symbol(name): casadi.SX.sym(name) for name in ("time", *kind.states)}
-        self.crossing = {one.symbol for one in flat.crossings} | {one.symbol for one in kind.receives}
+        self.crossing = {crossing.symbol for crossing in flat.crossings} | {
+            receive.symbol for receive in kind.receives
+        }
         self.parameters: dict[str, Any] = {}
         self.loops: list[tuple[Any, Any, Any]] = []  # unknowns (n,), where they begin, what is to be zero
 
@@ -77,14 +79,14 @@ class Writer:
         What a crossing that was read stands for is written too; what that reads, when this is called again.
         """
         clocked = self.kind.clocked
-        remembered = [one.variable for one in self.read(clocked.previous)]
+        remembered = [number.variable for number in self.read(clocked.previous)]
         for name in (*self.kind.states, *remembered):
             self.parameter(name)
-        limited = [one.name for one in clocked.flat.variables if one.limit]
-        held = [one.variable for one in self.read(clocked.holds)]
+        limited = [variable.name for variable in clocked.flat.variables if variable.limit]
+        held = [number.variable for number in self.read(clocked.holds)]
         self.column([*map("der({})".format, self.kind.states), *limited, *held, *remembered])
-        edges = [one.edge for one in self.read(self.kind.receives) if one.edge is not None]
-        for expression in (*edges, *(one.expression for one in self.kind.sends if one.name in heard)):
+        edges = [number.edge for number in self.read(self.kind.receives) if number.edge is not None]
+        for expression in (*edges, *(send.expression for send in self.kind.sends if send.name in heard)):
             self.write(expression)
 
     def column(self, names: Iterable[str]) -> Any:
@@ -97,7 +99,7 @@ class Writer:
 
     def read(self, crossings: Iterable[Crossing]) -> list[Crossing]:
         """Return the crossings whose symbols were needed."""
-        return [one for one in crossings if symbol(one.symbol) in self.known]
+        return [crossing for crossing in crossings if symbol(crossing.symbol) in self.known]
 
     def function(self, name: str, inputs: Mapping[str, Any], output: str, value: Any) -> Any:
         """Return the CasADi function of some columns that gives a value written in them.
@@ -185,11 +187,11 @@ class Writer:
             holds = self._build(expression.args[0], taken)
             within = [holds, casadi.logic_not(holds)]
             if taken is not None:
-                within = [casadi.logic_and(taken, one) for one in within]
+                within = [casadi.logic_and(taken, item) for item in within]
             return casadi.if_else(holds, *map(self._build, expression.args[1:], within))
         arguments = [self._build(argument, taken) for argument in expression.args]
         if taken is not None and name in _SOMEWHERE_NONE:
-            arguments = [casadi.if_else(taken, one, HARMLESS) for one in arguments]
+            arguments = [casadi.if_else(taken, argument, HARMLESS) for argument in arguments]
         function = _CASADI[name]
         return functools.reduce(function, arguments) if name in ("+", "max", "min") else function(*arguments)
 

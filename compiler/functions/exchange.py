@@ -96,7 +96,9 @@ class Timings:
             return parts
         tree = own[name].expression
         if tree is not None:
-            tree = renamed(tree, lambda one: self._parameter(one, kind) if ".".join(one) in own else one)
+            tree = renamed(
+                tree, lambda texts: self._parameter(texts, kind) if ".".join(texts) in own else texts
+            )
         return tuple(self.use(f"{kind.groups[0]}.{name}", replace(own[name], expression=tree)).split("."))
 
 
@@ -113,9 +115,10 @@ def used_links(scene: Scene, kinds: Sequence[Kind], timings: Timings) -> tuple[L
     heard = {receive.link for kind in kinds for clock in kind.clocks for receive in clock.receives}
     links = []
     for link in (link for link in scene.links if link.name in heard):
-        pairs = ((one, f"{link.name}.delays.{one.sender}.{one.receiver}") for one in link.delays)
+        pairs = ((delay, f"{link.name}.delays.{delay.sender}.{delay.receiver}") for delay in link.delays)
         delays = tuple(
-            PairDelay(one.sender, one.receiver, timings.use(name, one.delay)) for one, name in pairs
+            PairDelay(scene_delay.sender, scene_delay.receiver, timings.use(name, scene_delay.delay))
+            for scene_delay, name in pairs
         )
         delay, channel, its = timings.use(f"{link.name}.delay", link.delay), None, link.channel
         if its is not None:
@@ -172,9 +175,9 @@ def check_links(scene: Scene, kinds: Sequence[Kind], places: Sequence[int]) -> N
     """
     mistakes = Mistakes()
     for link in scene.links:
-        sent = [(kind.name, one.channels) for kind in kinds for one in kind.sends if one.link == link.name]
+        sent = [(kind.name, send.channels) for kind in kinds for send in kind.sends if send.link == link.name]
         every = [channel for _, channels in sent for channel in channels]
-        missing = ((name, one) for one in every for name, channels in sent if one not in channels)
+        missing = ((name, text) for text in every for name, channels in sent if text not in channels)
         for name, channel in islice(missing, 1):
             what = f"{channel} travels over {link.name}, and those of {name} send other values over it"
             hint = "a link of its own for what only some groups send"
@@ -184,7 +187,7 @@ def check_links(scene: Scene, kinds: Sequence[Kind], places: Sequence[int]) -> N
     for link in (link for link in scene.links if link.graph.shape == "arcs"):  # else all hear somebody
         owner = np.repeat(np.arange(len(groups)), counts)
         taken = [_taken(kinds[place], link.name) for place in places]
-        sends = [any(one.link == link.name for one in kinds[place].sends) for place in places]
+        sends = [any(send.link == link.name for send in kinds[place].sends) for place in places]
         senders, receivers = link.graph.arcs.T
         asking = np.flatnonzero(np.array(taken, dtype=bool)[owner])
         deaf = np.setdiff1d(asking, receivers[np.array(sends)[owner[senders]]])
@@ -207,8 +210,8 @@ def check_links(scene: Scene, kinds: Sequence[Kind], places: Sequence[int]) -> N
 
 def _taken(kind: Kind, link: str) -> str:
     """Return what a kind takes over those it hears over a link that is nothing over nobody, if anything."""
-    found = (one.operator for clock in kind.clocks for one in clock.receives if one.link == link)
-    return next((one for one in found if one in ("mean", "max", "min")), "")
+    found = (receive.operator for clock in kind.clocks for receive in clock.receives if receive.link == link)
+    return next((text for text in found if text in ("mean", "max", "min")), "")
 
 
 def compiled_groups(
@@ -244,7 +247,7 @@ def compiled_groups(
         columns = tuple(Column(name, numbers) for name, numbers in group.columns)
         found.append(Group(group.name, group.count, place, tuple(values), columns))
     for link in (link for link in scene.links if link.graph.shape != "complete"):
-        sending = [any(one.link == link.name for one in kind.sends) for kind in kinds]
+        sending = [any(send.link == link.name for send in kind.sends) for kind in kinds]
         silent = [group.name for group in found if not sending[group.kind]]
         if silent and any(count_of(link.name) in kind.parameters for kind in kinds):
             what = f"the graph of {link.name} joins all peers, and those of {silent[0]} send nothing over it"
@@ -287,7 +290,7 @@ def _named(
 ) -> Parameter:
     """Return a number as a parameter."""
     unit, formula = format_dimension(value.dimension), _formula(value.expression)
-    least, most = (None if one is None else float(one) for one in (minimum, maximum))
+    least, most = (None if item is None else float(item) for item in (minimum, maximum))
     return Parameter(
         name,
         unit,
@@ -307,7 +310,7 @@ def _declared(scene: Scene) -> dict[str, NumberParameter | Variable]:
     found: dict[str, NumberParameter | Variable] = {}
     for part in scene.parts:
         for declared in (part.component.variables, part.component.numbers):
-            found |= {f"{part.name}.{one.name}": one for one in declared}
+            found |= {f"{part.name}.{item.name}": item for item in declared}
     return found
 
 
@@ -355,12 +358,12 @@ def all_parameters(scene: Scene, kinds: Sequence[Kind], links: Sequence[Link]) -
         about, most = f"number of peers of group {group.name}", _most_peers(scene, group)
         found.append(_named(group_count(group.name), count, about, 1, most))
     found.append(Parameter(PEERS, "1", float(scene.peers), about="number of peers"))
-    return tuple({one.name: one for one in found}.values())
+    return tuple({parameter.name: parameter for parameter in found}.values())
 
 
 def _most_peers(scene: Scene, group: SceneGroup) -> float | None:
     """Return how many peers a group can have, the others as they are, by the components that say so."""
-    counts = {one.name: one.count for one in scene.groups}
+    counts = {group.name: group.count for group in scene.groups}
     room = [
         part.component.peers - sum(counts[name] for name in part.groups if name != group.name)
         for part in scene.parts
@@ -375,10 +378,10 @@ def followers_of(
     """Return the names of all numbers that follow from others, each behind what it follows from."""
     numbers: list[Parameter | Timing] = [*parameters, *timings]
     followed, names = TopologicalSorter[str](), set[str]()
-    for one in (*numbers, *(value for group in groups for value in group.values)):
-        if one.formula is not None:
-            followed.add(one.name, *one.formula.names)
-            names.add(one.name)
+    for item in (*numbers, *(value for group in groups for value in group.values)):
+        if item.formula is not None:
+            followed.add(item.name, *item.formula.names)
+            names.add(item.name)
     return tuple(name for name in followed.static_order() if name in names)
 
 

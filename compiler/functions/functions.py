@@ -66,12 +66,12 @@ def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
     while before < (before := sum(len(writer.known) for writer in writers)):  # until nothing new is read
         for writer in writers:
             writer.follow(heard)
-        receives = (one for writer in writers for one in writer.read(writer.kind.receives))
-        heard = list(dict.fromkeys(name for one in receives for name in one.sends))
+        receives = (number for writer in writers for number in writer.read(writer.kind.receives))
+        heard = list(dict.fromkeys(name for receive in receives for name in receive.sends))
     kinds = [_kind(writer, heard, timings) for writer in writers]
     dropped = []
     for kind, writer in zip(system.kinds, writers, strict=True):
-        unread = (one.variable for one in kind.clocked.holds if symbol(one.symbol) not in writer.known)
+        unread = (hold.variable for hold in kind.clocked.holds if symbol(hold.symbol) not in writer.known)
         dropped += [(name, "nobody reads this held value") for name in unread]
         dropped += [(send.name, "nobody hears it") for send in kind.sends if send.name not in heard]
     numbers = {group: i for i, kind in enumerate(system.kinds) for group in kind.clocked.flat.groups}
@@ -79,9 +79,11 @@ def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
     check_links(scene, kinds, places)
     links = used_links(scene, kinds, timings)
     clocks = used_clocks(scene, kinds, links, timings)
-    used = {one.name for one in links} | {one.name for one in clocks}  # no link has the name of a clock
-    dropped += [(one.name, "nobody hears what it would carry") for one in scene.links if one.name not in used]
-    dropped += [(one.name, "nothing ticks with it") for one in scene.clocks if one.name not in used]
+    used = {link.name for link in links} | {clock.name for clock in clocks}  # no link has the name of a clock
+    dropped += [
+        (link.name, "nobody hears what it would carry") for link in scene.links if link.name not in used
+    ]
+    dropped += [(clock.name, "nothing ticks with it") for clock in scene.clocks if clock.name not in used]
     parameters = all_parameters(scene, kinds, links)
     groups = compiled_groups(scene, kinds, places, links, timings)
     return CompiledSystem(
@@ -101,7 +103,9 @@ def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
         followers_of(parameters, timings.found, groups),
         warning_texts(scene.warnings),
         tuple(
-            Axis(f"{one.name}.delay", *one.within) for one in scene.links if one.within and one.name in used
+            Axis(f"{link.name}.delay", *link.within)
+            for link in scene.links
+            if link.within and link.name in used
         ),
     )
 
@@ -111,54 +115,54 @@ def _kind(writer: Writer, heard: Iterable[str], timings: Timings) -> Kind:
     kind, flat = writer.kind, writer.kind.clocked.flat
     holds, previous = writer.read(kind.clocked.holds), writer.read(kind.clocked.previous)
     sends = {send.name: send for send in kind.sends}
-    units = {one.name: format_dimension(one.dimension) for one in flat.variables}
+    units = {variable.name: format_dimension(variable.dimension) for variable in flat.variables}
     channels: dict[str, list[str]] = {}  # over each link, what is heard of this kind
     for name in (name for name in heard if name in sends):
         channels.setdefault(sends[name].link, []).append(name)
     outputs: dict[str, dict[str, None]] = {part.clock: {} for part in kind.partitions[1:]}
     switched: list[HoldCrossing | PreviousCrossing] = [*holds, *previous]
-    for one in switched:
-        outputs[one.clock][one.variable] = None
+    for item in switched:
+        outputs[item.clock][item.variable] = None
     parameters = tuple(sorted(writer.parameters))
 
     around = (
-        {"x": writer.column(kind.states), "u": writer.column(one.symbol for one in holds)},
+        {"x": writer.column(kind.states), "u": writer.column(hold.symbol for hold in holds)},
         {"p": casadi.vertcat(casadi.SX(0, 1), *map(writer.parameter, parameters)), "t": writer.known[TIME]},
     )
 
     def function(name: str, output: str, value: Any, between: Mapping[str, Any]) -> Any:
         return writer.function(name, {**around[0], **between, **around[1]}, output, value)
 
-    def edge(one: Heard, m: Any, r: Any) -> Any | None:
+    def edge(heard: Heard, m: Any, r: Any) -> Any | None:
         """Write what a reduction runs over, for one peer that hears and one that is heard, if anything."""
-        if one.edge is None:
+        if heard.edge is None:
             return None
-        theirs = [f"{OTHERS}.{name}" for name in channels[one.link]]
-        sent = writer.column([*theirs, HEARD_AGE] if one.age == "edge" else theirs)
-        value = writer.write(one.edge)
+        theirs = [f"{OTHERS}.{name}" for name in channels[heard.link]]
+        sent = writer.column([*theirs, HEARD_AGE] if heard.age == "edge" else theirs)
+        value = writer.write(heard.edge)
         if casadi.depends_on(value, r):
-            what = f"{one.symbol} asks of each other peer what depends on all that are heard"
+            what = f"{heard.symbol} asks of each other peer what depends on all that are heard"
             expected = "a mean or sum that is linear in what the others send"
-            raise ApcError(Mistake("E506", one.place, what, expected))
+            raise ApcError(Mistake("E506", heard.place, what, expected))
         return function("edge", "value", value, {"m": m, "s": sent})
 
     def clock(name: str, computed: Sequence[str]) -> ClockPartition:
         """Write what one clock's tick computes, from what is remembered and heard as well."""
-        received = [one for one in writer.read(kind.receives) if one.clock == name]
-        remembered = [one for one in previous if one.clock == name]
-        m, r = (writer.column(one.symbol for one in some) for some in (remembered, received))
+        received = [number for number in writer.read(kind.receives) if number.clock == name]
+        remembered = [previous_crossing for previous_crossing in previous if previous_crossing.clock == name]
+        m, r = (writer.column(item.symbol for item in some) for some in (remembered, received))
         return ClockPartition(
             name,
             tuple(computed),
             tuple(units[output] for output in computed),
-            tuple(computed.index(one.variable) for one in remembered),
-            tuple(one.variable for one in remembered),
+            tuple(computed.index(previous_crossing.variable) for previous_crossing in remembered),
+            tuple(previous_crossing.variable for previous_crossing in remembered),
             tuple(
                 Receive(
-                    *(one.symbol, one.operator, one.link, channels[one.link].index(one.send)),
-                    *(edge(one, m, r), one.age, one.before),
+                    *(heard.symbol, heard.operator, heard.link, channels[heard.link].index(heard.send)),
+                    *(edge(heard, m, r), heard.age, heard.before),
                 )
-                for one in received
+                for heard in received
             ),
             function(f"tick_{name}", "y", writer.column(computed), {"m": m, "r": r}),
         )
@@ -203,7 +207,7 @@ def _kind(writer: Writer, heard: Iterable[str], timings: Timings) -> Kind:
         tuple(send(link, listed) for link, listed in channels.items()),
         Ports(tuple(part for part, *_ in ports), port) if ports else None,
         hands=tuple(part.name for part in hands if "." not in part.name and _answers(part)),
-        limits=tuple(limit(one) for one in flat.variables if one.limit),
+        limits=tuple(limit(variable) for variable in flat.variables if variable.limit),
         held=tuple(
             dict.fromkeys(other for part in hands for _, other, _ in part.connections if other != GROUND)
         ),
@@ -225,8 +229,8 @@ def _held_ports(kind: SortedKind) -> Iterable[tuple[str, str, str, set[Symbol]]]
             for pair in zip(connector.potentials, connector.flows, strict=False):
                 if name in passed or pair[0].unit.dimension.multiply(pair[1].unit.dimension) != WORK:
                     continue  # it makes no work, or is the inner part's
-                potential, flow = (f"{part.name}.{name}.{one.name}" for one in pair)
-                at, through = (_follows_from(symbol(one), definitions) for one in (potential, flow))
+                potential, flow = (f"{part.name}.{name}.{variable.name}" for variable in pair)
+                at, through = (_follows_from(symbol(text), definitions) for text in (potential, flow))
                 own = {s for s in through if held.get(s) == part.name}
                 if own and not (through - own) & (moving | held.keys()) and not at & held.keys():
                     yield part.name, potential, flow, at | through
@@ -247,6 +251,10 @@ def _follows_from(wanted: Symbol, definitions: Mapping[Symbol, Definition]) -> s
 def _answers(part: Part) -> bool:
     """Say whether a hand answers to how it is moved; one that only pushes changes no stability."""
     component = part.component
-    moved = {(name, one.name) for name, connector in component.connectors for one in connector.potentials}
+    moved = {
+        (name, potential.name)
+        for name, connector in component.connectors
+        for potential in connector.potentials
+    }
     sides = [side for equation in component.equations for side in (equation.left, equation.right)]
     return bool(component.inner) or any(name.parts in moved for side in sides for name in names(side))

@@ -65,7 +65,7 @@ def read_probe(text: str) -> Probe | None:
 def _irtt(text: str) -> Probe | None:
     try:
         written = json.loads(text)
-        trips = {int(one["seqno"]): _round_trip(one) for one in written["round_trips"]}
+        trips = {int(item["seqno"]): _round_trip(item) for item in written["round_trips"]}
         interval = float(written["config"]["params"]["interval"]) * 1e-9
     except (ValueError, KeyError, TypeError, RecursionError):
         return None
@@ -79,11 +79,11 @@ def _irtt(text: str) -> Probe | None:
     return Probe("irtt", _in_order(trips, 0, max(trips)), interval)
 
 
-def _round_trip(one: dict[str, Any]) -> float:
+def _round_trip(item: dict[str, Any]) -> float:
     """Return a round trip of irtt in seconds, less what the server took for it; infinite if it was lost."""
-    if one["lost"] is not False and one["lost"] != "false":
+    if item["lost"] is not False and item["lost"] != "false":
         return math.inf
-    took = float(one["delay"]["rtt"]) * 1e-9
+    took = float(item["delay"]["rtt"]) * 1e-9
     return took if took >= 0 else math.nan
 
 

@@ -184,8 +184,10 @@ class GroupReader:
         for key, node in self._entry_by_entry(group):
             with mistakes:
                 what = f"set names {brief(key.text)}, which is no parameter or variable of a part"
-                if isinstance(node, MappingNode) and any(one.name == key.text for one in self.parts):
-                    pairs = [(own.text, one.text) for own, one in node.entries if isinstance(one, Scalar)]
+                if isinstance(node, MappingNode) and any(part.name == key.text for part in self.parts):
+                    pairs = [
+                        (own.text, scalar.text) for own, scalar in node.entries if isinstance(scalar, Scalar)
+                    ]
                     hint = ", ".join(f"{key.text}.{name}: {value}" for name, value in pairs)
                     raise fault("E206", key.place, what, hint=hint)
                 item, wholes = self._settable(key.text, key.place, group.name, "E206", what)
@@ -234,7 +236,7 @@ class GroupReader:
             known += [f"{part.name}.type" for part in self.parts if code == "E206" and "." not in part.name]
             raise unknown(code, place, what, name, known)
         part = wholes[0].rpartition(".")[0]
-        at = [name for one in self.parts if one.name == part for name in one.groups]
+        at = [name for item in self.parts if item.name == part for name in item.groups]
         if at and group not in at:
             what = f"{group} sets {name} and has no {part}, which is at {', '.join(at)}"
             raise fault("E211", place, what, hint=f"at: [{', '.join((*at, group))}]")
@@ -254,14 +256,14 @@ class GroupReader:
                 continue
             item, _ = self.settable[entry(key.text, 1)]
             assert isinstance(item, Number | Variable)
-            one = f"1 {item.unit.text}".removesuffix(" 1")
+            text = f"1 {item.unit.text}".removesuffix(" 1")
             nested = isinstance(node, Sequence) and any(isinstance(item, Sequence) for item in node.items)
             if not nested and group.table is None and "count" not in group.body.nodes:
                 what = f"{key.text} is a vector of {size}, and its list doesn't tell how many peers there are"
                 self.numbers.mistakes.add("E201", node.place, what, hint="count: 3")
             with self.numbers.mistakes:
                 rows = node.items if nested and isinstance(node, Sequence) else (node,)
-                columns = zip(*(list_of(row, key.text, size, one) for row in rows), strict=True)
+                columns = zip(*(list_of(row, key.text, size, text) for row in rows), strict=True)
                 for name, column in zip(entries(key.text, size), columns, strict=True):
                     yield replace(key, text=name), Sequence(column, node.place) if nested else column[0]
 
@@ -276,7 +278,9 @@ class GroupReader:
         if len(node.items) != count:
             expected, got = f"a value a peer, {count} in all", f"{len(node.items)}"
             raise fault("E208", node.place, f"the list of {what}", expected, got)
-        return np.array([float(self.numbers.read_for(one, what, item).number) for one in node.items])
+        return np.array(
+            [float(self.numbers.read_for(candidate, what, item).number) for candidate in node.items]
+        )
 
     def _add_followers(
         self, values: dict[str, Value], words: dict[str, str], columns: Collection[str], group: GroupBody

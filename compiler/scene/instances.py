@@ -58,9 +58,9 @@ class Part:
     def all_starts(self) -> Named[Value]:
         """The start values of all its variables that have one: those given here, else the component's own."""
         own = {
-            one.name: Value(one.start, one.unit.dimension, None, self.place)
-            for one in self.component.variables
-            if one.start is not None
+            variable.name: Value(variable.start, variable.unit.dimension, None, self.place)
+            for variable in self.component.variables
+            if variable.start is not None
         }
         return tuple((own | dict(self.starts)).items())
 
@@ -122,7 +122,7 @@ class PartReader:
             mistakes.add("E208", entry.place, shown, expected=f"{due} peers", got=f"{peers:,}", hint=hint)
         for index, element in enumerate(entries(name, entry.count or 0), 1):
             read = read_entry(entry, self.scope, mistakes, index)
-            values, starts = (self._settled(one, component) for one in (read.values, read.starts))
+            values, starts = (self._settled(pairs, component) for pairs in (read.values, read.starts))
             tables = self._tables(entry, dict(read.described))
             said = values, read.options, read.references, tables, starts, read.connections
             self._add(Part(element, entry.section, component, *said, shared, groups, entry.place))

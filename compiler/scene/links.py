@@ -178,7 +178,7 @@ def read_link(part: Part, entry: PartEntry, numbers: NamedNumbers) -> SceneLink:
         raise fault("E210", part.place, f"{told} it has no clock and delay", hint="type: Link")
     # Of a link's component nothing may be declared that no link obeys.
     obeyed = {*OBEYED, *(name for name, role in roles.items() if role != "link")}
-    declared = [one.name for one in (*component.variables, *component.parameters)]
+    declared = [item.name for item in (*component.variables, *component.parameters)]
     idle = [name for name in (*dict(component.connectors), *declared) if name not in obeyed]
     idle += ["equations"] * bool(component.equations or component.inner)
     if idle:

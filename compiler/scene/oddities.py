@@ -76,12 +76,12 @@ def oddities(
         # A mass is taken for a copy if a coupler follows the others by it alone, the same in all groups, and
         # something else of the peer moves it too.
         followed = [
-            one for one in hearing.values() if [other for _, other, _ in one.connections] == [part.name]
+            item for item in hearing.values() if [other for _, other, _ in item.connections] == [part.name]
         ]
         divided = [number.name for number in part.component.numbers if number.divided]
         own = {f"{part.name}.{name}" for name in divided}
-        own |= {f"{one.name}.{name}" for one in followed for name, _ in one.options}
-        touched = any(one is not part and one.name in anywhere for one in masses)
+        own |= {f"{part.name}.{name}" for part in followed for name, _ in part.options}
+        touched = any(mass is not part and mass.name in anywhere for mass in masses)
         said = entries[part.name.partition("[")[0]].body.get("shared") is not None
         if not said and followed and divided and touched and own.isdisjoint(given):
             follows = f"{part.name} follows the other peers' by {followed[0].name} and is not shared"
@@ -104,6 +104,6 @@ def _joined(parts: Sequence[Part]) -> DisjointSet:
 def warning_texts(warnings: Collection[Mistake]) -> tuple[str, ...]:
     """Return warnings as texts, each with its place in the topology, whose folder is left out."""
     return tuple(
-        f"{replace(one.place, file=one.place.file.rpartition('/')[2])}: {one.code} {one.sentence}"
-        for one in warnings
+        f"{replace(mistake.place, file=Path(mistake.place.file).name)}: {mistake.code} {mistake.sentence}"
+        for mistake in warnings
     )

@@ -56,28 +56,35 @@ def _entry(
     """Return a part's entry with the type that a group sets. Raises ApcError for one that doesn't fit."""
     old, hint = entry.component, f"{key.text}: {entry.component.name}"
     new = component_named(text_of(node, key.text, hint), node.place, parts.library, hint)
-    if entry.section == "links" or any(one.sends or one.hears_others for one in (old, new)):
+    if entry.section == "links" or any(component.sends or component.hears_others for component in (old, new)):
         what = f"{entry.name} sends or hears over a link, and is of one type at all peers"
         raise fault("E210", node.place, what)
     if _connectors(new) != _connectors(old):
         what = f"{key.text}, to take the place of {old.name},"
-        raise fault("E210", node.place, what, *(f"the connectors {_connectors(one)}" for one in (old, new)))
-    units = {one.name: one.unit for one in old.numbers}
-    for one in new.numbers:
-        before = units.get(one.name, one.unit)
-        if before.dimension != one.unit.dimension:
+        raise fault(
+            "E210",
+            node.place,
+            what,
+            *(f"the connectors {_connectors(component)}" for component in (old, new)),
+        )
+    units = {number.name: number.unit for number in old.numbers}
+    for number in new.numbers:
+        before = units.get(number.name, number.unit)
+        if before.dimension != number.unit.dimension:
             what = f"{key.text}, to take the place of {old.name},"
-            expected, got = (f"{one.name} in {unit.text}" for unit in (before, one.unit))
+            expected, got = (f"{number.name} in {unit.text}" for unit in (before, number.unit))
             raise fault("E210", node.place, what, expected, got)
     known = {*PART_KEYS, "type", *dict(new.connectors)}
-    known |= {one.name.partition("[")[0] for one in (*new.parameters, *new.variables)}
+    known |= {item.name.partition("[")[0] for item in (*new.parameters, *new.variables)}
     body = {name.text: (name, value) for name, value in entry.body.entries if name.text in known}
     for name, value in settings:
         part, _, own = name.text.rpartition(".")
         if part == entry.name and own in known and not isinstance(value, Sequence):
             body.setdefault(own, (replace(name, text=own), value))
     body.pop("type", None)
-    due = {f"{entry.name}.{one.name}": one.unit.text for one in new.numbers if one.default is None}
+    due = {
+        f"{entry.name}.{number.name}": number.unit.text for number in new.numbers if number.default is None
+    }
     if missing := {name: unit for name, unit in due.items() if name.rpartition(".")[2] not in body}:
         what = (
             f"{entry.name} as {new.name} has no {enumerated([name.rpartition('.')[2] for name in missing])}"

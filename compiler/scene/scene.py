@@ -222,7 +222,7 @@ class _Names:
         known = self.clocks if role == "clock" else self.links
         if word and word not in known and not (isinstance(node, Mapping) and node.get(word) is None):
             raise AlreadyReportedError
-        said = () if word else {one for entry in self.sections.entries.values() for one in entry.words}
+        said = () if word else {word for entry in self.sections.entries.values() for word in entry.words}
         return sorted(known, key=lambda name: name in said)
 
     def is_reported(self, name: str) -> bool:

@@ -91,7 +91,7 @@ def _item_among_keys(line: int, lines: Lines) -> Mistake | None:
 
 def _indented_further(line: int, lines: Lines) -> Mistake | None:
     """Return the mistake of a line that is indented further than the one above, whose key has a value."""
-    (text, place), (above, at) = (_code(one, lines) for one in (line, _line_above(line, lines)))
+    (text, place), (above, at) = (_code(number, lines) for number in (line, _line_above(line, lines)))
     if not (_KEY_AND_VALUE.match(text) and _KEY_AND_VALUE.match(above)) or place.column <= at.column:
         return None
     what = f"this line is indented by {place.column - 1} spaces, the one above it by {at.column - 1}"

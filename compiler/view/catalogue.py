@@ -58,7 +58,7 @@ def library_document(library: Library) -> dict[str, Any]:
 def _found(library: Library, name: str) -> Component | Connector:
     """Return a component or connector. Raises ApcError (E206) where the library has none of that name."""
     if (found := library.component(name) or library.connector(name)) is None:
-        names = {one.lower(): one for one in library.names}
+        names = {name.lower(): name for name in library.names}
         near = names.get(nearest(name.lower(), names), "")
         what = f"the library has no {name[:80] or 'nameless component'}"
         raise ApcError(Mistake("E206", Place("apc library"), what, hint=f"apc library {near}".rstrip()))
@@ -105,24 +105,24 @@ def component_document(library: Library, name: str) -> dict[str, Any]:
         "file": str(library.files[name]),
         "connectors": {own: its.name for own, its in whole.connectors},
         "parameters": [_parameter(own, entries) for own, entries in vectors.items()],
-        "equations": [*dict.fromkeys(one.text for one in whole.equations)],
+        "equations": [*dict.fromkeys(equation.text for equation in whole.equations)],
         "definitions": _definitions(library, name),
     }
 
 
 def _parameter(name: str, entries: list[Parameter]) -> dict[str, str]:
     """Return what a person reads of a parameter, or of the entries of a vector."""
-    one, unit, value, limits = entries[0], "", "needed" if is_required(entries[0]) else "", ""
-    if isinstance(one, Option):
-        value, limits = one.default or "needed", ", ".join(one.words)
-    elif not isinstance(one, Number):
-        limits = f"a {one.role}"
+    entry, unit, value, limits = entries[0], "", "needed" if is_required(entries[0]) else "", ""
+    if isinstance(entry, Option):
+        value, limits = entry.default or "needed", ", ".join(entry.words)
+    elif not isinstance(entry, Number):
+        limits = f"a {entry.role}"
     else:
-        unit, limits = one.unit.text, ", ".join([*limits_of(one), *(word for word, _ in one.words)])
+        unit, limits = entry.unit.text, ", ".join([*limits_of(entry), *(word for word, _ in entry.words)])
         if not value:
-            first, *more = (in_unit(one, getattr(each, "default", None)) for each in entries)
+            first, *more = (in_unit(entry, getattr(each, "default", None)) for each in entries)
             value = f"[{', '.join((first, *more))}]" if more else first
-    return {"name": name, "unit": unit, "value": value, "limits": limits, "about": one.about}
+    return {"name": name, "unit": unit, "value": value, "limits": limits, "about": entry.about}
 
 
 def _definitions(library: Library, name: str) -> dict[str, str]:

@@ -78,7 +78,11 @@ def build_diagram(scene: Scene) -> Diagram:
 
     for part in parts:
         if (name := shown(part.name)) not in boxes:
-            roles = {one.name: one.role for one in part.component.parameters if isinstance(one, Reference)}
+            roles = {
+                parameter.name: parameter.role
+                for parameter in part.component.parameters
+                if isinstance(parameter, Reference)
+            }
             named = [(roles[own], word) for own, word in part.references]
             clock = next((word for role, word in named if role == "clock"), "")
             lines = _part_lines(scene, part, sizes[name] if name != part.name else 1)
@@ -87,17 +91,17 @@ def build_diagram(scene: Scene) -> Diagram:
             sent += [Edge(name, f"link {link}", sent=True) for link in heard]
     for part in parts:
         for _, other, _ in part.connections:
-            one, two = shown(part.name), shown(other.partition(".")[0])
+            text, two = shown(part.name), shown(other.partition(".")[0])
             if other == GROUND:
-                two = f"{GROUND} of {one}"  # each has its own: the ground joins nothing
+                two = f"{GROUND} of {text}"  # each has its own: the ground joins nothing
                 boxes[two] = Box(two, GROUND, (GROUND,))
-            elif (boxes[one].role == "mass") == (boxes[two].role == "mass"):
+            elif (boxes[text].role == "mass") == (boxes[two].role == "mass"):
                 # Parts of one role are joined rigidly, at a point of its own: the graph has two sides.
-                middle = f"{one} and {two}"
+                middle = f"{text} and {two}"
                 boxes[middle] = Box(middle, "joint", (middle,))
-                joined[Edge(middle, one, sent=False)] = None
-                one = middle
-            joined[Edge(two, one, sent=False)] = None
+                joined[Edge(middle, text, sent=False)] = None
+                text = middle
+            joined[Edge(two, text, sent=False)] = None
     links, groups = [*map(_link_box, scene.links)], [*_group_boxes(scene)]
     sent += [Edge(link.key, group.key, sent=True) for link in links for group in groups]
     return Diagram(scene, (*boxes.values(), *links, *groups), (*joined, *sent))
@@ -114,7 +118,11 @@ def _part_lines(scene: Scene, part: Part, count: int) -> Iterator[str]:
         yield f"{count} of them"
     if component.name != DEFAULT_TYPES.get(part.section):
         yield component.name
-    axes = {whole_and_index(one.name)[1] for _, kind in component.connectors for one in kind.potentials}
+    axes = {
+        whole_and_index(potential.name)[1]
+        for _, kind in component.connectors
+        for potential in kind.potentials
+    }
     if part.section == "masses" and 2 in axes:
         yield "in space" if 3 in axes else "in a plane"
     if part.groups != tuple(group.name for group in scene.groups):

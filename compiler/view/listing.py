@@ -147,9 +147,9 @@ def schedule(system: CompiledSystem) -> dict[str, Any]:
                     *dict.fromkeys(
                         name
                         for kind in system.kinds
-                        for one in kind.clocks
-                        if one.clock == clock.name
-                        for name in one.outputs
+                        for item in kind.clocks
+                        if item.clock == clock.name
+                        for name in item.outputs
                     )
                 ],
                 "sends": [link.name for link in system.links if link.clock == clock.name],
@@ -176,9 +176,9 @@ def schedule(system: CompiledSystem) -> dict[str, Any]:
                     *dict.fromkeys(
                         name
                         for kind in system.kinds
-                        for one in kind.sends
-                        if one.link == link.name
-                        for name in one.channels
+                        for send in kind.sends
+                        if send.link == link.name
+                        for name in send.channels
                     )
                 ],
                 "period_s": float(periods[link.clock]),
@@ -225,5 +225,5 @@ def _shown(key: str, value: Any) -> str:
     if value is True:
         return name
     if key.endswith("_s"):
-        return f"{name} {' to '.join(seconds(Fraction(one)) for one in texts)}"
+        return f"{name} {' to '.join(seconds(Fraction(text)) for text in texts)}"
     return f"{name} {' and '.join(map(str, texts))}"

@@ -115,11 +115,13 @@ def _part(component: Component, quantities: dict[str, Schema]) -> Schema:
         properties[name] = {"$ref": "#/$defs/joined", "description": about}
     starts = (variable for variable in component.variables if variable.start is not None)
     for name, items in by_vector((*component.parameters, *starts)).items():
-        schemas = [_settable(name, one, quantities) for one in items]
+        schemas = [_settable(name, item, quantities) for item in items]
         size, about = len(schemas), schemas[0].get("description", "")
         vector = {"type": "array", "description": about, "prefixItems": schemas}
         properties[name] = schemas[0] if size == 1 else vector | {"minItems": size, "maxItems": size}
-    if any(isinstance(one, Reference) and one.role == "delays" for one in component.parameters):
+    if any(
+        isinstance(parameter, Reference) and parameter.role == "delays" for parameter in component.parameters
+    ):
         delay = properties["delay"]  # which of a link may be a range
         ends = {"type": "array", "prefixItems": [delay, delay], "minItems": 2, "maxItems": 2}
         properties["delay"] = {"anyOf": [delay, ends]}

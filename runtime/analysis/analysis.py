@@ -169,7 +169,7 @@ def _starting(
     used = {group.kind for group in system.groups}
     silent = False
     if any(at_start(sites[kind]) is None for kind in used):
-        silent = not any(reaches_start(system, one) for one in varied) and all(
+        silent = not any(reaches_start(system, free) for free in varied) and all(
             sends_nothing(system.kinds[group.kind], rows)
             for group, rows in zip(system.groups, resolve(system).parameters, strict=True)
         )
@@ -239,7 +239,7 @@ def analyze(
             spectrum, notes = _solve_populations(system, prepared, numbers, exchange)
         elif plan.method == "determinant":
             spectrum, notes = _solve_determinant(plan.loops), ()
-            small = all(one.states <= MOST_STATES for one in plan.loops)
+            small = all(loop.states <= MOST_STATES for loop in plan.loops)
             if (
                 method == "auto" and spectrum.stable is None and small
             ):  # matrices bound what the determinant leaves open
@@ -296,7 +296,7 @@ def _what_stands(spectrum: Spectrum, loops: Sequence[Loop], population: Sequence
     and what moves counts as a translation.
     """
     if not spectrum.rigid_modes or not any(
-        map(_remembers, (*population, *(g for one in loops for g in one.sites)))
+        map(_remembers, (*population, *(g for loop in loops for g in loop.sites)))
     ):
         return Standing(spectrum.rigid_modes, 0, spectrum.drifts, 0, ())
     listed: Sequence[tuple[Loop, int]] = [(loop, loop.multiplicity) for loop in loops]
@@ -305,14 +305,14 @@ def _what_stands(spectrum: Spectrum, loops: Sequence[Loop], population: Sequence
         listed = [*listed, (Loop(group.name, 1, (group,), anyhow), group.count)]
     with_drifts = bool(spectrum.drifts and loops)
     found = [(what_stands(loop, with_drifts=with_drifts), many) for loop, many in listed]
-    names = tuple(dict.fromkeys(name for one, _ in found for name in one.names))
-    unfelt = sum(one.unfelt * many for one, many in found)
+    names = tuple(dict.fromkeys(name for standing, _ in found for name in standing.names))
+    unfelt = sum(standing.unfelt * many for standing, many in found)
     if not loops:
         return Standing(spectrum.rigid_modes - unfelt, 0, spectrum.drifts, unfelt, names)
     return Standing(
-        translations=sum(one.translations * many for one, many in found),
-        rotations=sum(one.rotations * many for one, many in found),
-        drifts=sum(one.drifts * many for one, many in found),
+        translations=sum(standing.translations * many for standing, many in found),
+        rotations=sum(standing.rotations * many for standing, many in found),
+        drifts=sum(standing.drifts * many for standing, many in found),
         unfelt=unfelt,
         names=names,
     )
@@ -321,7 +321,7 @@ def _what_stands(spectrum: Spectrum, loops: Sequence[Loop], population: Sequence
 def _remembers(group: PeerGroup) -> bool:
     """Say whether peers keep more than lengths with their rates."""
     kind = group.jacobians.kind
-    return any(one.memories for one in kind.clocks) or any(
+    return any(clock.memories for clock in kind.clocks) or any(
         state.unit.partition("/")[0] != LENGTH for state in kind.states
     )
 
@@ -342,7 +342,10 @@ def _representatives(
 def _solve_closed(system: CompiledSystem, loops: Sequence[Loop], *, certify: bool) -> Spectrum:
     """Solve loops by their matrices."""
     closed = tuple(close_loop(loop) for loop in loops)
-    if not all(np.isfinite(one.matrix).all() and np.isfinite(one.error).all() for one in closed):
+    if not all(
+        np.isfinite(closed_system.matrix).all() and np.isfinite(closed_system.error).all()
+        for closed_system in closed
+    ):
         raise ApcError(Mistake("E806", Place(system.origin.topology), TOO_LARGE))
     return solve_spectrum(closed, certify=certify)
 

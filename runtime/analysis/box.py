@@ -108,23 +108,23 @@ def _parameter(system: CompiledSystem, free: Free) -> Parameter:
     name, group = free.name, free.group
     common = {parameter.name: parameter for parameter in system.parameters}
     times = {timing.name: timing.value for timing in system.timings}
-    delays = {one for link in system.links for one in (link.delay, *(pair.delay for pair in link.delays))}
+    delays = {text for link in system.links for text in (link.delay, *(pair.delay for pair in link.delays))}
     if name in delays:  # judged piece by piece
         return Parameter(name, "s", float(times[name]), minimum=0.0, exact=times[name])
     if name in scope_of(system).needed([*times]) or name not in common:
         what = f"{name} is a time, or sets one: what happens in a frame changes with it by jumps"
         rhythm = any(name in (clock.period, clock.phase) for clock in system.clocks)
         raise ApcError(Mistake("E831", _PLACE, what, hint="" if rhythm else f"apc critical {name}"))
-    for one in system.groups:
-        own = {value.name: value for value in one.values}
-        columns = {column.name for column in one.columns}
-        if group == one.name:
+    for item in system.groups:
+        own = {value.name: value for value in item.values}
+        columns = {column.name for column in item.columns}
+        if group == item.name:
             if name in columns:
                 raise ApcError(Mistake("E831", _PLACE, f"{name} differs from peer to peer of {group}"))
             return own.get(name, common[name])
         if group is None and (name in own or name in columns):
-            what = f"{name} is not the same for all: {one.name} has its own"
-            raise ApcError(Mistake("E831", _PLACE, what, hint=f"{one.name}.{name}=±1%"))
+            what = f"{name} is not the same for all: {item.name} has its own"
+            raise ApcError(Mistake("E831", _PLACE, what, hint=f"{item.name}.{name}=±1%"))
     return common[name]
 
 
@@ -147,7 +147,7 @@ def _check_limits(parameter: Parameter, low: Fraction, high: Fraction, name: str
         if parameter.minimum is not None and float(low) <= least:
             low = Fraction(least + (top - least) / 100 if parameter.open_minimum else least)
         hint = f"{name}={':'.join(shown(low, top))}" if low < top else ""
-        raise ApcError(replace(one, hint=hint) for one in mistakes.found)
+        raise ApcError(replace(mistake, hint=hint) for mistake in mistakes.found)
     mistakes.raise_if_any()
 
 
@@ -172,13 +172,13 @@ def open_systems(
     """
     if not ranges:
         raise ApcError(Mistake("E830", _PLACE, "no parameter is left open", hint="contact.stiffness=±1%"))
-    for one in ranges:
-        refuse_channel_number(system, one.free, _PLACE)
+    for interval in ranges:
+        refuse_channel_number(system, interval.free, _PLACE)
     found = open_sites(system, ranges, prepared, lambda changed: lifted_groups(changed, prepared=prepared))
     by_site = {id(group.site): found.sites[group.name] for group in found.groups}
     return [
-        (one, tuple(by_site[id(group.site)] for group in one.sites))
-        for one in split(found.groups, found.exchange)
+        (closed_system, tuple(by_site[id(group.site)] for group in closed_system.sites))
+        for closed_system in split(found.groups, found.exchange)
     ]
 
 
@@ -219,17 +219,17 @@ def open_sites(
     ApcError
         E831 a parameter left open twice, E832 a scene that is no rational function of the parameters.
     """
-    for place, one in enumerate(ranges):
-        if any(other.free.meets(one.free) for other in ranges[:place]):
-            raise ApcError(Mistake("E831", _PLACE, f"{one.free.label} has two ranges in one box"))
+    for place, interval in enumerate(ranges):
+        if any(other.free.meets(interval.free) for other in ranges[:place]):
+            raise ApcError(Mistake("E831", _PLACE, f"{interval.free.label} has two ranges in one box"))
     if not all(site.parameters_suffice for site in prepared.jacobians):
         what = f"{system.name} is not linear: where it is linearized may move with the parameters"
         raise ApcError(Mistake("E832", Place(system.origin.topology), what))
     field = Ratios.of(len(ranges))
     opened = [_opened(system, group, ranges, field) for group in system.groups]
     point = [
-        Override(one.free, one.low + GENERIC**place * (one.high - one.low))
-        for place, one in enumerate(ranges, 1)
+        Override(interval.free, interval.low + GENERIC**place * (interval.high - interval.low))
+        for place, interval in enumerate(ranges, 1)
     ]
     at = apply(system, point)
     groups, exchange = lifted(at)
@@ -246,7 +246,7 @@ def open_sites(
 def _members(group: PeerGroup, starts: NDArray[np.int64]) -> list[int]:
     """Return the scene's groups, of which `starts` are the first peers, that peers of a group are of."""
     if isinstance(group.peers, Runs):
-        ends = [(one.start, one.stop) for one in group.peers.ranges if len(one)]
+        ends = [(run.start, run.stop) for run in group.peers.ranges if len(run)]
         return [
             place
             for place, (first, last) in enumerate(itertools.pairwise(starts.tolist()))
@@ -257,7 +257,7 @@ def _members(group: PeerGroup, starts: NDArray[np.int64]) -> list[int]:
 
 def _reach(values: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
     """Return what of a group's parameters is open, in a form that can be compared."""
-    return tuple((name, f"{one.top}/{one.bottom}") for name, one in sorted(values.items()))
+    return tuple((name, f"{item.top}/{item.bottom}") for name, item in sorted(values.items()))
 
 
 def _opened(system: CompiledSystem, group: Group, ranges: Sequence[Range], field: Ratios) -> dict[str, Ratio]:
@@ -266,13 +266,13 @@ def _opened(system: CompiledSystem, group: Group, ranges: Sequence[Range], field
     scope = scope_of(system, group.values, fixed=columns)
     varying = scope.follow(dict.fromkeys(columns, True), lambda *_: True, lambda _: False)
     given = {
-        one.free.name: field.parameter(place)
-        for place, one in enumerate(ranges)
-        if one.free.group in (None, group.name)
+        interval.free.name: field.parameter(place)
+        for place, interval in enumerate(ranges)
+        if interval.free.group in (None, group.name)
     }
 
     def compute(name: str, formula: Formula, values: list[Any]) -> Any:
-        own = [one for one in formula.names if one in varying]
+        own = [name for name in formula.names if name in varying]
         if own:
             what = f"{name} depends on {own[0]}, which differs from peer to peer of {group.name}"
             raise ApcError(Mistake("E832", _PLACE, what))

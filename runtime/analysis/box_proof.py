@@ -128,9 +128,12 @@ def prove_box(
         opened = open_questions(system, ranges, prepared, inside)
 
         def is_unstable(point: Sequence[Fraction]) -> bool:
-            values = [Override(one.free, value) for one, value in zip(ranges, point, strict=True)]
-            one = analyze(apply(system, values), prepared=prepared)
-            return one.verdict == UNSTABLE or one.spectral_radius - one.spectral_radius_error > inside
+            values = [Override(interval.free, value) for interval, value in zip(ranges, point, strict=True)]
+            analysis = analyze(apply(system, values), prepared=prepared)
+            return (
+                analysis.verdict == UNSTABLE
+                or analysis.spectral_radius - analysis.spectral_radius_error > inside
+            )
 
         found = search_box(
             system.name,
@@ -213,7 +216,7 @@ def search_box(
     cells
         As of `prove_box`.
     """
-    whole: Cell = tuple((one.low, one.high) for one in ranges)
+    whole: Cell = tuple((interval.low, interval.high) for interval in ranges)
     looked, work = 0, 0.0
 
     def answer(verdict: str, left: float, point: Sequence[Fraction]) -> BoxProof:
@@ -230,12 +233,12 @@ def search_box(
     level = [whole]
     while level and not enough():
         halves, done = list[Cell](), 0
-        for cell, one in zip(level, looks(level), strict=False):
-            looked, done, work = looked + 1, done + 1, work + one.work
-            if one.unstable:
+        for cell, look in zip(level, looks(level), strict=False):
+            looked, done, work = looked + 1, done + 1, work + look.work
+            if look.unstable:
                 return answer(unstable, 1.0, middle(cell))
-            if one.reach is not None:
-                widest = int(np.argmax(one.reach))
+            if look.reach is not None:
+                widest = int(np.argmax(look.reach))
                 low, high = cell[widest]
                 for half in ((low, (low + high) / 2), ((low + high) / 2, high)):
                     halves.append((*cell[:widest], half, *cell[widest + 1 :]))

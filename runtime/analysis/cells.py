@@ -223,9 +223,9 @@ def _norm_below(matrix: Floats, limit: Floats) -> Truths:
 def _cholesky(matrix: Floats) -> Floats:
     """Return the lower triangular L (k, n, n) of matrices L Lᵀ, NaN where there is none."""
     found = np.full(matrix.shape, np.nan)
-    for place, one in enumerate(matrix):  # NumPy refuses a whole stack where it refuses one of it
+    for place, value in enumerate(matrix):  # NumPy refuses a whole stack where it refuses one of it
         with contextlib.suppress(np.linalg.LinAlgError):
-            found[place] = np.linalg.cholesky(one)
+            found[place] = np.linalg.cholesky(value)
     return found
 
 
@@ -246,7 +246,7 @@ def _change_of_basis(matrix: Floats) -> Floats:
     scale = balance(np.abs(matrix[some]).max(axis=0) + np.finfo(np.float64).tiny)
     balanced = matrix[some] / scale[:, None] * scale
     radius = np.abs(np.linalg.eigvals(balanced)).max(axis=1)
-    some, balanced, radius = (one[radius < 1] for one in (some, balanced, radius))
+    some, balanced, radius = (item[radius < 1] for item in (some, balanced, radius))
     if not len(some):
         return found
     power_of = balanced / (radius + DECAY * (1 - radius))[:, None, None]
@@ -272,7 +272,9 @@ def matrices_over(asked: OpenSystem, cells: Sequence[Cell]) -> Matrix:
     """
     maps = frames_over(asked.frames, cells)
     count = maps[0].p.shape[-3] - 2
-    heard = [Feedback(within(one.now, count), within(one.before, count)) for one in asked.feedback]
+    heard = [
+        Feedback(within(feedback.now, count), within(feedback.before, count)) for feedback in asked.feedback
+    ]
     closed = close(maps, heard, asked.system.layout, numbers=taylor(count)).matrix
     closed = np.broadcast_to(closed, (len(cells), *closed.shape[-3:]))
     at = replace(asked.relative, weights=within(asked.relative.weights, count))
@@ -298,13 +300,13 @@ def frames_over(asked: OpenFrames, cells: Sequence[Cell]) -> list[FrameMap]:
     parameters = _parameters(cells, wide=wide)
     count = len(parameters) if wide else 0
     numbers = taylor(count)
-    values = [_value(one, parameters, numbers) for one in asked.quotients]
+    values = [_value(quotient, parameters, numbers) for quotient in asked.quotients]
 
     def over(written: Matrix) -> Matrix:
-        one: _Written = written.item()
-        found = np.empty((len(cells), 2 + count, *one.still.shape[1:]))
-        found[:] = within(one.still, count)
-        for (row, column), place in one.moving.items():
+        item: _Written = written.item()
+        found = np.empty((len(cells), 2 + count, *item.still.shape[1:]))
+        found[:] = within(item.still, count)
+        for (row, column), place in item.moving.items():
             found[..., row, column] = values[place][..., 0, 0]
         return found
 
@@ -315,8 +317,8 @@ def frames_over(asked: OpenFrames, cells: Sequence[Cell]) -> list[FrameMap]:
         if key not in known:
             here = every_matrix(site, over)
             steps = {
-                one: step_over(here.a, here.b, float(one * schedule.quantum))
-                for one in step_durations(schedule)
+                number: step_over(here.a, here.b, float(number * schedule.quantum))
+                for number in step_durations(schedule)
             }
             known[key] = compose(here, schedule, steps, numbers=numbers)
         maps.append(known[key])
@@ -349,7 +351,10 @@ def _quotient(ratio: Ratio) -> tuple[Polynomial, Polynomial | None]:
     """Return a quotient as numerator and denominator, none where it is 1."""
     over = _fraction(ratio.bottom.leading_coefficient())
     top, bottom = (
-        [(tuple(map(int, powers)), _bounded(_fraction(one) / over)) for powers, one in part.to_dict().items()]
+        [
+            (tuple(map(int, powers)), _bounded(_fraction(item) / over))
+            for powers, item in part.to_dict().items()
+        ]
         for part in (ratio.top, ratio.bottom)
     )
     return top, None if ratio.bottom.is_constant() else bottom

@@ -42,14 +42,16 @@ def weights_of(loops: Sequence[OpenLoop]) -> Weights | str:
     loops
         All loops of a scene.
     """
-    drifting = [one for one in loops if one.seen]
+    drifting = [loop for loop in loops if loop.seen]
     if len(drifting) > 1:
-        names = " and ".join(one.name for one in drifting)
+        names = " and ".join(open_loop.name for open_loop in drifting)
         return f"with all contacts open, what may drift is of several modes: {names}"
     weights: dict[tuple[str, str, int], tuple[float, float]] = {}
-    for one in drifting:
-        moved, off = value_of(one.moved)[0], radius_of(one.moved)[0]
-        for port, share, count, m, doubt in zip(one.ports, one.seen, one.counts, moved, off, strict=True):
+    for open_loop in drifting:
+        moved, off = value_of(open_loop.moved)[0], radius_of(open_loop.moved)[0]
+        for port, share, count, m, doubt in zip(
+            open_loop.ports, open_loop.seen, open_loop.counts, moved, off, strict=True
+        ):
             if not share:
                 return f"{port[1]} does not hold what may drift with all contacts open"
             by = -1 / (float(share) * count)
@@ -60,44 +62,44 @@ def weights_of(loops: Sequence[OpenLoop]) -> Weights | str:
     return weights
 
 
-def least_of(one: OpenLoop, weights: Weights) -> float:
+def least_of(open_loop: OpenLoop, weights: Weights) -> float:
     """Return the least real part of a loop, weighted, at any frequency, less 1: above −1 it takes energy out.
 
     Parameters
     ----------
-    one, weights
+    open_loop, weights
         The loop, and the weights of its ticks.
     """
-    a, b, c, d, weight = (value_of(block) for block in _posed(one, weights))
-    root = np.sqrt(np.diag(value_of(_weigh(one, weights))))
+    a, b, c, d, weight = (value_of(block) for block in _posed(open_loop, weights))
+    root = np.sqrt(np.diag(value_of(_weigh(open_loop, weights))))
     scaled = b / root, c / root[:, None], d / np.outer(root, root)
     return least_real(a, *scaled, weight / np.outer(root, root) - np.eye(len(root)))[0]
 
 
-def is_proved(one: OpenLoop, weights: Weights) -> bool:
+def is_proved(open_loop: OpenLoop, weights: Weights) -> bool:
     """Say whether a loop, weighted, is proved to take energy out at all frequencies.
 
     Parameters
     ----------
-    one, weights
+    open_loop, weights
         As for `least_of`.
     """
-    return proves_positive(*_posed(one, weights))
+    return proves_positive(*_posed(open_loop, weights))
 
 
-def _posed(one: OpenLoop, weights: Weights) -> tuple[Matrix, Matrix, Matrix, Matrix, Matrix]:
+def _posed(open_loop: OpenLoop, weights: Weights) -> tuple[Matrix, Matrix, Matrix, Matrix, Matrix]:
     """Return A, B, C, D and W of a loop whose He(C (e^{jθ} − A)⁻¹ B + D) + W is to be positive."""
-    weigh = _weigh(one, weights)
-    half = RADII.multiply(np.swapaxes(one.moved / 2, -1, -2), one.moved)
-    c, d = (RADII.multiply(weigh, block) for block in (one.c, one.d))
+    weigh = _weigh(open_loop, weights)
+    half = RADII.multiply(np.swapaxes(open_loop.moved / 2, -1, -2), open_loop.moved)
+    c, d = (RADII.multiply(weigh, block) for block in (open_loop.c, open_loop.d))
     weight = RADII.subtract(weigh, half)
-    return one.a, one.b, c, d, weight
+    return open_loop.a, open_loop.b, c, d, weight
 
 
-def _weigh(one: OpenLoop, weights: Weights) -> Matrix:
+def _weigh(open_loop: OpenLoop, weights: Weights) -> Matrix:
     """Return the weights of a loop's ticks, of all their peers, on a diagonal with their radii."""
-    found = np.zeros((2, len(one.ports), len(one.ports)))
-    for k, (port, count) in enumerate(zip(one.ports, one.counts.tolist(), strict=True)):
+    found = np.zeros((2, len(open_loop.ports), len(open_loop.ports)))
+    for k, (port, count) in enumerate(zip(open_loop.ports, open_loop.counts.tolist(), strict=True)):
         value, radius = weights.get(port, (1.0, 0.0))
         found[:, k, k] = value * count, (radius + UNIT * value) * count * (1 + 4 * UNIT)
     return found

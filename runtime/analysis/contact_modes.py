@@ -109,7 +109,9 @@ def contact_modes(system: CompiledSystem, *, prepared: Prepared | None = None) -
     """
     prepared = prepared or prepare(system)
     switched = [find_switches(site.kind) for site in prepared.jacobians]
-    hidden = dict.fromkeys(one.kind.name for one in switched if not one.walkable)
+    hidden = dict.fromkeys(
+        switched_kind.kind.name for switched_kind in switched if not switched_kind.walkable
+    )
     notes = tuple(f"not looked into: {name}, which has a nonlinear loop" for name in hidden)
     parts = parts_of_kinds(system, switched, resolve(system))
     names = tuple(dict.fromkeys(part.name for listed in parts for part in listed))
@@ -119,8 +121,8 @@ def contact_modes(system: CompiledSystem, *, prepared: Prepared | None = None) -
         """Return the Jacobians of a kind with these parts on and all others off."""
         if not switched[kind].decisions:
             return prepared.jacobians[kind]
-        setting = settings((one for one in parts[kind] if one.name in on), on=True)
-        setting |= settings((one for one in parts[kind] if one.name not in on), on=False)
+        setting = settings((part for part in parts[kind] if part.name in on), on=True)
+        setting |= settings((part for part in parts[kind] if part.name not in on), on=False)
         return bind(switched[kind], prepared.jacobians[kind], setting)
 
     def mode(name: str, setting: _Setting) -> ContactMode:
@@ -172,9 +174,9 @@ def parts_of_kinds(
         E863 a part that takes too many decisions.
     """
     parts: list[tuple[SwitchingPart, ...]] = []
-    for index, one in enumerate(switched):
+    for index, switched_kind in enumerate(switched):
         rows = [numbers.parameters[g][0] for g, group in enumerate(system.groups) if group.kind == index]
-        parts.append(switching_parts(one, rows[0]) if rows else ())
+        parts.append(switching_parts(switched_kind, rows[0]) if rows else ())
     return parts
 
 

@@ -107,13 +107,13 @@ class Conventions(Result):
     @property
     def flips(self) -> bool:
         """Whether the verdict depends on the conventions."""
-        return len({(one.verdict, bool(one.refusal)) for one in self.outcomes}) > 1
+        return len({(outcome.verdict, bool(outcome.refusal)) for outcome in self.outcomes}) > 1
 
     @property
     def warning(self) -> str:
         """A warning in one sentence if the verdict flips, else ""."""
         default = self.outcomes[0]
-        other = next((one for one in self.outcomes if one.verdict != default.verdict), None)
+        other = next((outcome for outcome in self.outcomes if outcome.verdict != default.verdict), None)
         if other is None:
             return ""
         verdict = other.verdict or "not analysed"

@@ -102,7 +102,7 @@ def predict(system: CompiledSystem, groups: list[tuple[PeerGroup, tuple[Push, ..
     )
     if not frequency:
         return f"no buzz: with contacts of {gain:.6g} of their stiffness it drifts away without swinging"
-    bias = brentq(lambda one: gain_of(one) - gain, -1, 1, xtol=NEAR)
+    bias = brentq(lambda item: gain_of(item) - gain, -1, 1, xtol=NEAR)
     return Predicted(frequency, gain, bias, 0.5 + math.asin(bias) / math.pi, unstable)
 
 

@@ -113,26 +113,26 @@ def contact_groups(
     switched = [find_switches(kind) for kind in kinds_now]
     parts = parts_of_kinds(system, switched, numbers)
     on = tuple(
-        bind(one, site, settings(listed, on=True)) if one.decisions else site
-        for one, site, listed in zip(switched, prepared.jacobians, parts, strict=True)
+        bind(switched_kind, site, settings(listed, on=True)) if switched_kind.decisions else site
+        for switched_kind, site, listed in zip(switched, prepared.jacobians, parts, strict=True)
     )
     for place, group in enumerate(system.groups):
         vector = numbers.parameters[place][0]
-        for one in parts[group.kind]:
-            push = push_of(switched[group.kind], one, prepared.jacobians[group.kind], vector)
+        for part in parts[group.kind]:
+            push = push_of(switched[group.kind], part, prepared.jacobians[group.kind], vector)
             if isinstance(push, str):
                 return push
         if not on[group.kind].parameters_suffice:
             return f"some force at {group.name} is not linear, or looks at each of the others by itself"
     exchange = build_exchange(system, numbers.timings)
-    kinds = {id(one): kind for kind, one in enumerate(on)}
+    kinds = {id(site_jacobians): kind for kind, site_jacobians in enumerate(on)}
     found = []
     for peers in peer_groups(system, on, prepared.schedules, numbers, exchange):
         kind = kinds[id(peers.jacobians)]
         pushes = (
-            push_of(switched[kind], one, prepared.jacobians[kind], peers.parameters) for one in parts[kind]
+            push_of(switched[kind], part, prepared.jacobians[kind], peers.parameters) for part in parts[kind]
         )
-        found.append((peers, tuple(one for one in pushes if isinstance(one, Push))))
+        found.append((peers, tuple(push for push in pushes if isinstance(push, Push))))
     return found
 
 
@@ -146,20 +146,20 @@ def with_gain(group: PeerGroup, pushes: Sequence[Push], gain: Fraction) -> PeerG
     gain
         The factor.
     """
-    site, exact = (_pushing(one, pushes, gain) for one in (group.site, group.exact))
+    site, exact = (_pushing(linear_site, pushes, gain) for linear_site in (group.site, group.exact))
     return group.with_site(site, exact, group.schedule)
 
 
 def _pushing(site: LinearSite, pushes: Sequence[Push], gain: Fraction) -> LinearSite:
     """Return a site whose contacts push so many times as hard, of floats or rationals."""
     ticks = list(site.ticks)
-    for one in pushes:
-        tick = ticks[one.partition]
+    for push in pushes:
+        tick = ticks[push.partition]
         blocks = [block.copy() for block in (tick.x, tick.u, tick.m, tick.r)]
         for block in blocks:
-            block[one.output] *= gain if block.dtype == object else float(gain)
+            block[push.output] *= gain if block.dtype == object else float(gain)
         x, u, m, r = blocks
-        ticks[one.partition] = replace(tick, x=x, u=u, m=m, r=r)
+        ticks[push.partition] = replace(tick, x=x, u=u, m=m, r=r)
     return replace(site, ticks=tuple(ticks))
 
 
@@ -170,19 +170,19 @@ def open_loops(system: CompiledSystem, prepared: Prepared) -> list[OpenLoop] | s
         return groups
     opened: list[Opened] = []
     for group, pushes in groups:
-        for one in pushes:
-            if one.sector and not one.shares:
-                return one.sector
+        for push in pushes:
+            if push.sector and not push.shares:
+                return push.sector
         opened.append(_cut_open(group, pushes))
-    of_site = {id(one.group.lifting): one for one in opened}
+    of_site = {id(item.group.lifting): item for item in opened}
     exchange = build_exchange(system, resolve(system).timings)
-    loops = loops_at_right_angles([one.group for one in opened], exchange, MOST_STATES)
+    loops = loops_at_right_angles([item.group for item in opened], exchange, MOST_STATES)
     if isinstance(loops, str):
         return loops
     found = []
     for loop in loops:
         listed = [of_site[id(site.lifting)] for site in loop.sites]
-        size = loop.states + sum(len(one.ticks) for one in listed)
+        size = loop.states + sum(len(opened.ticks) for opened in listed)
         if size > MOST_STATES:
             return f"{size:,} states and ticks of contacts move together, and {MOST_STATES} are the most"
         one_open = _open_loop(loop, listed)
@@ -198,20 +198,20 @@ def _cut_open(group: PeerGroup, pushes: Sequence[Push]) -> Opened:
     steps = step_durations(schedule)
     found = discretize(bare.exact.a, bare.exact.b, [step * schedule.quantum for step in steps])
     off = {
-        step: with_radius(one.matrix, one.roundings * UNIT * one.size)
-        for step, one in zip(steps, found, strict=True)
+        step: with_radius(item.matrix, item.roundings * UNIT * item.size)
+        for step, item in zip(steps, found, strict=True)
     }
     ticks: list[tuple[str, int]] = []
     slopes = []
-    for one in pushes:
-        count = schedule.ticks[one.partition]
-        ticks += [(one.part, index) for index in range(count)]
-        slopes += [group.exact.ticks[one.partition].x[one.output]] * count
-    wide, whole = with_cuts(group.site, schedule, [(one.partition, one.output) for one in pushes])
+    for push in pushes:
+        count = schedule.ticks[push.partition]
+        ticks += [(push.part, index) for index in range(count)]
+        slopes += [group.exact.ticks[push.partition].x[push.output]] * count
+    wide, whole = with_cuts(group.site, schedule, [(push.partition, push.output) for push in pushes])
     wide_map = compose(with_roundings(wide), whole, off, numbers=RADII)
     followed = np.array(slopes, dtype=object).reshape(len(ticks), len(bare.exact.a))
-    plain = not any(one.slopes[one.states :].any() for one in pushes)
-    jumps = next((one.part for one in pushes if one.sector), "")
+    plain = not any(push.slopes[push.states :].any() for push in pushes)
+    jumps = next((push.part for push in pushes if push.sector), "")
     return Opened(bare, wide_map, len(bare.z_names), tuple(ticks), followed, plain, jumps)
 
 
@@ -220,27 +220,29 @@ def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop | str:
     free = find_rigid_modes(close_loop(loop))
     if free.drifts:
         return "with all contacts open, something drifts ever farther"
-    names = [(*one.group.z_names, *(f"{part}[{tick}]" for part, tick in one.ticks)) for one in opened]
+    names = [(*item.group.z_names, *(f"{part}[{tick}]" for part, tick in item.ticks)) for item in opened]
     layout = lay_out(names, [site.schedule for site in loop.sites])
     closed = close_outside(
-        loop, [one.map for one in opened], [len(one.ticks) for one in opened], layout, numbers=RADII
+        loop, [item.map for item in opened], [len(item.ticks) for item in opened], layout, numbers=RADII
     ).matrix
     n, listed = len(layout.names), list(zip(loop.sites, opened, layout.offsets, strict=True))
-    outside = np.concatenate([offset + one.states + np.arange(len(one.ticks)) for _, one, offset in listed])
+    outside = np.concatenate(
+        [offset + opened.states + np.arange(len(opened.ticks)) for _, opened, offset in listed]
+    )
     own = np.delete(np.arange(n), outside)
     a, b = (closed[:, own][..., which] for which in (own, slice(n, None)))
     c, d = (closed[:, outside][..., which] for which in (own, slice(n, None)))
-    ports = tuple((site.name, *tick) for site, one, _ in listed for tick in one.ticks)
+    ports = tuple((site.name, *tick) for site, opened, _ in listed for tick in opened.ticks)
     at = with_doubt(relative_coordinates(free.basis))
     shares, moved = np.zeros(0, dtype=object), np.zeros((2, 1, len(ports)))
     if free.exact:
-        if not all(one.plain for one in opened):
+        if not all(item.plain for item in opened):
             return _MORE
         motions = np.array(free.exact, dtype=object).T
         left = _left_vectors(a, motions, at.held)
         if left is None:
             return "what moves with all contacts open can't be told from what drifts"
-        rows = [(one.slopes, np.searchsorted(own, offset)) for _, one, offset in listed]
+        rows = [(opened.slopes, np.searchsorted(own, offset)) for _, opened, offset in listed]
         followed = np.concatenate(
             [slopes @ motions[start : start + slopes.shape[1]] for slopes, start in rows], axis=0
         )
@@ -261,10 +263,10 @@ def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop | str:
         c=negated(c[..., at.rest]),
         d=negated(d),
         ports=ports,
-        counts=np.array([float(site.count) for site, one, _ in listed for _ in one.ticks]),
+        counts=np.array([float(site.count) for site, opened, _ in listed for _ in opened.ticks]),
         seen=tuple(shares),
         moved=moved,
-        jumps=next((one.jumps for one in opened if one.jumps), ""),
+        jumps=next((item.jumps for item in opened if item.jumps), ""),
     )
 
 

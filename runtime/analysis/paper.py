@@ -215,8 +215,8 @@ class _OpenLoop:
     @property
     def depths(self) -> list[int]:
         """How many values of each input, and of each row of y_n, are on their way at a frame's start."""
-        frames = [-(-one.delay // self.ratio) for one in self.slow]
-        return [one.delay for one in self.fast] + frames + [one.delay for one in self.heard]
+        frames = [-(-item.delay // self.ratio) for item in self.slow]
+        return [item.delay for item in self.fast] + frames + [item.delay for item in self.heard]
 
     @property
     def starts(self) -> list[int]:
@@ -227,7 +227,7 @@ class _OpenLoop:
 
 def _weights(signals: Sequence[_Signal], width: int) -> Matrix:
     """Return the exact weights of signals (len(signals), width)."""
-    return np.array([one.weights for one in signals], dtype=object).reshape(len(signals), width)
+    return np.array([signal.weights for signal in signals], dtype=object).reshape(len(signals), width)
 
 
 def _floats(signals: Sequence[_Signal], width: int) -> Floats:
@@ -259,9 +259,9 @@ def _open_loop(system: CompiledSystem, whole: ClosedSystem) -> _OpenLoop:
     ]
     heard: dict[tuple[int, Way, str], _Signal] = {}
     for i, group in enumerate(sites):
-        several = len({one.way.delay for one in group.schedule.heard}) > 1
+        several = len({heard.way.delay for heard in group.schedule.heard}) > 1
         places = (
-            (p, k) for p, one in enumerate(group.jacobians.kind.clocks) for k in range(len(one.receives))
+            (p, k) for p, clock in enumerate(group.jacobians.kind.clocks) for k in range(len(clock.receives))
         )
         for way, channel in (pair for place in places for pair in group.schedule.ways(*place)):
             row = np.full(n, Fraction(0), dtype=object)
@@ -306,19 +306,21 @@ def _open_loop(system: CompiledSystem, whole: ClosedSystem) -> _OpenLoop:
         a, b = (block_diag(*listed) for listed in zip(*split, strict=True))
         return np.hstack([a, b[:, columns[0]], b[:, columns[1]]])
 
-    known = {id(one.site): discretize(one.exact.a, one.exact.b, [period])[0] for one in sites}
-    steps = [known[id(one.site)] for one in sites]
+    known = {id(site.site): discretize(site.exact.a, site.exact.b, [period])[0] for site in sites}
+    steps = [known[id(site.site)] for site in sites]
     return _OpenLoop(
         ratio=ratio,
         period=period,
-        states=tuple(f"{group.name}.{one.name}" for group in sites for one in group.jacobians.kind.states),
+        states=tuple(
+            f"{group.name}.{state.name}" for group in sites for state in group.jacobians.kind.states
+        ),
         fast=tuple(fast),
         slow=tuple(slow),
         heard=tuple(heard.values()),
-        ab=side_by_side(np.hstack([one.site.a, one.site.b]) for one in sites),
+        ab=side_by_side(np.hstack([site.site.a, site.site.b]) for site in sites),
         step=with_radius(
-            side_by_side(one.matrix for one in steps),
-            side_by_side(one.roundings * UNIT * one.size for one in steps),
+            side_by_side(step.matrix for step in steps),
+            side_by_side(step.roundings * UNIT * step.size for step in steps),
         ),
     )
 
@@ -342,7 +344,7 @@ def _lift(loop: _OpenLoop) -> FrameMap:
 
     course = [unit[:, (ratio - 1) * n : ratio * n]]
     for tick in range(ratio):
-        late = [tick - one.delay for one in inputs]
+        late = [tick - item.delay for item in inputs]
         acting = [value(i, by if i < n_c else by // ratio) for i, by in enumerate(late)]
         course.append(RADII.multiply(loop.step, np.concatenate([course[-1], unit[:, acting]], axis=1)))
     waiting, outputs = [], []
@@ -351,10 +353,10 @@ def _lift(loop: _OpenLoop) -> FrameMap:
         columns = [value(i, newest - age) for age in range(1, loop.depths[i] + 1)]
         waiting.append(unit[:, np.array(columns, dtype=np.intp)])
     heard = RADII.multiply(rounded(_floats(loop.heard, n)), course[0])
-    for row, (one, start) in enumerate(zip(loop.heard, starts[len(inputs) :], strict=False)):
-        line = np.concatenate([heard[:, row : row + 1], unit[:, start : start + one.delay]], axis=1)
-        waiting.append(line[:, : one.delay])
-        outputs.append(line[:, one.delay :])
+    for row, (item, start) in enumerate(zip(loop.heard, starts[len(inputs) :], strict=False)):
+        line = np.concatenate([heard[:, row : row + 1], unit[:, start : start + item.delay]], axis=1)
+        waiting.append(line[:, : item.delay])
+        outputs.append(line[:, item.delay :])
     moved = np.concatenate([*course[1:], *waiting], axis=1)
     seen = np.concatenate([*course[:-1], *outputs], axis=1)
     return FrameMap(moved[..., :size], moved[..., size:], seen[..., :size], seen[..., size:])
@@ -376,12 +378,12 @@ def _close(delayed: FrameMap, f: Floats) -> Matrix:
 def _named(loop: _OpenLoop) -> PaperRoute:
     """Return every matrix with the names of its rows and columns."""
     n, ratio = len(loop.states), loop.ratio
-    fast, slow = (tuple(replace(one, delay=0) for one in signals) for signals in (loop.fast, loop.slow))
-    at_once = replace(loop, fast=fast, slow=slow, heard=tuple(replace(one, delay=0) for one in loop.heard))
+    fast, slow = (tuple(replace(signal, delay=0) for signal in signals) for signals in (loop.fast, loop.slow))
+    at_once = replace(loop, fast=fast, slow=slow, heard=tuple(replace(item, delay=0) for item in loop.heard))
     f, lifted, delayed = _feedback(loop), _lift(at_once), _lift(loop)
     closed = value_of(_close(delayed, f))
     ticks = [float(j * loop.period * 1000) for j in range(1 - ratio, ratio)]
-    forces, received, heard = ([one.name for one in signals] for signals in (fast, slow, loop.heard))
+    forces, received, heard = ([signal.name for signal in signals] for signals in (fast, slow, loop.heard))
     stacked = _timed(loop.states, ticks[:ratio])
     augmented = (*stacked, *_waiting_names(loop))
     inputs = (*_timed(forces, ticks[ratio - 1 :]), *received)
@@ -424,8 +426,8 @@ def _waiting_names(loop: _OpenLoop) -> tuple[str, ...]:
     frame = loop.ratio * loop.period
     signals = (*loop.fast, *loop.slow, *loop.heard)
     return tuple(
-        f"{one.name}({-age * float((loop.period if i < len(loop.fast) else frame) * 1000):.6g} ms)"
-        for i, (one, depth) in enumerate(zip(signals, loop.depths, strict=True))
+        f"{signal.name}({-age * float((loop.period if i < len(loop.fast) else frame) * 1000):.6g} ms)"
+        for i, (signal, depth) in enumerate(zip(signals, loop.depths, strict=True))
         for age in range(1, depth + 1)
     )
 
@@ -497,10 +499,10 @@ def _periods(system: CompiledSystem, sites: Sequence[PeerGroup]) -> tuple[Fracti
         for hold, acting in zip(group.jacobians.kind.holds, group.schedule.acting, strict=True)
         if acting is not None
     ]
-    ways = [one.way for group in sites for one in group.schedule.heard]
+    ways = [heard.way for group in sites for heard in group.schedule.heard]
     forces = dict.fromkeys(hold.clock for hold in holds)
     networks = dict.fromkeys(link_clock[way.link] for way in ways)
-    missing = [text for group in {id(one.site): one for one in sites}.values() for text in _misfits(group)]
+    missing = [text for group in {id(site.site): site for site in sites}.values() for text in _misfits(group)]
     for what, found in (("clock of forces", forces), ("network clock", networks)):
         if len(found) != 1:
             listed = f"here are {' and '.join(found)}" if found else "here is none"
@@ -517,8 +519,8 @@ def _periods(system: CompiledSystem, sites: Sequence[PeerGroup]) -> tuple[Fracti
         (apart / period, f"ticks of {slow.name} that fall on ticks of {fast.name}"),
     ]
     whole += [
-        (timings[one.delay] / period, f"a computational delay of {one.name} of whole ticks of {fast.name}")
-        for one in holds
+        (timings[hold.delay] / period, f"a computational delay of {hold.name} of whole ticks of {fast.name}")
+        for hold in holds
     ]
     whole += [
         (timings[way.delay] / frame, f"a delay of {way.link} of whole ticks of {slow.name}") for way in ways

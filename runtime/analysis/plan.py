@@ -182,8 +182,8 @@ def _sizes(loops: Sequence[Loop], method: str) -> tuple[tuple[int, int], ...]:
 
 def _determinant_bytes(loop: Loop) -> int:
     """Return what the sites of a loop take, each known by what all send and hear."""
-    entries = sum(len(one.schedule.sent) for one in loop.sites) * sum(
-        len(one.schedule.heard) for one in loop.sites
+    entries = sum(len(site.schedule.sent) for site in loop.sites) * sum(
+        len(site.schedule.heard) for site in loop.sites
     )
     return (KEPT_OF_SITE * len(loop.sites) + SITE_AT_WORK) * entries
 

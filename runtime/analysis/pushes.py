@@ -74,14 +74,14 @@ def push_of(
     """
     symbols = [switched.decisions[place].symbol for place in part.decisions]
     touched = [
-        (one, row)
-        for one in switched.functions
-        for row in range(one.output.numel())
-        if any(casadi.depends_on(one.output[row], symbol) for symbol in symbols)
+        (function, row)
+        for function in switched.functions
+        for row in range(function.output.numel())
+        if any(casadi.depends_on(function.output[row], symbol) for symbol in symbols)
     ]
-    if any(one.where[0] == "derivative" for one, _ in touched):
+    if any(item.where[0] == "derivative" for item, _ in touched):
         return f"{part.name} acts at every moment, not from tick to tick"
-    if any(one.where[0] != "tick" for one, _ in touched):
+    if any(item.where[0] != "tick" for item, _ in touched):
         return f"{part.name} depends on each of the others by itself"
     if len(touched) > 1:
         return f"{part.name} is more than one force"
@@ -95,7 +95,9 @@ def push_of(
     slopes = jacobian(everything, moving)
     if casadi.depends_on(slopes, moving):
         return f"{part.name} is not linear where it pushes"
-    others = [one.symbol for place, one in enumerate(switched.decisions) if place not in part.decisions]
+    others = [
+        decision.symbol for place, decision in enumerate(switched.decisions) if place not in part.decisions
+    ]
     if any(casadi.depends_on(everything, other) for other in others):
         return f"{part.name} depends on what another part decides"
     decided = casadi.vertcat(*symbols)
@@ -105,7 +107,7 @@ def push_of(
 
     def piece(setting: Sequence[bool]) -> tuple[Floats, Floats]:
         """Return force and guards at the start with these decisions, and their slopes."""
-        values, slopes = pieces(start, parameters, [float(one) for one in setting])
+        values, slopes = pieces(start, parameters, [float(flag) for flag in setting])
         return np.asarray(values).ravel(), np.asarray(slopes).reshape(-1, len(start))
 
     values, steepest = piece(part.on)
@@ -113,7 +115,7 @@ def push_of(
     if not square:
         return None
     offset = float(values[0] - line @ start)
-    tick, sizes = switched.kind.clocks[partition].tick, [one.numel() for one in inputs]
+    tick, sizes = switched.kind.clocks[partition].tick, [item.numel() for item in inputs]
 
     def force_at(y: float) -> float:
         """Return the force where y is so much, by a motion along its slopes."""
@@ -153,7 +155,7 @@ def _sector(force_at: Callable[[float], float], breaks: Sequence[float], size: f
 
     `size` is that of the numbers y is made of.
     """
-    ends = [one for k, one in enumerate(breaks) if not k or one - breaks[k - 1] > ROUNDED * size]
+    ends = [value for k, value in enumerate(breaks) if not k or value - breaks[k - 1] > ROUNDED * size]
     knots = np.array([ends[0] - FAR * size, *ends, ends[-1] + FAR * size])
     at_knots = np.array([force_at(y) for y in knots])
     amid = np.array([force_at(y) for y in (knots[1:] + knots[:-1]) / 2])

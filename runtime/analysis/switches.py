@@ -115,10 +115,10 @@ class _Walk:
 
     def decide(self, word: str, operands: Sequence[_Step]) -> _Step:
         """Return the symbol of a decision between these operands."""
-        number = self.number(("decision", word, *(one.number for one in operands)))
+        number = self.number(("decision", word, *(operand.number for operand in operands)))
         if number not in self.symbols:
             self.symbols[number] = casadi.SX.sym(f"d{len(self.symbols)}")
-            self.operands[number] = [one.expression for one in operands]
+            self.operands[number] = [operand.expression for operand in operands]
         return _Step(self.symbols[number], number, moves=False, decided=True)
 
     def open(self, function: Any, names: Sequence[str]) -> tuple[tuple[Any, ...], Any]:
@@ -130,8 +130,8 @@ class _Walk:
         inputs = tuple(casadi.SX.sym(name, function.sparsity_in(i)) for i, name in enumerate(names))
         steps = [
             _Step(entry, self.number((name, place)), name not in ("p", "t"), decided=False)
-            for name, one in zip(names, inputs, strict=True)
-            for place, entry in enumerate(casadi.vertsplit(one.nz[:]) if one.nnz() else [])
+            for name, expression in zip(names, inputs, strict=True)
+            for place, entry in enumerate(casadi.vertsplit(expression.nz[:]) if expression.nnz() else [])
         ]
         steps += [
             _Step(casadi.SX(value), self.number(("constant", value)), False, False)
@@ -153,10 +153,10 @@ class _Walk:
 
     def apply(self, word: str, *operands: _Step) -> _Step:
         """Return an operation of the function, or what a decision makes of it."""
-        number = self.number((word, *(one.number for one in operands)))
-        moves = any(one.moves for one in operands)
-        decided = any(one.decided for one in operands)
-        values = [one.expression for one in operands]
+        number = self.number((word, *(operand.number for operand in operands)))
+        moves = any(operand.moves for operand in operands)
+        decided = any(operand.decided for operand in operands)
+        values = [operand.expression for operand in operands]
         if moves and word in ("lt", "le"):
             return self.decide(word, operands)
         if moves and word in _POINTS:
@@ -185,9 +185,9 @@ def find_switches(kind: Kind) -> SwitchedKind:
     decisions = []
     for number, symbol in opening.symbols.items():
         changed: dict[str, None] = {}
-        for one in opened:
-            if casadi.depends_on(one.output, symbol):
-                changed |= dict.fromkeys(_changed(kind, one, symbol, opening.operands[number]))
+        for item in opened:
+            if casadi.depends_on(item.output, symbol):
+                changed |= dict.fromkeys(_changed(kind, item, symbol, opening.operands[number]))
         first, *others = opening.operands[number]
         # Of a sign there is one operand.
         decisions.append(Decision(symbol, tuple(changed), first - others[0] if others else first))
@@ -202,10 +202,10 @@ def varying_slopes(site: SiteJacobians) -> tuple[str, ...]:
     if not site.timed:
         return ()
     found: dict[str, None] = {}
-    for one in find_switches(site.kind).functions:
-        *moving, _, t = one.inputs
-        slopes = jacobian(one.output, casadi.vertcat(*moving))
-        found |= dict.fromkeys(one.names(slopes, t))
+    for function in find_switches(site.kind).functions:
+        *moving, _, t = function.inputs
+        slopes = jacobian(function.output, casadi.vertcat(*moving))
+        found |= dict.fromkeys(function.names(slopes, t))
     return tuple(found)
 
 
@@ -227,7 +227,7 @@ def switching_parts(switched: SwitchedKind, parameters: NDArray[np.float64]) -> 
     parts = []
     for places in _together(switched.decisions):
         names = list(dict.fromkeys(name for place in places for name in switched.decisions[place].changes))
-        owners = {one.rpartition(".")[0] or one for one in names}
+        owners = {name.rpartition(".")[0] or name for name in names}
         name = owners.pop() if len(names) > 1 and len(owners) == 1 else ", ".join(names)
         if len(places) > MOST_DECISIONS:
             what = (
@@ -271,15 +271,15 @@ def _functions(kind: Kind) -> list[tuple[tuple[str, int, int], Any, tuple[str, .
                 edge = ("x", "u", f"m{p}", f"s {receive.link}", "p", "t")
                 listed.append((("edge", p, place), receive.edge, edge, (receive.name,)))
     listed += [
-        (("send", p, 0), one.send, ("x", "u", "p", "t"), one.channels) for p, one in enumerate(kind.sends)
+        (("send", p, 0), send.send, ("x", "u", "p", "t"), send.channels) for p, send in enumerate(kind.sends)
     ]
     return listed
 
 
-def _changed(kind: Kind, one: _Opened, symbol: Any, operands: Sequence[Any]) -> list[str]:
+def _changed(kind: Kind, opened: _Opened, symbol: Any, operands: Sequence[Any]) -> list[str]:
     """Return the names of what a decision changes in a function."""
-    what, p, place = one.where
-    changed = one.names(one.output, symbol)
+    what, p, place = opened.where
+    changed = opened.names(opened.output, symbol)
     if what == "edge":  # what is computed of what is heard
         partition = kind.clocks[p]
         inputs = partition.tick.sx_in()
@@ -289,7 +289,7 @@ def _changed(kind: Kind, one: _Opened, symbol: Any, operands: Sequence[Any]) -> 
     if what != "derivative":
         return changed
     # A continuous force has no name in the equations of motion; the part whose parameters decide has.
-    symbols = casadi.vertsplit(one.inputs[2]) if kind.parameters else []
+    symbols = casadi.vertsplit(opened.inputs[2]) if kind.parameters else []
     moving = {state.name.rpartition(".")[0] for state in kind.states}
     owners = dict.fromkeys(
         name.rpartition(".")[0]
@@ -321,7 +321,7 @@ def _extremes(
     for setting in itertools.product((True, False), repeat=len(places)):
         site = jacobians(_bound(switched, dict(zip(places, setting, strict=True))))
         x, u, m = start_values(site, list(parameters))
-        memories = [value for one in m for value in one]
+        memories = [value for item in m for value in item]
         heard = [0.0] * site.function.numel_in(3)
         flat = np.asarray(site.function(x, u, memories, heard, parameters, 0.0), dtype=np.float64).ravel()
         for edge in site.edges.values():
@@ -344,7 +344,7 @@ def _patterns(site: SiteJacobians) -> list[NDArray[Any]]:
     pattern = site.pattern
     listed = [pattern.a, pattern.b]
     for tick in pattern.ticks:
-        channels = np.array([len(one) for one in tick.channels], dtype=np.int64)
+        channels = np.array([len(channel) for channel in tick.channels], dtype=np.int64)
         listed += [tick.x, tick.u, tick.m, tick.r * channels]
     for send in pattern.sends:
         listed += [send.x, send.u]
@@ -358,9 +358,13 @@ def _bound(switched: SwitchedKind, settings: Mapping[int, bool]) -> Kind:
         *(casadi.SX(float(settings.get(place, False))) for place in range(len(switched.decisions)))
     )
     found: dict[tuple[str, int, int], Any] = {}
-    for one in switched.functions:
-        output = casadi.substitute(one.output, symbols, values) if switched.decisions else one.output
-        found[one.where] = casadi.Function(one.where[0], list(one.inputs), [casadi.sparsify(output)])
+    for function in switched.functions:
+        output = (
+            casadi.substitute(function.output, symbols, values) if switched.decisions else function.output
+        )
+        found[function.where] = casadi.Function(
+            function.where[0], list(function.inputs), [casadi.sparsify(output)]
+        )
     kind = switched.kind
     clocks = tuple(
         replace(
@@ -373,5 +377,5 @@ def _bound(switched: SwitchedKind, settings: Mapping[int, bool]) -> Kind:
         )
         for p, partition in enumerate(kind.clocks)
     )
-    sends = tuple(replace(one, send=found["send", p, 0]) for p, one in enumerate(kind.sends))
+    sends = tuple(replace(send, send=found["send", p, 0]) for p, send in enumerate(kind.sends))
     return replace(kind, derivative=found["derivative", 0, 0], clocks=clocks, sends=sends)

@@ -90,14 +90,14 @@ def switching(system: CompiledSystem, modes: ContactModes, *, prepared: Prepared
 def _judge(topology: str, loops: Sequence[OpenLoop]) -> Switching:
     """Prove the circle criterion of all loops, or say which fails."""
     weights = weights_of(loops)
-    jumps = next((one.jumps for one in loops if one.jumps), "")
+    jumps = next((loop.jumps for loop in loops if loop.jumps), "")
     if isinstance(weights, str):
         return Switching(topology, OPEN, weights, jumps=jumps)
-    least, worst = min(((least_of(one, weights), one.name) for one in loops), default=(np.inf, ""))
+    least, worst = min(((least_of(loop, weights), loop.name) for loop in loops), default=(np.inf, ""))
     reach = float("inf") if least >= 0 else float(-1 / least)
     if not reach > 1:
         reason = f"the circle criterion fails in the {worst} mode"
-    elif fails := [one.name for one in loops if not is_proved(one, weights)]:
+    elif fails := [loop.name for loop in loops if not is_proved(loop, weights)]:
         reason = f"the circle criterion holds too narrowly to be proved in the {fails[0]} mode"
     else:
         return Switching(topology, STABLE, "", reach, worst, jumps)

@@ -59,7 +59,7 @@ FAILED, WRONG = "FAILED, which is a bug", "WRONG"  # how what must not be is sai
 
 # Of `analyze(method=…)`, and the two that are called otherwise.
 CERTIFIED = "certified"
-ANALYSES = (*(one for one in METHODS if one not in (AUTO, PAPER)), CERTIFIED, PAPER)
+ANALYSES = (*(text for text in METHODS if text not in (AUTO, PAPER)), CERTIFIED, PAPER)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +107,7 @@ class Comparison:
     @property
     def chosen(self) -> Measured | None:
         """The default method."""
-        return next((one for one in self.measured if one.chosen), None)
+        return next((measured for measured in self.measured if measured.chosen), None)
 
     @property
     def faults(self) -> tuple[str, ...]:
@@ -130,7 +130,7 @@ class Bench(Result):
     @property
     def faults(self) -> tuple[str, ...]:
         """What must not be, on any scene: none where all is well."""
-        return tuple(fault for one in self.comparisons for fault in one.faults)
+        return tuple(fault for comparison in self.comparisons for fault in comparison.faults)
 
 
 def bench(system: CompiledSystem, *, rounds: int = ROUNDS, duration: Fraction = DURATION) -> Bench:
@@ -224,7 +224,7 @@ def bench_analysis(system: CompiledSystem, *, rounds: int = ROUNDS) -> Compariso
     ]
     if default.stable is None:
         notes.append(f"{WRONG}: analyze leaves the verdict open: {default.verdict}")
-    notes += [f"{WRONG}: the bound of {one.name} does not hold" for one in measured if one.fails]
+    notes += [f"{WRONG}: the bound of {item.name} does not hold" for item in measured if item.fails]
     return Comparison(
         task="analyze",
         quantity="spectral radius",
@@ -260,7 +260,7 @@ def bench_simulation(
         notes.append(f"nothing moves in this scene: {how}")
     calls = {str(method): partial(_ready, system, duration, method) for method in _methods(system)}
     ready, refused, _ = _first(calls)
-    times = take_turns({name: partial(_play, one) for name, one in ready.items()}, rounds, enough=ENOUGH)
+    times = take_turns({name: partial(_play, item) for name, item in ready.items()}, rounds, enough=ENOUGH)
     chosen = prepare(system, Settings(duration)).how
     exact = ready.get(EXACT)
     rounded, _ = finer(Method(EXACT), all_linear=True)
@@ -268,11 +268,11 @@ def bench_simulation(
         _measured(
             name,
             times[name],
-            error=exact and _distance(_ready(system, duration, rounded) if one is exact else one, exact),
+            error=exact and _distance(_ready(system, duration, rounded) if item is exact else item, exact),
             bound=None,
             chosen=name == chosen or (name == str(DEFAULT) and chosen != EXACT),
         )
-        for name, one in ready.items()
+        for name, item in ready.items()
     ]
     said = dict(refused).get(
         EXACT, "the exact transition, itself off by what one rounding of each number makes"
@@ -333,7 +333,10 @@ def _moved(system: CompiledSystem) -> tuple[CompiledSystem, str]:
     by = float(state_scales(system, kind, jacobians(kind), list(rows))[0])
     values = np.array(rows[numbers.rows[0], kind.parameters.index(state.start)], dtype=np.float64)
     values[0] += by
-    columns = (*(one for one in first.columns if one.name != state.start), Column(state.start, values))
+    columns = (
+        *(column for column in first.columns if column.name != state.start),
+        Column(state.start, values),
+    )
     changed = replace(system, groups=(replace(first, columns=columns), *others))
     return changed, f"{state.name} of its first peer starts {with_unit(f'{by:g}', state.unit)} elsewhere"
 
@@ -362,7 +365,7 @@ def _distance(simulation: Simulation, exact: Simulation) -> float:
     worst = 0.0
     units = np.array([exact.signals[place].unit for place in moving])
     for unit in dict.fromkeys(units.tolist()):
-        error, largest = (float(one[units == unit].max()) for one in (apart, size))
+        error, largest = (float(values[units == unit].max()) for values in (apart, size))
         worst = max(worst, error / largest if largest else error)
     return worst
 
@@ -401,15 +404,15 @@ def pareto_front(measured: Sequence[Measured]) -> tuple[Measured, ...]:
     """
     return tuple(
         replace(
-            one,
-            front=one.error is not None
-            and not any(_beats(other, one) for other in measured if other.error is not None),
+            item,
+            front=item.error is not None
+            and not any(_beats(other, item) for other in measured if other.error is not None),
         )
-        for one in sorted(measured, key=lambda one: one.seconds)
+        for item in sorted(measured, key=lambda measured: measured.seconds)
     )
 
 
-def _beats(one: Measured, other: Measured) -> bool:
-    faster = one.seconds + one.spread + other.spread < other.seconds
-    mine, its = (max(m.error or 0.0, SAME) for m in (one, other))
-    return (faster and mine <= its) or (mine < its and one.seconds <= other.seconds)
+def _beats(measured: Measured, other: Measured) -> bool:
+    faster = measured.seconds + measured.spread + other.spread < other.seconds
+    mine, its = (max(m.error or 0.0, SAME) for m in (measured, other))
+    return (faster and mine <= its) or (mine < its and measured.seconds <= other.seconds)

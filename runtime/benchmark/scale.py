@@ -133,7 +133,7 @@ def _largest(path: Path) -> tuple[str, Scalar]:
     if not found:
         what = "no group of this topology has a count that could grow"
         raise ApcError(Mistake("E921", Place(str(path)), what, hint="peers: {user: {count: 3}}"))
-    _, name, number = max(found, key=lambda one: one[0])
+    _, name, number = max(found, key=lambda item: item[0])
     return name, number
 
 

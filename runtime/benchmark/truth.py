@@ -110,10 +110,12 @@ def _radius(systems: Sequence[ClosedSystem]) -> Any:
         # Of a chain of equal eigenvalues each step of QR gains a few bits: as many steps as bits, each.
         values = matrix.eig(algorithm="approx", maxiter=flint.ctx.prec * size) if size else []
         off = abs(sum(values, flint.acb(0)) - sum((matrix[i, i] for i in range(size)), flint.acb(0))).mid()
-        found = max(found, *(abs(one).mid() for one in values if abs(one - 1).mid() > RIGID), flint.arb(0))
+        found = max(
+            found, *(abs(value).mid() for value in values if abs(value - 1).mid() > RIGID), flint.arb(0)
+        )
         assert off < RIGID * max(found, flint.arb(1)), "QR did not converge"
     return found
 
 
-def _agree(one: Any, other: Any) -> bool:
-    return bool(abs(one - other).mid() <= max(abs(other).mid(), LEAST) * flint.arb(10) ** -DIGITS)
+def _agree(item: Any, other: Any) -> bool:
+    return bool(abs(item - other).mid() <= max(abs(other).mid(), LEAST) * flint.arb(10) ** -DIGITS)

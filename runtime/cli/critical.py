@@ -119,7 +119,7 @@ def _check_order(path: str, file: str | None) -> None:
         from apc.vary.margins import coupler_parameters
 
         got = got if file else f"{path} alone"
-        name = next((one.label for one in coupler_parameters(open_scene(path, ()))), None)
+        name = next((free.label for free in coupler_parameters(open_scene(path, ()))), None)
     hint = f"apc critical {name} {path}" if name else ""
     wanted = "a parameter or delay, then the scene"
     raise ApcError(Mistake("E841", Place("apc critical"), "the command", wanted, got, hint))

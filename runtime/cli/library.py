@@ -46,7 +46,7 @@ def library_command(
 
     own = () if folder is None else (folder,)
     library = Library(
-        tuple(readable_library(one, str(one), Place("--folder"), "--folder parts") for one in own)
+        tuple(readable_library(path, str(path), Place("--folder"), "--folder parts") for path in own)
     )
     if name is None:
         document, lines = catalogue.library_document(library), catalogue.library_lines(library)
@@ -91,10 +91,10 @@ def new_command(
     text = _TOPOLOGY.sub(f"topology: {name}", text, count=1)
     if Path(SCHEMA_FILE).is_file():
         text = f"# yaml-language-server: $schema={SCHEMA_FILE}\n{text}"
-    tables = [one for one in catalogue.tables_of(source) if not _is_there(one)] if like is not None else []
-    _write({path: text, **{Path(one.name): one.read_text(encoding="utf-8") for one in tables}})
+    tables = [path for path in catalogue.tables_of(source) if not _is_there(path)] if like is not None else []
+    _write({path: text, **{Path(table.name): table.read_text(encoding="utf-8") for table in tables}})
     written = (
-        f"{' and '.join([str(path), *(one.name for one in tables)])} {'are' if tables else 'is'} written"
+        f"{' and '.join([str(path), *(table.name for table in tables)])} {'are' if tables else 'is'} written"
     )
     tell(f"{written}. Next: apc compile {path}")
 
@@ -131,8 +131,8 @@ def _write(texts: dict[Path, str]) -> None:
                 written.append(path)
                 file.write(text)
     except OSError as error:
-        for one in written:
-            one.unlink(missing_ok=True)
+        for item in written:
+            item.unlink(missing_ok=True)
         if not isinstance(error, FileExistsError):
             raise unwritable(path, error) from None
         hint = "apc new another-name" if path == next(iter(texts)) else f"mv {path} another-name{path.suffix}"

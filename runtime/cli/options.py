@@ -122,7 +122,10 @@ SHARED: dict[str, Callable[[inspect.Parameter], click.Parameter]] = {
 def command(function: Callable[..., None]) -> Command:
     """Return a function `NAME_command` as the command of that name, its options in their order."""
     asked = inspect.signature(function).parameters.values()
-    made = [(SHARED[one.name] if one.default is one.empty else one.default)(one) for one in asked]
+    made = [
+        (SHARED[parameter.name] if parameter.default is parameter.empty else parameter.default)(parameter)
+        for parameter in asked
+    ]
     made.append(click.Option(["--timings"], is_flag=True, help="Say on stderr how long each part took."))
     name = function.__name__.removesuffix("_command")
     return Command(name, callback=function, params=made, help=inspect.cleandoc(function.__doc__ or ""))
@@ -184,11 +187,11 @@ def print_result(
     before
         What stands before the name of a file; None where the result names it itself.
     """
-    files = [one for one in written if one is not None]
+    files = [path for path in written if path is not None]
     err = beside(*files)
     tell(json_text(found.to_dict()) if as_json else str(found), err=err)
-    for one in () if as_json or before is None else files:
-        tell(f"{before}{one} is written", err=err)
+    for path in () if as_json or before is None else files:
+        tell(f"{before}{path} is written", err=err)
 
 
 def beside(*outputs: Path | None) -> bool:

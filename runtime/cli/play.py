@@ -88,8 +88,8 @@ def play_command(
         outside = None if device is None else device_function(device)
         with at_work("playing"):
             parts = (play_one(system, peer, listening, addresses, how, device=outside),)
-    troubles = [mistake for one in parts if one.trouble for mistake in one.trouble.mistakes]
-    played = [one.run for one in parts if one.run is not None]
+    troubles = [mistake for part in parts if part.trouble for mistake in part.trouble.mistakes]
+    played = [part.run for part in parts if part.run is not None]
     if played:
         write_run(folder, system, played, whole=peer is None)
     if troubles:
@@ -135,7 +135,7 @@ def _addresses(listen: str | None, to: tuple[str, ...], *, has_secret: bool):  #
 
     others = {}
     for text in to:
-        name, equals, address = (one.strip() for one in text.partition("="))
+        name, equals, address = (item.strip() for item in text.partition("="))
         if not (equals and name):
             expected, hint = "PEER=HOST:PORT", '--to "right[1]=192.0.2.7:5000"'
             raise ApcError(

@@ -76,7 +76,7 @@ def region_command(
     asked = criterion_with(hands, criterion)
     note_usual(hands)
     systems = [
-        open_scene(one, settings, {"--out": out}, hands=hands, told=note_aside) for one in (file, *compare)
+        open_scene(text, settings, {"--out": out}, hands=hands, told=note_aside) for text in (file, *compare)
     ]
     with status_line() as told:
         found = compare_regions(

@@ -76,13 +76,13 @@ def _check(path: Path) -> None:
 
     kept = kept_report(path)
     mistakes, notes = [], []
-    for one in kept["scenes"]:
+    for item in kept["scenes"]:
         with tempfile.TemporaryDirectory(prefix="apc-report-") as folder, at_work("reporting"):
-            again = report([scene_again(one, Path(folder))], one["settings"])
-        place = Place(f"{path}: {one['name']}")
-        mistakes += [Mistake("E991", place, what) for what in _differs(one, again)]
+            again = report([scene_again(item, Path(folder))], item["settings"])
+        place = Place(f"{path}: {item['name']}")
+        mistakes += [Mistake("E991", place, what) for what in _differs(item, again)]
         made = dict(again.scenes[0].origin)
-        changed = [name for name, digest in one["origin"] if made.get(name) != digest]
+        changed = [name for name, digest in item["origin"] if made.get(name) != digest]
         notes += [f"{name} is another one than the report was made with" for name in changed]
         was = dict(kept["versions"])
         other = [(name, now) for name, now in again.versions if was.get(name) != now]
@@ -100,7 +100,7 @@ def _differs(kept: KeptScene, again: Report) -> Iterator[str]:
     from apc.reports.contents import differences
 
     [now] = again.to_dict()["scenes"]
-    before = {one["key"]: one for one in kept["sections"]}
+    before = {item["key"]: item for item in kept["sections"]}
     for section in now["sections"]:
         title, old = TITLES[section["key"]], before.get(section["key"])
         if old is None:

@@ -143,7 +143,7 @@ def _write(system: CompiledSystem, found: Tuning, settings: Sequence[str], path:
     from apc.frame.names import find
     from apc.frame.overrides import parse_override
 
-    values = {parse_override(system, one).free: one.partition("=")[2].strip() for one in settings}
+    values = {parse_override(system, setting).free: setting.partition("=")[2].strip() for setting in settings}
     for gain in found.gains:
         number = f"{float(gain.value):.12g}"
         values[find(system, gain.parameter)] = with_unit(number, gain.unit).removesuffix(" 1")

@@ -103,13 +103,13 @@ def _axis(system: CompiledSystem, free: Free) -> str:
 
 def _found(system: CompiledSystem, axis: str) -> list[str]:
     """Return the names that could be meant."""
-    heard = {one.link for kind in system.kinds for clock in kind.clocks for one in clock.receives}
+    heard = {receive.link for kind in system.kinds for clock in kind.clocks for receive in clock.receives}
     links = [link for link in system.links if link.name in heard]
     if axis == DELAY:
         return _roots(system, [link.delay for link in links], ("s",))
     if axis == LOSS:
         losses = [link.channel.loss for link in links if link.channel is not None]
-        return _roots(system, [one.p for one in losses if one is not None], ("1",))
+        return _roots(system, [loss.p for loss in losses if loss is not None], ("1",))
     hearing = {
         channel.rpartition(".")[0]
         for kind in system.kinds
@@ -117,7 +117,7 @@ def _found(system: CompiledSystem, axis: str) -> list[str]:
         if send.link in heard
         for channel in send.channels
     }
-    stiff = [one.name for one in system.parameters if one.unit in STIFFNESSES]
+    stiff = [parameter.name for parameter in system.parameters if parameter.unit in STIFFNESSES]
     return _roots(system, [name for name in stiff if name.rpartition(".")[0] in hearing], STIFFNESSES)
 
 

@@ -90,7 +90,7 @@ class Scheme:
     def left_out(self) -> tuple[str, ...]:
         """What of the scene some of its numbers don't look at."""
         parts = (self.analysis, self.stiffness, self.delay, self.loss, self.feel)
-        return tuple(dict.fromkeys(text for one in parts if one is not None for text in one.left_out))
+        return tuple(dict.fromkeys(text for part in parts if part is not None for text in part.left_out))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,8 +106,8 @@ class Comparison(Result):
     def left_out(self) -> tuple[str, ...]:
         """What some numbers don't look at, with the places (from 1) of the schemes it is said of."""
         said: dict[str, list[str]] = {}
-        for place, one in enumerate(self.schemes):
-            for text in one.left_out:
+        for place, scheme in enumerate(self.schemes):
+            for text in scheme.left_out:
                 said.setdefault(text, []).append(str(place + 1))
         every = len(self.schemes)
         return tuple(f"{', '.join(on)}: {text}" if len(on) < every else text for text, on in said.items())
@@ -181,8 +181,8 @@ def _scheme(
     told: Told | None,
 ) -> Scheme:
     """Return what is told of one scene. Raises ApcError, as `analyze` and `passive_hands`, if it can't be."""
-    names = {axis: one.name for axis, one in axes.items()}
-    missing = {axis: one.why for axis, one in axes.items() if one.why}
+    names = {axis: item.name for axis, item in axes.items()}
+    missing = {axis: item.why for axis, item in axes.items() if item.why}
     say = told or (lambda _: None)
 
     def had(key: str, command: str, compute: Callable[[], _Found]) -> _Found | None:
@@ -249,13 +249,13 @@ def _passive(system: CompiledSystem, prepared: Prepared) -> PassiveHands:
 
 def _notes(schemes: Sequence[Scheme]) -> tuple[str, ...]:
     """Say in what the schemes differ beside their couplings."""
-    peers = dict.fromkeys(one.peers for one in schemes)
-    frames = dict.fromkeys(one.analysis.frame_s for one in schemes if one.analysis is not None)
-    judged = dict.fromkeys(one.network is None for one in schemes if one.analysis is not None)
+    peers = dict.fromkeys(scheme.peers for scheme in schemes)
+    frames = dict.fromkeys(scheme.analysis.frame_s for scheme in schemes if scheme.analysis is not None)
+    judged = dict.fromkeys(scheme.network is None for scheme in schemes if scheme.analysis is not None)
     notes = {
-        f"they have different numbers of peers: {', '.join(f'{one:,}' for one in peers)}": len(peers) > 1,
+        f"they have different numbers of peers: {', '.join(f'{peer:,}' for peer in peers)}": len(peers) > 1,
         "their frames differ, and with them what a spectral radius is of: "
-        f"{', '.join(f'{one * 1e3:.6g} ms' for one in frames)}": len(frames) > 1,
+        f"{', '.join(f'{frame * 1e3:.6g} ms' for frame in frames)}": len(frames) > 1,
         "some are judged in mean square over the network as it is, some with every packet on time": len(
             judged
         )

@@ -62,13 +62,13 @@ def effort(system: CompiledSystem) -> Effort:
     ticks = [
         (
             _operations(clock.tick)
-            + sum(_to_hear(one, int(heard[one.link][place])) for one in clock.receives),
+            + sum(_to_hear(receive, int(heard[receive.link][place])) for receive in clock.receives),
             clock.clock,
         )
         for place, kind in enumerate(kinds)
         for clock in kind.clocks
     ]
-    operations, name = max(ticks, key=lambda one: one[0], default=(0, ""))
+    operations, name = max(ticks, key=lambda tick: tick[0], default=(0, ""))
     return Effort(operations, name, float(busiest.max(initial=0.0)), float(every.sum()))
 
 
@@ -79,7 +79,7 @@ def _channels(kind: Kind, link: Link) -> int:
 
 def _hears(kind: Kind, link: Link) -> bool:
     """Say whether a peer reads what it hears over a link."""
-    return any(one.link == link.name for clock in kind.clocks for one in clock.receives)
+    return any(receive.link == link.name for clock in kind.clocks for receive in clock.receives)
 
 
 def _ways(
@@ -110,14 +110,18 @@ def _ways(
     )
 
 
-def _to_hear(one: Receive, peers: int) -> int:
+def _to_hear(receive: Receive, peers: int) -> int:
     """Return the operations of a reduction over so many peers."""
-    return peers if one.edge is None else peers * (1 + _operations(one.edge))
+    return peers if receive.edge is None else peers * (1 + _operations(receive.edge))
 
 
 def _operations(function: Any) -> int:
     """Return how many operations a function has, with those of its loops; inputs and constants are none."""
     if function.is_a("SXFunction"):
         return len(straight(function).operations)
-    called = {one.name(): one for one in function.find_functions(0) if one.name() != POLISH}
-    return sum(_operations(one if one.is_a("SXFunction") else one.oracle()) for one in called.values())
+    called = {
+        find_function.name(): find_function
+        for find_function in function.find_functions(0)
+        if find_function.name() != POLISH
+    }
+    return sum(_operations(item if item.is_a("SXFunction") else item.oracle()) for item in called.values())

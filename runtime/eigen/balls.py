@@ -140,18 +140,18 @@ def closed_frame(
     n = len(layout.names)
     start = np.eye(n, dtype=np.int64).astype(object) if state is None else state
     place_of = layout.places
-    rows_of = [{one: row for row, one in enumerate(group.schedule.sent)} for group in system.sites]
+    rows_of = [{sent: row for row, sent in enumerate(group.schedule.sent)} for group in system.sites]
     weights = weight_balls(system) if weights is None else weights
     sent: dict[tuple[int, int], Balls] = {}
 
     def hearing(g: int) -> Callable[[int], Balls | None]:
         def hear(line: int) -> Balls | None:
-            one = system.sites[g].schedule.heard[line]
+            heard = system.sites[g].schedule.heard[line]
             total = np.zeros(start.shape[1], dtype=object)
-            for h, weight in weights[one.way][g]:
-                row = rows_of[h][one.sent]
-                if one.lag:
-                    total = total + start[place_of[Packet(h, row, one.lag)]] * weight
+            for h, weight in weights[heard.way][g]:
+                row = rows_of[h][heard.sent]
+                if heard.lag:
+                    total = total + start[place_of[Packet(h, row, heard.lag)]] * weight
                 elif (h, row) in sent:
                     total = total + sent[h, row] * weight
                 else:
@@ -236,7 +236,7 @@ def _exact(value: NDArray[Any]) -> Balls:
     if value.dtype != np.float64:
         return value.astype(object)
     found = np.empty(value.size, dtype=object)
-    found[:] = [int(one) if one in (0.0, 1.0) else flint.arb(one) for one in value.ravel().tolist()]
+    found[:] = [int(item) if item in (0.0, 1.0) else flint.arb(item) for item in value.ravel().tolist()]
     return found.reshape(value.shape)
 
 

@@ -115,16 +115,16 @@ def prove(system: ClosedSystem, free: RigidModes) -> Proof:
             if not searched and any(map(_may_vanish_at_one, polynomials)):
                 free, searched = find_rigid_modes(system), True
                 polynomials = _polynomials(matrix, free)
-            found = [root_discs(one) for one in polynomials]
-            verdicts = [one.inside for one in found] if _stands_still(matrix, free) else [None]
+            found = [root_discs(polynomial) for polynomial in polynomials]
+            verdicts = [discs.inside for discs in found] if _stands_still(matrix, free) else [None]
         centres, radii = (
-            np.concatenate([np.empty(0), *(getattr(one, name) for one in found)])
+            np.concatenate([np.empty(0), *(getattr(discs, name) for discs in found)])
             for name in ("centres", "radii")
         )
         inside = False if False in verdicts else None if None in verdicts else True
         if inside is not None or (doubtful and bits >= DOUBTFUL):
             break
-    beyond = [one.beyond for one in found] or [(-1.0, -1.0)]
+    beyond = [discs.beyond for discs in found] or [(-1.0, -1.0)]
     least, most = map(max, zip(*beyond, strict=True))
     return Proof(inside, bits, free, centres, radii, (least, most))
 
@@ -165,9 +165,11 @@ def root_discs(polynomial: Any) -> Discs:
     *lower, _ = coefficients
     n, tiny = len(lower), flint.arb(2) ** (SPARE - flint.ctx.prec)
     points, radii = [flint.acb(0)] * n, [flint.arb("inf")] * n  # more bits may tell
-    if all(one.is_finite() for one in lower):
-        nudges = [math.cos(k) * (one.rad() + tiny * (abs(one.mid()) + tiny)) for k, one in enumerate(lower)]
-        beside = [(one.mid() + by).mid() for one, by in zip(lower, nudges, strict=True)]
+    if all(item.is_finite() for item in lower):
+        nudges = [
+            math.cos(k) * (item.rad() + tiny * (abs(item.mid()) + tiny)) for k, item in enumerate(lower)
+        ]
+        beside = [(item.mid() + by).mid() for item, by in zip(lower, nudges, strict=True)]
         with contextlib.suppress(ValueError):
             roots = flint.acb_poly([*beside, 1]).roots(tol=tiny, maxprec=4 * flint.ctx.prec)
             points = [root.mid() for root in roots]

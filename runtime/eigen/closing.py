@@ -239,27 +239,27 @@ def bounded_weight(weight: Fraction, doubt: float) -> tuple[float, float]:
 
 def feedback_of(loop: Loop | ClosedSystem, layout: StateLayout) -> list[Feedback]:
     """Return what each site hears, each weight with the radius of its doubt and of its rounding."""
-    row_of = [{one: row for row, one in enumerate(group.schedule.sent)} for group in loop.sites]
+    row_of = [{sent: row for row, sent in enumerate(group.schedule.sent)} for group in loop.sites]
     starts = np.cumsum([0] + [len(group.schedule.sent) for group in loop.sites]).tolist()
     # Few weights at many places: each is looked at once, and plain keys are found faster than packets.
-    places = {(one.site, one.row, one.lag): place for one, place in layout.places.items()}
+    places = {(packet.site, packet.row, packet.lag): place for packet, place in layout.places.items()}
     known: dict[tuple[int, int, float], tuple[float, float]] = {}
     found = []
     for g, group in enumerate(loop.sites):
         now = np.zeros((2, len(group.schedule.heard), starts[-1]))
         before = np.zeros((2, len(group.schedule.heard), len(layout.names)))
-        for line, one in enumerate(group.schedule.heard):
-            doubt = loop.doubts.get(one.way, 0.0)
+        for line, heard in enumerate(group.schedule.heard):
+            doubt = loop.doubts.get(heard.way, 0.0)
             columns, weights = [], []
-            for h, weight in enumerate(loop.coupling[one.way][g]):
+            for h, weight in enumerate(loop.coupling[heard.way][g]):
                 if not (weight or doubt):
                     continue
                 key = weight.numerator, weight.denominator, doubt
-                row = row_of[h][one.sent]
-                columns.append(places[h, row, one.lag] if one.lag else starts[h] + row)
+                row = row_of[h][heard.sent]
+                columns.append(places[h, row, heard.lag] if heard.lag else starts[h] + row)
                 weights.append(known.get(key) or known.setdefault(key, bounded_weight(weight, doubt)))
             if columns:
-                (before if one.lag else now)[:, line, columns] = np.array(weights).T
+                (before if heard.lag else now)[:, line, columns] = np.array(weights).T
         found.append(Feedback(now, before))
     return found
 
@@ -288,30 +288,35 @@ def close(
     that time orders: D W₀ is nilpotent, and I − D W₀ is solved exactly by as many steps as there are packets.
     """
     n, columns = len(layout.names), feedback[0].before.shape[-1]
-    parts = [block for one in maps for block in one.blocks] + [one.before for one in feedback]
+    parts = [block for frame_map in maps for block in frame_map.blocks] + [item.before for item in feedback]
     many = common_shape(*(block.shape[:-2] for block in parts))
     number = np.result_type(*parts)
-    starts = np.cumsum([0] + [one.s.shape[-2] for one in maps])
-    rows = [slice(start, start + one.s.shape[-2]) for one, start in zip(maps, starts, strict=False)]
-    z = [slice(offset, offset + one.p.shape[-1]) for one, offset in zip(maps, layout.offsets, strict=True)]
+    starts = np.cumsum([0] + [frame_map.s.shape[-2] for frame_map in maps])
+    rows = [
+        slice(start, start + frame_map.s.shape[-2]) for frame_map, start in zip(maps, starts, strict=False)
+    ]
+    z = [
+        slice(offset, offset + frame_map.p.shape[-1])
+        for frame_map, offset in zip(maps, layout.offsets, strict=True)
+    ]
     sent = np.zeros((*many, starts[-1], columns), dtype=number)
-    for one, heard, own, place in zip(maps, feedback, rows, z, strict=True):
-        if numbers.vanishes(one.d):
-            sent[..., own, place] = one.s
+    for frame_map, heard, own, place in zip(maps, feedback, rows, z, strict=True):
+        if numbers.vanishes(frame_map.d):
+            sent[..., own, place] = frame_map.s
         else:
-            _put(sent[..., own, :], place, one.s, one.d, heard.before, numbers)
+            _put(sent[..., own, :], place, frame_map.s, frame_map.d, heard.before, numbers)
     at_once = any(heard.now.any() for heard in feedback)
     if at_once:
         within = np.zeros((*many, starts[-1], starts[-1]), dtype=number)
-        for one, heard, own in zip(maps, feedback, rows, strict=True):
-            within[..., own, :] = numbers.multiply(one.d, heard.now)
+        for frame_map, heard, own in zip(maps, feedback, rows, strict=True):
+            within[..., own, :] = numbers.multiply(frame_map.d, heard.now)
         sent = _sent_in_turn(within, sent, numbers)
     matrix = np.zeros((*many, n, columns), dtype=number)
     received = []
-    for one, heard, place in zip(maps, feedback, z, strict=True):
+    for frame_map, heard, place in zip(maps, feedback, z, strict=True):
         r = numbers.add(numbers.multiply(heard.now, sent), heard.before) if at_once else heard.before
         received.append(r)
-        _put(matrix[..., place, :], place, one.p, one.q, r, numbers)
+        _put(matrix[..., place, :], place, frame_map.p, frame_map.q, r, numbers)
     unit = numbers.exact(np.array(1))
     for packet, at in layout.places.items():  # each grows older by a frame
         if packet.lag == 1:

@@ -230,7 +230,7 @@ def _dissipates(a: Matrix, b: Matrix, supply: Matrix, spared: Sequence[float]) -
     -----
     P solves the Riccati equation of a supply that is a little smaller, in floats; that it serves is checked.
     """
-    if not all(np.isfinite(one).all() for one in (a, b, supply)):
+    if not all(np.isfinite(values).all() for values in (a, b, supply)):
         return False
     plain = value_of(a), value_of(b), value_of(supply)
     first = _storage(*plain, np.zeros(len(plain[0])))
@@ -258,9 +258,9 @@ def _storage(a: Floats, b: Floats, supply: Floats, more: Floats) -> Floats | Non
             h = supply[:n, n:] @ back[:, :n] - supply[:n, :n] + np.diag(more)
             for _ in range(DOUBLINGS):
                 turned = np.linalg.solve(np.eye(n) + g @ h, np.hstack([a_k, g @ a_k.T]))
-                one, other = turned[:, :n], turned[:, n:]
-                rise = a_k.T @ h @ one
-                h, g, a_k = h + rise, g + a_k @ other, a_k @ one
+                values, other = turned[:, :n], turned[:, n:]
+                rise = a_k.T @ h @ values
+                h, g, a_k = h + rise, g + a_k @ other, a_k @ values
                 if not np.isfinite(h).all():
                     return None
                 if np.abs(rise).max(initial=0.0) <= UNIT * np.abs(h).max(initial=0.0):

@@ -91,7 +91,7 @@ def inverses(matrix: Matrix) -> Matrix:
     except np.linalg.LinAlgError:
         if matrix.ndim == 2:
             return np.full_like(matrix, np.nan)
-        return np.array([inverses(one) for one in matrix])
+        return np.array([inverses(item) for item in matrix])
 
 
 def pairs_to(matrix: Matrix, values: Complexes) -> Eigenpairs:

@@ -292,14 +292,14 @@ def least_radius(matrix: Floats, slopes: Floats, error: Floats) -> float:
             block = norms(moves[:, rows, columns]).sum() + norms(off[rows, columns]) + doubt
             return float(block) * (1 + charge)
 
-        one, rest = slice(0, 1), slice(1, n)
+        item, rest = slice(0, 1), slice(1, n)
         others = np.linalg.svd(first * np.eye(count) - centre[1:, 1:], compute_uv=False)
         away = (others - charge * others.max(initial=0.0)).min(initial=np.inf)
-        spare = away - most(one, one) - most(rest, rest)
-        square = spare**2 - 4 * most(one, rest) * most(rest, one)
+        spare = away - most(item, item) - most(rest, rest)
+        square = spare**2 - 4 * most(item, rest) * most(rest, item)
         if not (wrong < 1 and spare > 0 and square > 0):
             return 0.0
-        near = 2 * most(one, rest) * most(rest, one) / (spare + np.sqrt(square))
+        near = 2 * most(item, rest) * most(rest, item) / (spare + np.sqrt(square))
         inwards = np.abs((np.exp(-1j * np.angle(first)) * moves[:, 0, 0]).real).sum() + off[0, 0] + doubt
         return float(abs(first) - (inwards + near) * (1 + charge) - charge)
 

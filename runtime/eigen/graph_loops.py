@@ -87,17 +87,17 @@ def graph_loop(group: PeerGroup, mode: GraphMode, scale: GraphScale) -> Loop:
     """Let one site hear itself by an eigenvalue, or two by a complex pair."""
     a, b = mode.real, mode.imaginary
     weights = scale.weights
-    doubts = {way: float(abs(one)) * mode.doubt for way, one in weights.items()}
+    doubts = {way: float(abs(weight)) * mode.doubt for way, weight in weights.items()}
     # What rounding makes of an eigenvalue 0 is called 0.
     named = 0.0 if abs(mode.value.real) <= mode.doubt else mode.value.real
     name = "common" if mode.common else f"graph {named:+.6g}"
     if not b:
-        coupling: Coupling = {way: ((one * a,),) for way, one in weights.items()}
+        coupling: Coupling = {way: ((weight * a,),) for way, weight in weights.items()}
         surds: Mapping[Way, Surd] = {}
         if mode.doubt and mode.surd:
             surd = mode.surd
-            surds = {way: replace(surd, scale=one * surd.scale) for way, one in weights.items()}
+            surds = {way: replace(surd, scale=weight * surd.scale) for way, weight in weights.items()}
         return Loop(name, mode.multiplicity, (group,), coupling, doubts, surds)
-    pair = {way: ((one * a, -one * b), (one * b, one * a)) for way, one in weights.items()}
+    pair = {way: ((weight * a, -weight * b), (weight * b, weight * a)) for way, weight in weights.items()}
     sites = tuple(replace(group, name=part) for part in ("real", "imaginary"))
     return Loop(f"{name} ± {mode.value.imag:.6g}i", mode.multiplicity, sites, pair, doubts)

@@ -183,7 +183,7 @@ def _clusters(values: NDArray[np.complex128], doubt: float) -> list[Integers]:
     for i in range(len(values)):
         near = np.unique(cluster[np.abs(values - values[i]) <= 2 * doubt])
         cluster[np.isin(cluster, near)] = near[0]
-    return [np.flatnonzero(cluster == one) for one in np.unique(cluster)]
+    return [np.flatnonzero(cluster == item) for item in np.unique(cluster)]
 
 
 def _row_sum(graph: Graph, n: int, *, mean: bool) -> Fraction | None:

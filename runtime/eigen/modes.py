@@ -93,7 +93,9 @@ def arrange(groups: Sequence[PeerGroup], exchange: Exchange) -> Arrangement:
         found = graph_modes(exchange.links[graphs[0]].graph, exchange.peers, mean=scale.by_mean)
         if found is not None:
             note = f"{len(found)} systems, one an eigenvalue of the graph of {named}"
-            return Arrangement("modes", tuple(graph_loop(groups[0], one, scale) for one in found), (note,))
+            return Arrangement(
+                "modes", tuple(graph_loop(groups[0], graph_mode, scale) for graph_mode in found), (note,)
+            )
         reason = f"the graph of {named} has no full set of eigenvectors"
     parts = split_exchangeable(dense_loop(groups, exchange), exchange)
     if len(parts) > 1:
@@ -192,7 +194,7 @@ def dense_loop(groups: Sequence[PeerGroup], exchange: Exchange) -> Loop:
     weights = {
         link: {
             (receiver, sender): exact_weight(weight)
-            for (sender, receiver), weight in zip(*(one.tolist() for one in exchange.arcs(link)), strict=True)
+            for (sender, receiver), weight in zip(*(arc.tolist() for arc in exchange.arcs(link)), strict=True)
         }
         for link in exchange.links
     }
@@ -251,8 +253,8 @@ def split_exchangeable(loop: Loop, exchange: Exchange) -> tuple[Loop, ...]:
 
 def _are_exchangeable(loop: Loop, g: int, h: int) -> bool:
     """Say whether two sites can change places."""
-    one, other = loop.sites[g], loop.sites[h]
-    if one.lifting is not other.lifting or one.schedule is not other.schedule:
+    site, other = loop.sites[g], loop.sites[h]
+    if site.lifting is not other.lifting or site.schedule is not other.schedule:
         return False
     rest = [place for place in range(len(loop.sites)) if place not in (g, h)]
     return all(
@@ -302,7 +304,7 @@ def couple(
     for way in used_ways(group.schedule for group in groups):
         rows = []
         for g, group in enumerate(groups):
-            hears = any(one.way == way for one in group.schedule.heard)
+            hears = any(heard.way == way for heard in group.schedule.heard)
             if hears and way.operator == "mean":
                 total = degrees.get((way.link, g))
                 check_mean(

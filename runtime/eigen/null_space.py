@@ -34,7 +34,7 @@ def null_space(matrix: Matrix) -> list[list[Fraction]]:
     for i, j in np.argwhere(matrix != 0).tolist():
         entry = Fraction(matrix[i, j])
         exact[i, n - 1 - j] = flint.fmpq(entry.numerator, entry.denominator)
-    return _kernel(exact, lambda one: Fraction(int(one.p), int(one.q)))
+    return _kernel(exact, lambda item: Fraction(int(item.p), int(item.q)))
 
 
 def residue(number: Fraction | int) -> Any:

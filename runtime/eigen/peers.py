@@ -53,7 +53,7 @@ class Runs:
     ranges: tuple[range, ...]
 
     def __len__(self) -> int:
-        return sum(len(one) for one in self.ranges)
+        return sum(len(run) for run in self.ranges)
 
     def __iter__(self) -> Iterator[int]:
         return itertools.chain.from_iterable(self.ranges)
@@ -65,7 +65,7 @@ class Runs:
 
     def shifted(self, by: int) -> Runs:
         """Return the peers counted from another start."""
-        return Runs(tuple(range(one.start + by, one.stop + by) for one in self.ranges))
+        return Runs(tuple(range(run.start + by, run.stop + by) for run in self.ranges))
 
 
 # Some peers of a group, or of the scene, by number.
@@ -79,10 +79,10 @@ def shifted(peers: Peers, by: int) -> Peers:
 
 def joined(listed: Sequence[Peers]) -> Peers:
     """Return peers together, in order."""
-    runs = [one for one in listed if isinstance(one, Runs)]
+    runs = [runs for runs in listed if isinstance(runs, Runs)]
     if len(runs) == len(listed):
-        return Runs(tuple(sorted((run for one in runs for run in one.ranges), key=lambda run: run.start)))
-    return np.sort(np.concatenate([np.fromiter(one, np.int64, len(one)) for one in listed]))
+        return Runs(tuple(sorted((run for item in runs for run in item.ranges), key=lambda run: run.start)))
+    return np.sort(np.concatenate([np.fromiter(item, np.int64, len(item)) for item in listed]))
 
 
 # More states than this in one system are refused: at the cost of n³, its eigenvalues would take minutes, and
@@ -246,7 +246,7 @@ def group_name(parts: Sequence[tuple[int, Peers]], exchange: Exchange) -> str:
 
 def used_ways(schedules: Iterable[Schedule]) -> tuple[Way, ...]:
     """Return every way on which something is heard, in order."""
-    return tuple(sorted({one.way for schedule in schedules for one in schedule.heard}))
+    return tuple(sorted({heard.way for schedule in schedules for heard in schedule.heard}))
 
 
 def states_of(schedule: Schedule, site: SiteJacobians) -> int:
@@ -466,7 +466,7 @@ def peer_groups(
         return _by_start(system, jacobians, schedules, numbers, exchange)
     except ApcError as error:
         where = system.origin.topology, system.origin.texts
-        raise ApcError(at_its_part(one, *where) for one in error.mistakes) from None
+        raise ApcError(at_its_part(mistake, *where) for mistake in error.mistakes) from None
 
 
 def _by_matrices(

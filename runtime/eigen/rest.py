@@ -37,11 +37,11 @@ def unrest(groups: Sequence[PeerGroup]) -> str:
     groups
         All peers of the scene, each group linearized where it starts.
     """
-    found = [one for group in groups for one in _moved(group, named=len(groups) > 1)]
+    found = [value for group in groups for value in _moved(group, named=len(groups) > 1)]
     for unit in FORCES:
         pushed = [(size, what) for size, of, what in found if of == unit]
         if pushed:
-            size, what = max(pushed, key=lambda one: one[0])
+            size, what = max(pushed, key=lambda pair: pair[0])
             return f"the start is not at rest: {size:.4g} {unit} acts on {what}"
     for size, unit, what in found:
         return f"the start is not at rest: {what} changes by {with_unit(f'{size:.4g}', unit)} in a second"
@@ -80,8 +80,8 @@ def _moved(group: PeerGroup, *, named: bool) -> list[tuple[float, str, str]]:
         name, rate = prefix + kind.states[place].name, abs(float(rates[place]))
         inverse, unit = max(
             (
-                (abs(float(one)), unit)
-                for one, unit in zip(site.b[place], units, strict=True)
+                (abs(float(item)), unit)
+                for item, unit in zip(site.b[place], units, strict=True)
                 if unit in FORCES
             ),
             default=(0.0, ""),

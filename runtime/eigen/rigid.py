@@ -202,7 +202,7 @@ def stays_rigid(system: ClosedSystem | Loop, others: Sequence[LinearSite]) -> bo
             sum((matrix[:, place] * value for place, value in moving), np.zeros(len(matrix), dtype=object))
             for matrix in (equations, states)
         )
-        if any(left) or any(one - other for one, other in zip(reached, state, strict=True)):
+        if any(left) or any(item - other for item, other in zip(reached, state, strict=True)):
             return False
     return True
 
@@ -216,7 +216,7 @@ def _standing_solutions(system: ClosedSystem | Loop) -> list[tuple[list[Fraction
     found: list[tuple[list[Fraction], list[Fraction]]] = []
     for solution in null_space(equations):
         state = _times(states, solution)
-        before = [one for _, one in found]
+        before = [numbers for _, numbers in found]
         if not null_space(np.array([*before, state], dtype=object).T) if before else any(state):
             found.append((solution, state))
     return found
@@ -356,10 +356,12 @@ def _ramp_equations(
         way: [[(h, number(weight)) for h, weight in enumerate(row) if weight] for row in rows]
         for way, rows in system.coupling.items()
     }
-    steps = [frame_steps(one, group.schedule, euler) for one, group in zip(sites, system.sites, strict=True)]
+    steps = [
+        frame_steps(site, group.schedule, euler) for site, group in zip(sites, system.sites, strict=True)
+    ]
     after = closed_frame(system, sites, steps, weights=weights, state=z, watch=watch)
     equations.append(after - z - rates * number(system.sites[0].schedule.frame_s))
-    equations += [BALLS.multiply(site.a, one) for site, one in zip(sites, own, strict=True)]
+    equations += [BALLS.multiply(site.a, values) for site, values in zip(sites, own, strict=True)]
     return np.concatenate(equations)
 
 

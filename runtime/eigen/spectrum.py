@@ -152,12 +152,12 @@ def solve_spectrum(
     disc keeps clear of 1 there is none, and the exact search for one is spared.
     """
     solved = [_solve(system, rigid_modes_here(system)) for system in systems]
-    lowest = max((one.low for one in solved), default=0.0)
+    lowest = max((item.low for item in solved), default=0.0)
     notes: list[str] = []
     for place, system in enumerate(systems):
-        one = solved[place]
-        drifting = bool(one.free.names) and not one.clear_of_one
-        if not (certify or drifting or _is_open(one, lowest)):
+        item = solved[place]
+        drifting = bool(item.free.names) and not item.clear_of_one
+        if not (certify or drifting or _is_open(item, lowest)):
             continue
         reason = unprovable(system)
         if not in_balls:
@@ -165,21 +165,21 @@ def solve_spectrum(
         elif not reason and (states := _tied(system)) > MOST_PROVED:
             reason = f"it has {states} states, more than the {MOST_PROVED} that are proved"
         if not reason:
-            solved[place] = _prove(system, one)
+            solved[place] = _prove(system, item)
             continue
-        if certify or _is_open(one, lowest):
+        if certify or _is_open(item, lowest):
             notes.append(f"{system.name}: not proved, as {reason}")
         if drifting and (free := find_rigid_modes(system)).drifts:
             solved[place] = _solve(system, free)
-    low = max((one.low for one in solved), default=0.0)
-    high = max((one.high for one in solved), default=0.0)
-    largest = max((float(np.abs(one.pairs.values).max(initial=0.0)) for one in solved), default=0.0)
+    low = max((item.low for item in solved), default=0.0)
+    high = max((item.high for item in solved), default=0.0)
+    largest = max((float(np.abs(item.pairs.values).max(initial=0.0)) for item in solved), default=0.0)
     radius = min(max(largest, low), high)  # a proof can know better than the vectors of floats
     rigid = drifts = 0
-    for system, one in zip(systems, solved, strict=True):
-        rigid += system.multiplicity * len(one.free.names)
-        drifts += system.multiplicity * one.free.drifts
-    verdict, stable = judge([one.inside for one in solved], rigid, drifts)
+    for system, item in zip(systems, solved, strict=True):
+        rigid += system.multiplicity * len(item.free.names)
+        drifts += system.multiplicity * item.free.drifts
+    verdict, stable = judge([item.inside for item in solved], rigid, drifts)
     return Spectrum(
         modes=Later(functools.partial(_modes, tuple(systems), tuple(solved))),
         spectral_radius=radius,
@@ -195,9 +195,9 @@ def solve_spectrum(
 
 
 def _beyond(solved: Sequence[_Solved]) -> tuple[float, float] | None:
-    if not any(one.bits for one in solved):
+    if not any(item.bits for item in solved):
         return None
-    least, most = map(max, zip(*(one.beyond for one in solved), strict=True))
+    least, most = map(max, zip(*(item.beyond for item in solved), strict=True))
     return least, most
 
 
@@ -205,7 +205,7 @@ def mode_near(systems: Sequence[ClosedSystem], eigenvalue: complex) -> Mode:
     """Return the mode of closed systems whose eigenvalue, or its conjugate, is nearest to a value."""
     modes = solve_spectrum(systems, in_balls=False).modes
     value = complex(eigenvalue.real, abs(eigenvalue.imag))
-    return min(modes, key=lambda one: abs(complex(one.eigenvalue.real, abs(one.eigenvalue.imag)) - value))
+    return min(modes, key=lambda mode: abs(complex(mode.eigenvalue.real, abs(mode.eigenvalue.imag)) - value))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -243,14 +243,16 @@ def _tied(system: ClosedSystem) -> int:
     return max((len(part) for part in components(~(np.abs(system.matrix) + system.error == 0))), default=0)
 
 
-def _is_open(one: _Solved, lowest: float) -> bool:
+def _is_open(solved: _Solved, lowest: float) -> bool:
     """Say whether floats leave something open that decides: the verdict, or the radius of the whole.
 
     `lowest` is what the radius of the whole is at least.
     """
-    if not one.high > lowest:  # another system decides
+    if not solved.high > lowest:  # another system decides
         return False
-    return (one.inside is None and not lowest > 1) or not one.high - one.low <= WIDE * max(one.low, 1.0)
+    return (solved.inside is None and not lowest > 1) or not solved.high - solved.low <= WIDE * max(
+        solved.low, 1.0
+    )
 
 
 # What a proof says of a scene that drifts; a drift that nothing reads is none of the scene's.
@@ -259,15 +261,15 @@ TO_DRIFT = "to drift"
 
 def _proof_in_words(solved: Sequence[_Solved], drifts: int) -> str:
     """Say what was proved, "" where floats decided everything."""
-    bits = max((one.bits for one in solved), default=0)
+    bits = max((item.bits for item in solved), default=0)
     if not bits:
         return ""
-    unstable = [one.bits for one in solved if one.inside is False]
+    unstable = [item.bits for item in solved if item.inside is False]
     if any(unstable):
         return f"proved unstable with {max(unstable)} bits"
-    if any(one.inside is None for one in solved):
+    if any(item.inside is None for item in solved):
         return f"undecided at {bits} bits"
-    if unstable or not all(one.bits for one in solved if len(one.pairs.values)):
+    if unstable or not all(item.bits for item in solved if len(item.pairs.values)):
         return f"decided with {bits} bits where floats left it open"
     return f"proved {TO_DRIFT if drifts else 'stable'} with {bits} bits"
 
@@ -325,12 +327,12 @@ def _modes(systems: Sequence[ClosedSystem], solved: Sequence[_Solved]) -> tuple[
     """List the eigenvalues of all systems, the largest first; how they move is made when it is looked at."""
     ranked = sorted(
         (-abs(value), system.name, value.real, -value.imag, place, row)
-        for place, (system, one) in enumerate(zip(systems, solved, strict=True))
-        for row, value in enumerate(one.pairs.values.tolist())
+        for place, (system, item) in enumerate(zip(systems, solved, strict=True))
+        for row, value in enumerate(item.pairs.values.tolist())
     )
     modes = []
     for some in (ranked[:LOOKED_AT], ranked[LOOKED_AT:]):
-        motions = Later(functools.partial(_motions, systems, solved, [one[-2:] for one in some]))
+        motions = Later(functools.partial(_motions, systems, solved, [item[-2:] for item in some]))
         for number, (*_, place, row) in enumerate(some):
             value = complex(solved[place].pairs.values[row])
             modes.append(
@@ -356,20 +358,20 @@ def _motions(
     """Describe some eigenvalues, given by their systems and rows."""
     found: dict[tuple[int, int], Motion] = {}
     with single_threaded(), np.errstate(all="ignore"):
-        for s, (system, one) in enumerate(zip(systems, solved, strict=True)):
+        for s, (system, item) in enumerate(zip(systems, solved, strict=True)):
             rows = [row for own, row in places if own == s]
             if rows:
-                motions = _described(system, one, np.array(rows, dtype=np.intp))
+                motions = _described(system, item, np.array(rows, dtype=np.intp))
                 found |= {(s, row): motion for row, motion in zip(rows, motions, strict=True)}
     return tuple(found[place] for place in places)
 
 
-def _described(system: ClosedSystem, one: _Solved, rows: Integers) -> list[Motion]:
+def _described(system: ClosedSystem, solved: _Solved, rows: Integers) -> list[Motion]:
     """Describe the eigenvalues of some rows of a system, in their order."""
-    pairs = one.whole.at(rows)
-    vectors, shares = whole_vectors(system, one.at, pairs)
+    pairs = solved.whole.at(rows)
+    vectors, shares = whole_vectors(system, solved.at, pairs)
     sizes = np.abs(pairs.values)
-    gone = sizes <= np.maximum(DEADBEAT * len(system.names), np.minimum(one.bounds.errors[rows], SMALL))
+    gone = sizes <= np.maximum(DEADBEAT * len(system.names), np.minimum(solved.bounds.errors[rows], SMALL))
     # What ends in finite time has no frequency; but what is never computed anew can't end.
     angles = np.full(len(rows), 0.0 if _ticks(system) else np.nan)
     angles[~gone] = angles_in_frame(system, pairs.values[~gone], vectors[:, ~gone], shares[:, ~gone])

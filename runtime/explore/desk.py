@@ -100,7 +100,7 @@ class Desk:
             return
         if self.workers is None:
             self.workers = self.stack.enter_context(local_processes(compute, self.model, 1, LOST))
-        section = min(self.waiting, key=lambda one: (self.begun.get(one, -1), self.order.index(one)))
+        section = min(self.waiting, key=lambda text: (self.begun.get(text, -1), self.order.index(text)))
         number, task = self.waiting.pop(section)
         self.begun[section], self.held = next(self.numbers), None
         self.busy = (number, task, time.monotonic())

@@ -142,7 +142,7 @@ class Words:
         self.model.text = (
             f"<p><strong class='{kind}'>{escape(found['verdict'])}</strong>, spectral radius "
             f"{found['radius']:.9g} per frame</p><p>{escape(found['limits'])}</p>"
-            + "".join(f"<p>{escape(one)}</p>" for one in found["notes"])
+            + "".join(f"<p>{escape(item)}</p>" for item in found["notes"])
             + "<details><summary>All modes</summary>"
             f"<pre tabindex='0'>{escape(found['text'])}</pre></details>"
         )
@@ -196,15 +196,15 @@ class RegionFigure:
     def show(self, found: Plain) -> None:
         """Draw a region."""
         self.plot.visible = True
-        outlines = [np.asarray(one) for one in found["outlines"]]
+        outlines = [np.asarray(item) for item in found["outlines"]]
         rings = {
-            axis: [[[one[:, n] for one in outlines]]] if outlines else []
+            axis: [[[outline[:, n] for outline in outlines]]] if outlines else []
             for n, axis in enumerate(("xs", "ys"))
         }
         self.inside.data = rings
         self.boundary.data = {
-            "xs": [one[:, 0] for one in found["curves"]],
-            "ys": [one[:, 1] for one in found["curves"]],
+            "xs": [item[:, 0] for item in found["curves"]],
+            "ys": [item[:, 1] for item in found["curves"]],
         }
         for axis, span, which in (
             (self.plot.xaxis, self.plot.x_range, found["x"]),
@@ -371,32 +371,32 @@ class MotionFigure:
         """Draw a motion, and put the bodies where they are at the time that is shown."""
         self._visible(True)
         peers, names = (
-            list(dict.fromkeys(one))
-            for one in zip(*((peer, one.name) for peer, one in motion.bodies), strict=True)
+            list(dict.fromkeys(item))
+            for item in zip(*((peer, body.name) for peer, body in motion.bodies), strict=True)
         )
         colours = [COLOURS[peers.index(peer) % len(COLOURS)] for peer, _ in motion.bodies]
-        labels = [f"{peer}.{one.name}" for peer, one in motion.bodies]
+        labels = [f"{peer}.{body.name}" for peer, body in motion.bodies]
         x, y = motion.x, motion.y
         self.lines.data = {
             "xs": [motion.time for _ in labels],
             "ys": [*x.T],
             "colour": colours,
-            "dash": [DASHES[names.index(one.name) % len(DASHES)] for _, one in motion.bodies],
+            "dash": [DASHES[names.index(body.name) % len(DASHES)] for _, body in motion.bodies],
             "name": labels,
         }
         planar = y is not None
         if y is None:
-            rows = [peers.index(peer) + STAGGER * names.index(one.name) for peer, one in motion.bodies]
+            rows = [peers.index(peer) + STAGGER * names.index(body.name) for peer, body in motion.bodies]
             y = np.tile(rows, (len(x), 1))
-        sizes = [MM * one.radius for _, one in motion.bodies]
+        sizes = [MM * body.radius for _, body in motion.bodies]
         self.bodies.data = {
             "x": x[0],
             "y": y[0],
             "angle": motion.angle[0],
-            "bar": [BAR if one.turning else 0 for _, one in motion.bodies],
-            "width": [2 * one for one in sizes],
-            "height": [2 * one if planar else 0.5 * (one > 0) for one in sizes],
-            "name": labels if planar else [one.name for _, one in motion.bodies],
+            "bar": [BAR if body.turning else 0 for _, body in motion.bodies],
+            "width": [2 * size for size in sizes],
+            "height": [2 * size if planar else 0.5 * (size > 0) for size in sizes],
+            "name": labels if planar else [body.name for _, body in motion.bodies],
             # In a plane bodies may stand on one place, where their names would lie on each other.
             "above": [-8 - (LINE if planar else 0) * place for place in range(len(labels))],
             "colour": colours,
@@ -408,7 +408,7 @@ class MotionFigure:
             "bottom": [row - 0.45 for row, _ in motion.walls],
         }
         self.discs.data = {
-            name: [one[n] for one in motion.discs] for n, name in enumerate(("x", "y", "radius"))
+            name: [disc[n] for disc in motion.discs] for n, name in enumerate(("x", "y", "radius"))
         }
         self.frames.data = {"time": motion.time, "x": x, "y": y, "angle": motion.angle}
         reach = max(sizes)
@@ -442,8 +442,8 @@ class MotionFigure:
         self.words.nothing(why)
 
     def _visible(self, there: bool) -> None:
-        for one in (self.stage, self.play, self.time, self.plot):
-            one.visible = there
+        for item in (self.stage, self.play, self.time, self.plot):
+            item.visible = there
 
 
 class FeelFigure:

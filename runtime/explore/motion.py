@@ -72,25 +72,25 @@ def motion_of(system: CompiledSystem, *, struck: bool) -> Motion:
         told.append(f"{what} is struck: it starts at {SPEED * MM:g} mm/s.")
     shown = tuple((view.name, body) for view in views for body in view.bodies)
     names = [
-        [f"{peer}.{state}" for state in (one.states[0], one.states[planar], *one.turning)]
-        for peer, one in shown
+        [f"{peer}.{state}" for state in (body.states[0], body.states[planar], *body.turning)]
+        for peer, body in shown
     ]
     if not names:
         raise ApcError(Mistake("E983", Place(system.name), "nothing here has a position that could be shown"))
     duration = system.experiment.duration or WATCHED
-    played = simulate(system, duration=duration, signals=[one for own in names for one in own])
+    played = simulate(system, duration=duration, signals=[text for own in names for text in own])
     values, time = played.values, played.time
-    places = [number for number, one in enumerate(played.signals) if one.unit == "m"]
+    places = [number for number, signal in enumerate(played.signals) if signal.unit == "m"]
     apart = np.abs(values - values[0])[:, places].max(axis=1) > FAR
     if apart.any():
         last = max(int(np.argmax(apart)), 2)
         values, time = values[:last], time[:last]
         told.append(f"Shown until something is {FAR:g} m from where it began.")
     some = np.unique(np.linspace(0, len(time) - 1, min(ROWS, len(time))).astype(int))
-    columns = {one.name: place for place, one in enumerate(played.signals)}
-    tracks = [values[some][:, [columns[one] for one in own]] for own in names]
-    x, y = (np.stack([one[:, place] for one in tracks], axis=1) for place in (0, 1))
-    angle = np.stack([heading(one[:, 2:]) for one in tracks], axis=1)
+    columns = {signal.name: place for place, signal in enumerate(played.signals)}
+    tracks = [values[some][:, [columns[text] for text in own]] for own in names]
+    x, y = (np.stack([track[:, place] for track in tracks], axis=1) for place in (0, 1))
+    angle = np.stack([heading(track[:, 2:]) for track in tracks], axis=1)
     fixed = [(row, surface) for row, view in enumerate(views) for surface in view.surfaces]
     told.append(f"It {played.summary.verdict}.")
     return Motion(
@@ -99,12 +99,14 @@ def motion_of(system: CompiledSystem, *, struck: bool) -> Motion:
         x=MM * x,
         y=MM * y if planar else None,
         angle=angle,
-        walls=tuple((row, MM * one.offset) for row, one in fixed if not planar and not isinstance(one, Disc)),
+        walls=tuple(
+            (row, MM * line.offset) for row, line in fixed if not planar and not isinstance(line, Disc)
+        ),
         discs=tuple(
             dict.fromkeys(
-                (MM * one.centre[0], MM * one.centre[1], MM * one.radius)
-                for _, one in fixed
-                if isinstance(one, Disc)
+                (MM * disc.centre[0], MM * disc.centre[1], MM * disc.radius)
+                for _, disc in fixed
+                if isinstance(disc, Disc)
             )
         ),
         told=tuple(told),

@@ -160,7 +160,7 @@ def scene_of(system: CompiledSystem, settings: Sequence[str], text: str | None) 
         E980 a number without a slider; those of `overrides.parse_override` and `overrides.apply`.
     """
     sliders = sliders_of(system)
-    found = [set_to(system, sliders, one) for one in settings]
+    found = [set_to(system, sliders, setting) for setting in settings]
     apply(system, [Override(sliders[place].free, value) for place, value in found])
     return Scene(system, model_bytes(system), sliders, tuple(settings), text)
 
@@ -175,12 +175,12 @@ class Page:
 
     def __init__(self, scene: Scene, document: Document) -> None:
         self.scene, self.system, self.document = scene, scene.system, document
-        self.sliders, self.places = list(scene.sliders), [one.start for one in scene.sliders]
+        self.sliders, self.places = list(scene.sliders), [slider.start for slider in scene.sliders]
         self.chosen = self._axes_at_first()
         self.message = Words("message")
         self.message.model.text = ""
-        for one in scene.settings:
-            self._start_at(one)
+        for setting in scene.settings:
+            self._start_at(setting)
         self._take_link(document.session_context.request.arguments)
         self.verdict, self.margins, self.network = Words("verdict"), Words("margins"), Words("network")
         self.tuned = Words("tuned")
@@ -202,7 +202,7 @@ class Page:
 
     def _axes_at_first(self) -> list[int]:
         """Return the sliders on the axes of the region, those the scene studies first; none without two."""
-        found = [place for place, one in enumerate(self.sliders) if one.span is not None]
+        found = [place for place, slider in enumerate(self.sliders) if slider.span is not None]
         return found[:2] if len(found) > 1 else []
 
     def _take_link(self, arguments: Mapping[str, list[bytes]]) -> None:
@@ -211,7 +211,9 @@ class Page:
         for name, values in arguments.items():
             text = values[-1].decode("utf-8", "replace")
             if name in (X, Y):
-                axes = [place for place, one in enumerate(self.sliders) if one.span and one.label == text]
+                axes = [
+                    place for place, slider in enumerate(self.sliders) if slider.span and slider.label == text
+                ]
                 if axes and self.chosen:
                     self.chosen[(X, Y).index(name)] = axes[0]
                 else:
@@ -220,7 +222,7 @@ class Page:
                 try:
                     self._start_at(f"{name}={text}")
                 except ApcError as error:
-                    wrong += [one.sentence for one in error.mistakes]
+                    wrong += [mistake.sentence for mistake in error.mistakes]
         if wrong:
             self.message.say("The link says what can't be:", *wrong)
 
@@ -232,7 +234,7 @@ class Page:
 
     def _lay_out(self) -> None:
         self.handles = [self._handle(place) for place in range(len(self.sliders))]
-        names = [one.label for one in self.sliders if one.span is not None]
+        names = [slider.label for slider in self.sliders if slider.span is not None]
         self.selects = [
             Select(title=f"Region: {way} axis", value=self.sliders[place].label, options=names, width=250)
             for way, place in zip(("horizontal", "vertical"), self.chosen, strict=False)
@@ -257,10 +259,14 @@ class Page:
         if any(link.channel is not None for link in self.system.links):
             controls.append(self.meant)
         controls.append(row(*self._buttons(), sizing_mode="stretch_width"))
-        kinds = dict.fromkeys(one.kind for one in self.sliders)
+        kinds = dict.fromkeys(slider.kind for slider in self.sliders)
         for kind in sorted(kinds, key=lambda kind: kind != PEOPLE):  # how many there are comes first
             heading = Div(text=f"<h2 style='font-size:15px;margin:10px 0 0'>{kind.capitalize()}</h2>")
-            own = [handle for handle, one in zip(self.handles, self.sliders, strict=True) if one.kind == kind]
+            own = [
+                handle
+                for handle, slider in zip(self.handles, self.sliders, strict=True)
+                if slider.kind == kind
+            ]
             controls += [heading, *own]
         self.tune = Button(label="Tune", stylesheets=[FOCUS], name="tune", width=120)
         self.tune.on_click(self._ask_tune)
@@ -275,8 +281,8 @@ class Page:
             self.tuned.model,
             _below("motion", self.begins, motion.stage, played, motion.plot),
             _below("feel", self.at, feel.plot, feel.phase),
-            *(one.model for one in (self.verdict, self.margins, self.region.words, self.network)),
-            *(one.model for one in (self.roots.words, self.roots.way_words, motion.words, feel.words)),
+            *(words.model for words in (self.verdict, self.margins, self.region.words, self.network)),
+            *(words.model for words in (self.roots.words, self.roots.way_words, motion.words, feel.words)),
         ):
             self.document.add_root(part)
         self.document.js_on_event(
@@ -308,7 +314,9 @@ class Page:
         if self.scene.text is None:
             self.message.say("There is no topology beside this compiled model, whose text could be given.")
             return
-        values = {one.free: one.texts[place] for one, place in self._pairs() if place != one.start}
+        values = {
+            slider.free: slider.texts[place] for slider, place in self._pairs() if place != slider.start
+        }
         text = with_values(self.scene.text, self.system, values)
         self.out.data = {"name": [f"{self.system.name}.yaml"], "text": [text]}
 
@@ -324,8 +332,8 @@ class Page:
         if (axes := self._region_asked()) is None:
             return None
         spans = (
-            f"{one.free.label}={float(one.low)!r} {one.unit}:{float(one.high)!r} {one.unit}"
-            for one in axes[:2]
+            f"{axis.free.label}={float(axis.low)!r} {axis.unit}:{float(axis.high)!r} {axis.unit}"
+            for axis in axes[:2]
         )
         return tuple(spans), axes[1].free.label
 
@@ -340,12 +348,12 @@ class Page:
         """Say what the button looks for, in the place of gains for other sliders."""
         self.desks[TUNED].forget("tune")
         asked = self._tuning_asked()
-        names = [self.sliders[one].label for one in self.chosen]
+        names = [self.sliders[number].label for number in self.chosen]
         self.tune.disabled = asked is None
         self.tuned.say(NO_AXES if asked is None else TUNES.format(*reversed(names)) if asked[0] else STUDIED)
 
     def _save_numbers(self, found: Plain) -> None:
-        values = {one.label: one.texts[place] for one, place in self._pairs()}
+        values = {slider.label: slider.texts[place] for slider, place in self._pairs()}
         told = {"topology": self.system.name, "apc": program_version(), "set": values, **found}
         self.out.data = {"name": [f"{self.system.name}.json"], "text": [json_text(told)]}
 
@@ -359,21 +367,21 @@ class Page:
 
     def _handle(self, place: int) -> Handle:
         """Return the slider of a number, which counts its values."""
-        one = self.sliders[place]
-        texts = [text.replace("*", "·") for text in one.texts]
+        slider = self.sliders[place]
+        texts = [text.replace("*", "·") for text in slider.texts]
         handle = Handle(
             start=0,
             end=max(len(texts) - 1, 1),
             step=1,
             value=self.places[place],
-            title=one.label,
+            title=slider.label,
             format=CustomJSTickFormatter(args={"texts": texts}, code="return texts[Math.round(tick)]"),
             tooltips=False,
             sizing_mode="stretch_width",
             stylesheets=[FOCUS],
             disabled=len(texts) == 1,
         )
-        self._hear(handle, partial(is_place, one), lambda value: self._set({place: round(value)}))
+        self._hear(handle, partial(is_place, slider), lambda value: self._set({place: round(value)}))
         return handle
 
     def _hear(self, model: Any, may: Callable[[Any], bool], then: Callable[[Any], None]) -> None:
@@ -423,7 +431,7 @@ class Page:
 
     def _choose(self, axis: int, label: str) -> None:
         """Take another axis for the region."""
-        self.chosen[axis] = [one.label for one in self.sliders].index(label)
+        self.chosen[axis] = [slider.label for slider in self.sliders].index(label)
         self._moved()
 
     def _moved(self) -> None:
@@ -432,7 +440,7 @@ class Page:
         self._ask("verdict", overrides)
         if self.sliders:
             moved = self.sliders[self.last]
-            others = tuple(one for one in overrides if one.free != moved.free)
+            others = tuple(override for override in overrides if override.free != moved.free)
             self._ask("roots", others, (moved.free, moved.values))
         self._ask_region(overrides)
         self._ask("motion", overrides, self.begins.value == STRUCK)
@@ -457,12 +465,14 @@ class Page:
         if self.linear is None:
             return
         # What stands on an axis has all its values there.
-        others = tuple(one for one in overrides if one.free not in (asked[0].free, asked[1].free))
+        others = tuple(
+            override for override in overrides if override.free not in (asked[0].free, asked[1].free)
+        )
         slow = self._slow(asked)
         self.desks[REGION if slow else LATER].forget("region")
         if self.desks[LATER if slow else REGION].ask(Task("region", others, asked)) and slow:
             self.region.clear(f"Computing, after all else: {slow}, which takes a while.")
-        self.region.mark(*(float(self.sliders[one].values[self.places[one]]) for one in self.chosen))
+        self.region.mark(*(float(self.sliders[number].values[self.places[number]]) for number in self.chosen))
 
     def _slow(self, asked: tuple[Range, Range, str]) -> str:
         """Return why a region can't be redrawn as fast as a slider moves; nothing if it can."""
@@ -470,12 +480,12 @@ class Page:
         if criterion == MEAN_SQUARE:
             return "it looks at packets as they are lost and late"
         if not self.at_once or (
-            not self.linear and any(reaches_start(self.system, one.free) for one in (x, y))
+            not self.linear and any(reaches_start(self.system, interval.free) for interval in (x, y))
         ):
             return "the scene is not linear, and is linearized at its start for each point by itself"
-        if any(reaches_time(self.system, one.free) for one in (x, y)):
+        if any(reaches_time(self.system, interval.free) for interval in (x, y)):
             return "as a time varies, each point has a schedule of its own"
-        if any(reaches_count(self.system, one.free) for one in (x, y)):
+        if any(reaches_count(self.system, interval.free) for interval in (x, y)):
             return "each number of peers is analysed by itself"
         return ""
 
@@ -497,7 +507,9 @@ class Page:
 
     def _query(self) -> str:
         """Return the part of the link that holds values and axes."""
-        pairs = [(one.label, one.texts[place]) for one, place in self._pairs() if place != one.start]
+        pairs = [
+            (slider.label, slider.texts[place]) for slider, place in self._pairs() if place != slider.start
+        ]
         pairs += [
             (name, self.sliders[number].label) for name, number in zip((X, Y), self.chosen, strict=False)
         ]

@@ -91,7 +91,9 @@ def compute(model: bytes, task: Task) -> Told:
         changed = apply(system, task.overrides)
         return Told(SECTIONS[task.section](changed, prepared, task.asked))
     except ApcError as error:
-        return Told(None, "\n".join(one.reason for one in error.mistakes))  # whose hints are for the terminal
+        return Told(
+            None, "\n".join(mistake.reason for mistake in error.mistakes)
+        )  # whose hints are for the terminal
     except Exception as error:  # the other sections go on
         return Told(None, f"This is a bug of apc, not of your scene: {type(error).__name__}: {error}")
 
@@ -124,7 +126,7 @@ def _limits(found: Analysis) -> str:
     if not found.modes:
         return "Nothing moves."
     leading = found.modes[0]
-    parts = sorted(leading.participation, key=lambda one: -one[1])[:2]
+    parts = sorted(leading.participation, key=lambda pair: -pair[1])[:2]
     moves = " and ".join(name for name, _ in parts)
     changes = "grows" if leading.magnitude > 1 else "dies out most slowly"
     times = f"by {leading.magnitude:.6g} each {found.frame_s * 1e3:.6g} ms"
@@ -153,7 +155,7 @@ def _roots(system: CompiledSystem, prepared: Prepared, asked: tuple[Free, tuple[
     with finite_equations(system.name):
         places, rows = eigenvalues_at(system, free, some, prepared=prepared)
     found = np.concatenate([EMPTY, *rows])
-    texts = [text_of(one, unit_of(system, free.name)) for one in some]
+    texts = [text_of(number, unit_of(system, free.name)) for number in some]
     return {
         "real": found.real,
         "imag": found.imag,

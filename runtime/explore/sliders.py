@@ -82,20 +82,20 @@ def sliders_of(system: CompiledSystem) -> tuple[Slider, ...]:
     studied = {axis.parameter: (axis.low, axis.high) for axis in system.region}
     found = []
     for free in free_parameters(system):
-        one = parameter_of(system, free)
-        if free.name in starts and one.value == 0:
+        parameter = parameter_of(system, free)
+        if free.name in starts and parameter.value == 0:
             continue  # where nothing is said of a start, nobody looks for a slider of it
         low, high = _bounds(system, free)
-        span = studied.get(free.label) or _span(system, free, one.number, low, high)
-        if one.value > 0 and one.unit != "1" and free.label not in studied:
-            values = _decades(one.number, low, high)
+        span = studied.get(free.label) or _span(system, free, parameter.number, low, high)
+        if parameter.value > 0 and parameter.unit != "1" and free.label not in studied:
+            values = _decades(parameter.number, low, high)
         else:
-            values = _even(one.number, *_within(span, one.number), low, high)
-        found.append(_slider(system, free, PARAMETERS, one.about, values, one.number, span))
+            values = _even(parameter.number, *_within(span, parameter.number), low, high)
+        found.append(_slider(system, free, PARAMETERS, parameter.about, values, parameter.number, span))
     couplers = coupler_parameters(system)
-    couplers.sort(key=lambda one: unit_of(system, one.name) not in STIFFNESSES)
-    listed = [*studied, *(one.label for one in couplers)]
-    found.sort(key=lambda one: listed.index(one.label) if one.label in listed else len(listed))
+    couplers.sort(key=lambda coupler: unit_of(system, coupler.name) not in STIFFNESSES)
+    listed = [*studied, *(coupler.label for coupler in couplers)]
+    found.sort(key=lambda slider: listed.index(slider.label) if slider.label in listed else len(listed))
     return (*found, *_times(system, studied), *_people(system))
 
 
@@ -110,7 +110,7 @@ def _slider(
 ) -> Slider:
     unit = unit_of(system, free.name)
     listed = tuple(sorted({*values, now}))
-    texts = tuple(text_of(one, unit) for one in listed)
+    texts = tuple(text_of(number, unit) for number in listed)
     return Slider(free, unit, kind, about, listed, texts, listed.index(now), span)
 
 
@@ -132,11 +132,11 @@ def _is_float(value: Fraction) -> bool:
 
 def _bounds(system: CompiledSystem, free: Free) -> tuple[Fraction | None, Fraction | None]:
     """Return the least and the largest value a parameter may have; above an open bound, a little more."""
-    one = parameter_of(system, free)
-    low = None if one.minimum is None else Fraction(repr(one.minimum))
-    if low is not None and one.open_minimum:
-        low += abs(one.number - low) / 10**DECADES
-    return low, None if one.maximum is None else Fraction(repr(one.maximum))
+    parameter = parameter_of(system, free)
+    low = None if parameter.minimum is None else Fraction(repr(parameter.minimum))
+    if low is not None and parameter.open_minimum:
+        low += abs(parameter.number - low) / 10**DECADES
+    return low, None if parameter.maximum is None else Fraction(repr(parameter.maximum))
 
 
 def _span(
@@ -145,7 +145,11 @@ def _span(
     """Return a range around a value: all that it may be, or to `ROOM` times it, below 0 too if it may."""
     if low is not None and high is not None:
         return low, high
-    alike = [abs(one.number) for one in system.parameters if one.unit == unit_of(system, free.name)]
+    alike = [
+        abs(parameter.number)
+        for parameter in system.parameters
+        if parameter.unit == unit_of(system, free.name)
+    ]
     size = abs(now) or max(alike, default=Fraction(0)) or Fraction(1)
     least = -ROOM * size if low is None else low
     most = _nice(ROOM * size)
@@ -168,9 +172,13 @@ def _even(
     """Return values in even steps of a round size."""
     exact = (most - least) / STEPS
     power = Fraction(10) ** floor(log10(float(exact)))
-    step = next(power * one for one in (1, 2, 5, 10) if power * one >= exact)
+    step = next(power * number for number in (1, 2, 5, 10) if power * number >= exact)
     values = [step * k for k in range(ceil(least / step), floor(most / step) + 1)]
-    ends = [one for one in (least, most) if (low is None or one >= low) and (high is None or one <= high)]
+    ends = [
+        number
+        for number in (least, most)
+        if (low is None or number >= low) and (high is None or number <= high)
+    ]
     return [*values, *ends, now]
 
 
@@ -179,7 +187,9 @@ def _decades(now: Fraction, low: Fraction | None, high: Fraction | None) -> list
     middle = log10(float(now))
     count = DECADES * A_DECADE
     listed = [Fraction(f"{10 ** (middle + k / A_DECADE):.{DIGITS}g}") for k in range(-count, count + 1)]
-    return [one for one in listed if (low is None or one >= low) and (high is None or one <= high)]
+    return [
+        number for number in listed if (low is None or number >= low) and (high is None or number <= high)
+    ]
 
 
 def _times(system: CompiledSystem, studied: dict[str, tuple[Fraction, Fraction]]) -> list[Slider]:
@@ -207,11 +217,11 @@ def _times(system: CompiledSystem, studied: dict[str, tuple[Fraction, Fraction]]
             span = studied.get(timing.name, (Fraction(0), _nice(max(ROOM * value, 4 * longest))))
             values = _even(value, *_within(span, value), Fraction(0), None)
         found.append(_slider(system, free, TIMES, about, values, value, span))
-    return sorted(found, key=lambda one: (one.span is None, one.free.name in phases))
+    return sorted(found, key=lambda slider: (slider.span is None, slider.free.name in phases))
 
 
 def _about(system: CompiledSystem, name: str) -> str:
-    return next((one.about for one in system.parameters if one.name == name), "")
+    return next((parameter.about for parameter in system.parameters if parameter.name == name), "")
 
 
 def _periods(now: Fraction, others: Sequence[Fraction]) -> list[Fraction]:
@@ -221,16 +231,16 @@ def _periods(now: Fraction, others: Sequence[Fraction]) -> list[Fraction]:
     listed = {other * k for other in others for k in range(1, RATIOS + 1)}
     listed |= {other / k for other in others for k in range(1, RATIOS + 1)}
     return [
-        one
-        for one in listed
-        if now / 10 <= one <= now * 10 and _frame([one, *others]) / min(one, *others) <= MOST_TICKS
+        number
+        for number in listed
+        if now / 10 <= number <= now * 10 and _frame([number, *others]) / min(number, *others) <= MOST_TICKS
     ]
 
 
 def _frame(periods: Sequence[Fraction]) -> Fraction:
     """Return the least common multiple of periods."""
-    below = lcm(*(one.denominator for one in periods))
-    return Fraction(lcm(*(int(one * below) for one in periods)), below)
+    below = lcm(*(period.denominator for period in periods))
+    return Fraction(lcm(*(int(period * below) for period in periods)), below)
 
 
 def _people(system: CompiledSystem) -> list[Slider]:
@@ -238,8 +248,8 @@ def _people(system: CompiledSystem) -> list[Slider]:
     found = []
     for group in system.groups:
         free = Free(group_count(group.name))
-        one = parameter_of(system, free)
-        if group.columns or one.formula is not None:
+        parameter = parameter_of(system, free)
+        if group.columns or parameter.formula is not None:
             continue
         least = 2 if len(system.groups) == 1 else 1
         most = COUNTS * max(group.count, 3)
@@ -269,8 +279,8 @@ def is_one_of(names: Iterable[str], value: Any) -> bool:
 def place_of(slider: Slider, value: Fraction | float) -> int:
     """Return the place of the value of a slider that is nearest."""
     after = bisect_left(slider.values, value)
-    places = [one for one in (after - 1, after) if 0 <= one < len(slider.values)]
-    return min(places, key=lambda one: abs(slider.values[one] - Fraction(value)))
+    places = [number for number in (after - 1, after) if 0 <= number < len(slider.values)]
+    return min(places, key=lambda place: abs(slider.values[place] - Fraction(value)))
 
 
 def set_to(system: CompiledSystem, sliders: Sequence[Slider], text: str) -> tuple[int, Fraction]:
@@ -282,8 +292,8 @@ def set_to(system: CompiledSystem, sliders: Sequence[Slider], text: str) -> tupl
         E980 what is set has no slider; and those of `overrides.parse_override`.
     """
     found = parse_override(system, text)
-    for place, one in enumerate(sliders):
-        if one.free == found.free:
+    for place, slider in enumerate(sliders):
+        if slider.free == found.free:
             return place, found.value
     what = f"{found.free.label} has no slider: it follows from other numbers, or differs from peer to peer"
     raise ApcError(Mistake("E980", Place("explore"), what))
@@ -292,7 +302,7 @@ def set_to(system: CompiledSystem, sliders: Sequence[Slider], text: str) -> tupl
 def with_value(slider: Slider, value: Fraction) -> tuple[Slider, int]:
     """Return a slider that has a value, and the value's place; it begins where it did."""
     listed = tuple(sorted({*slider.values, value}))
-    texts = tuple(text_of(one, slider.unit) for one in listed)
+    texts = tuple(text_of(number, slider.unit) for number in listed)
     start = listed.index(slider.values[slider.start])
     return replace(slider, values=listed, texts=texts, start=start), listed.index(value)
 
@@ -300,9 +310,9 @@ def with_value(slider: Slider, value: Fraction) -> tuple[Slider, int]:
 def overrides_of(sliders: Sequence[Slider], places: Sequence[int]) -> list[Override]:
     """Return what sets the sliders that were moved."""
     return [
-        Override(one.free, one.values[place])
-        for one, place in zip(sliders, places, strict=True)
-        if place != one.start
+        Override(slider.free, slider.values[place])
+        for slider, place in zip(sliders, places, strict=True)
+        if place != slider.start
     ]
 
 
@@ -310,11 +320,11 @@ def axes_of(sliders: Sequence[Slider], places: Sequence[int], chosen: tuple[int,
     """Return the axes of a region over two sliders: their spans, wide enough for their values."""
     found = []
     for number in chosen:
-        one, value = sliders[number], sliders[number].values[places[number]]
-        assert one.span is not None
-        low, high = one.span
+        slider, value = sliders[number], sliders[number].values[places[number]]
+        assert slider.span is not None
+        low, high = slider.span
         room = (high - low) / 10
         low = low if value >= low else value - room
         high = high if value <= high else _nice(value + room)
-        found.append(Range(one.free, one.unit, low, high))
+        found.append(Range(slider.free, slider.unit, low, high))
     return found[0], found[1]

@@ -53,7 +53,7 @@ def _filled(file: str, peer: Peer, **values: object) -> str:
     """Return one of a peer's texts, its title with it."""
     system, clocks = peer.system, {partition.clock for partition in peer.kind.clocks}
     timings = {timing.name: float(timing.value) for timing in system.timings}
-    periods = [(one.name, timings[one.period]) for one in system.clocks if one.name in clocks]
+    periods = [(clock.name, timings[clock.period]) for clock in system.clocks if clock.name in clocks]
     shared = {"peer": peer, "name": peer.identifier, "periods": periods, "version": program_version()}
     return filled(file, **shared, **values)
 
@@ -67,11 +67,14 @@ def header(peer: Peer) -> str:
         peer,
         states=kind.states,
         inside=[
-            f"{one.name} [{one.unit}]" if i not in peer.outside else "-" for i, one in enumerate(kind.states)
+            f"{state.name} [{state.unit}]" if i not in peer.outside else "-"
+            for i, state in enumerate(kind.states)
         ],
         holds=kind.holds,
         computed=[
-            f"{own} [{unit}]" for one in kind.clocks for own, unit in zip(one.outputs, one.units, strict=True)
+            f"{own} [{unit}]"
+            for clock in kind.clocks
+            for own, unit in zip(clock.outputs, clock.units, strict=True)
         ],
         settings=[f"{own} [{unit}]" for own, unit in named],
         kept=_kept(peer),
@@ -108,14 +111,14 @@ def source(peer: Peer, include: str) -> str:
         include=include,
         quantum=peer.schedule.quantum,
         constants=[
-            one
-            for one in zip(names, kind.parameters, peer.parameters.tolist(), strict=True)
-            if one[0].startswith("P_")
+            item
+            for item in zip(names, kind.parameters, peer.parameters.tolist(), strict=True)
+            if item[0].startswith("P_")
         ],
         units=parameter_units(peer),
         kinds=kinds,
         kind_of=[*map(kinds.index, peer.instants)],
-        lengths=[peer.moves[one.move].quanta for one in kinds],
+        lengths=[peer.moves[kind.move].quanta for kind in kinds],
         over={line.sending: line.name for line in peer.sending},
         ticking=ticking_partitions(peer.schedule),
         computed=computed,

@@ -97,16 +97,16 @@ def format_of(to: str | None, out: Path | None, *, option: str = "--") -> Format
     ApcError
         E952 no such format; E878 a suffix that is none, or another one's.
     """
-    names = [one.name for one in FORMATS]
+    names = [item.name for item in FORMATS]
     written = "--out" if option == "--" else "out="
     if to is None:
         if out is None:
             raise ApcError(
                 Mistake("E952", Place("export"), "no format is named", f"one of {', '.join(names)}")
             )
-        suffix = check_suffix(out, [one.suffix for one in FORMATS], written)
-        return next(one for one in FORMATS if one.suffix == suffix)
-    found = next((one for one in FORMATS if one.name == to), None)
+        suffix = check_suffix(out, [item.suffix for item in FORMATS], written)
+        return next(item for item in FORMATS if item.suffix == suffix)
+    found = next((item for item in FORMATS if item.name == to), None)
     if found is None:
         near = nearest(to, names) or names[0]
         place = Place("--to" if option == "--" else "to")
@@ -138,7 +138,7 @@ def export(system: CompiledSystem, chosen: Format, asked: Asked, out: Path | Non
     """
     for name in Asked.__slots__:
         if getattr(asked, name) and name not in chosen.takes:
-            able = ", ".join(one.name for one in FORMATS if name in one.takes)
+            able = ", ".join(item.name for item in FORMATS if name in item.takes)
             what = f"--{name} means nothing to the format {chosen.name}"
             raise ApcError(Mistake("E953", Place(f"--{name}"), what, hint=f"--to {able}" if able else ""))
     refuse_range(system)

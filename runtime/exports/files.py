@@ -58,8 +58,8 @@ def write_mat(path: Path, found: StateSpace) -> None:
     from scipy.io import savemat
 
     variables = {
-        name: np.array(one, dtype=object).reshape(-1, 1) if isinstance(one, list) else one
-        for name, one in _variables(found).items()
+        name: np.array(item, dtype=object).reshape(-1, 1) if isinstance(item, list) else item
+        for name, item in _variables(found).items()
     }
     # The name has another suffix until the file is whole, and SciPy would add its own.
     write_file(path, lambda temporary: savemat(temporary, variables, appendmat=False, do_compression=True))
@@ -68,8 +68,8 @@ def write_mat(path: Path, found: StateSpace) -> None:
 def write_npz(path: Path, found: StateSpace) -> None:
     """Write an archive of arrays, without pickles. Raises ApcError (E601)."""
     arrays: dict[str, Any] = {
-        name: np.array(one, dtype=np.str_) if isinstance(one, list | str) else np.asarray(one)
-        for name, one in _variables(found).items()
+        name: np.array(item, dtype=np.str_) if isinstance(item, list | str) else np.asarray(item)
+        for name, item in _variables(found).items()
     }
 
     def write(temporary: Path) -> None:

@@ -76,7 +76,10 @@ def unit_of(system: CompiledSystem, scene: CScene, *, peer: str = "") -> Unit:
         texts[f"{code.identifier}.h"] = header(code)
         texts[f"{code.identifier}.c"] = source(code, f"{code.identifier}.h")
     main = filled(
-        "fmu.c", inputs=sum(one.given for one in scene.variables), guid=PLACE_OF_GUID, **shared(scene)
+        "fmu.c",
+        inputs=sum(variable.given for variable in scene.variables),
+        guid=PLACE_OF_GUID,
+        **shared(scene),
     )
     guid = hashlib.sha256("\0".join((*texts.values(), main)).encode()).hexdigest()
     unit = Unit(system, peer, scene, step, float(duration) if duration else 1.0, guid, texts)
@@ -100,9 +103,9 @@ def compile_texts(texts: Mapping[str, str], options: Sequence[str], place: Place
         )
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        for one, text in texts.items():
-            (folder / one).write_text(text, encoding="utf-8")
-        listed = [one for one in texts if one.endswith(".c")]
+        for item, text in texts.items():
+            (folder / item).write_text(text, encoding="utf-8")
+        listed = [text for text in texts if text.endswith(".c")]
         command = [found[0], *options, *listed, "-o", "built", "-lm"]
         try:
             done = subprocess.run(
@@ -122,12 +125,12 @@ def write_fmu(path: Path, unit: Unit) -> None:
     system, suffix = PLATFORMS.get(platform.system(), PLATFORMS["Linux"])
     library = compile_texts(unit.texts, OPTIONS, Place(str(path)))
     members = {"modelDescription.xml": unit.description.encode()}
-    members |= {f"sources/{one}": text.encode() for one, text in unit.texts.items()}
+    members |= {f"sources/{item}": text.encode() for item, text in unit.texts.items()}
     members[f"binaries/{system}64/{unit.identifier}{suffix}"] = library
 
     def write(temporary: Path) -> None:
         with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-            for one, content in members.items():
-                archive.writestr(zipfile.ZipInfo(one, DATE), content, zipfile.ZIP_DEFLATED)
+            for text, content in members.items():
+                archive.writestr(zipfile.ZipInfo(text, DATE), content, zipfile.ZIP_DEFLATED)
 
     write_file(path, write)

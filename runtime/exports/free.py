@@ -65,7 +65,7 @@ def state_space_of(system: CompiledSystem, *, cut: str = "", free: Sequence[str]
     if not free:
         return found
     frees = _frees(system, free)
-    ports = tuple(Port(one.label, unit_of(system, one.name)) for one in frees)
+    ports = tuple(Port(free.label, unit_of(system, free.name)) for free in frees)
     symbols = [casadi.SX.sym(word) for word in words(ports)]
     prepared = prepare_at_start(system, prepare(system), frees)
     if prepared is None:
@@ -109,7 +109,9 @@ def _by_groups(group: PeerGroup, starts: Any) -> list[PeerGroup]:
     """Return equal peers apart by the scene's groups: a group's own number may be free."""
     peers = np.array(list(group.peers), np.int64)
     of = np.searchsorted(starts, peers, side="right")
-    return [replace(group, peers=own, count=len(own)) for one in np.unique(of) for own in [peers[of == one]]]
+    return [
+        replace(group, peers=own, count=len(own)) for item in np.unique(of) for own in [peers[of == item]]
+    ]
 
 
 def _numbers(vector: Callable[[PeerGroup], Any]) -> Numbers:
@@ -117,7 +119,7 @@ def _numbers(vector: Callable[[PeerGroup], Any]) -> Numbers:
 
     def values(function: Any, group: PeerGroup) -> list[Any]:
         rest = [casadi.DM.zeros(*function.size_in(place)) for place in range(function.n_in() - 2)]
-        return [_plain(one) for one in function(*rest, vector(group), 0).nonzeros()]
+        return [_plain(nonzero) for nonzero in function(*rest, vector(group), 0).nonzeros()]
 
     def site(group: PeerGroup) -> LinearSite:
         return site_of_entries(group.jacobians, values(group.jacobians.function, group), 0)
@@ -132,8 +134,8 @@ def _numbers(vector: Callable[[PeerGroup], Any]) -> Numbers:
         moving = np.concatenate([plain.a, plain.b, np.zeros((len(plain.a), count))], axis=1).astype(object)
         for place, push in enumerate(forces, moving.shape[1] - count):
             moving[list(push.velocities), place] = inverses(group, push)
-        if not any(isinstance(one, casadi.SX) for one in moving.flat):
-            return [one.astype(object) for one in steps_in_floats(group, forces, count, durations)]
+        if not any(isinstance(item, casadi.SX) for item in moving.flat):
+            return [matrix.astype(object) for matrix in steps_in_floats(group, forces, count, durations)]
         return [_step(moving, group.site.a, float(duration)) for duration in durations]
 
     return Numbers(site, inverses, steps, SYMBOLS)
@@ -155,9 +157,9 @@ def _step(moving: Matrix, now: Matrix, seconds: float) -> Matrix:
     return _array(found[:n, :])
 
 
-def _plain(one: Any) -> Any:
+def _plain(item: Any) -> Any:
     """Return an expression, as a float if it is one."""
-    value = casadi.SX(one)
+    value = casadi.SX(item)
     return float(value) if value.is_constant() else value
 
 
@@ -180,8 +182,8 @@ def _matrix(block: Matrix) -> Any:
 
 SYMBOLS = Arithmetic(
     multiply=lambda left, right: _array(casadi.mtimes(_matrix(left), _matrix(right))),
-    add=lambda one, other: _array(_matrix(one) + _matrix(other)),
-    subtract=lambda one, other: _array(_matrix(one) - _matrix(other)),
+    add=lambda values, other: _array(_matrix(values) + _matrix(other)),
+    subtract=lambda values, other: _array(_matrix(values) - _matrix(other)),
     exact=lambda matrix: matrix.astype(object),
     vanishes=lambda matrix: not _matrix(matrix).nnz(),
 )

@@ -148,7 +148,7 @@ def steps_in_floats(
 
 
 IN_FLOATS = Numbers(
-    lambda group: group.site, lambda group, one: [*map(float, one.inverses)], steps_in_floats, FLOATS
+    lambda group: group.site, lambda group, push: [*map(float, push.inverses)], steps_in_floats, FLOATS
 )
 
 
@@ -183,7 +183,7 @@ def peers_of(
     try:
         return lifted_groups(system, prepared=prepared)
     except ApcError as error:
-        if any(one.code != "E804" for one in error.mistakes):
+        if any(mistake.code != "E804" for mistake in error.mistakes):
             raise
         what = error.mistakes[0].what
         raise ApcError(Mistake("E951", Place(system.origin.topology), what, hint="fewer peers")) from None
@@ -225,11 +225,11 @@ def lifted(
         link = _link_of(system, cut)
         opened = [_open(system, group, "" if link else cut, numbers) for group in groups]
         _check_size(system, opened)
-        loop = dense_loop([one.group for one in opened], exchange)
-        of_schedule = {id(one.group.schedule): one for one in opened}
+        loop = dense_loop([item.group for item in opened], exchange)
+        of_schedule = {id(item.group.schedule): item for item in opened}
         sites = [of_schedule[id(site.schedule)] for site in loop.sites]
         blocks, labels = _closed(loop, sites, link=link, cut=cut, arithmetic=numbers.arithmetic)
-    notes = () if cut else tuple(dict.fromkeys(note for one in opened for note in one.unpushed))
+    notes = () if cut else tuple(dict.fromkeys(note for item in opened for note in item.unpushed))
     return blocks, labels, notes
 
 
@@ -265,14 +265,16 @@ def _open(system: CompiledSystem, group: PeerGroup, cut: str, numbers: Numbers) 
     durations = step_durations(full)
     steps = numbers.steps(group, forces, count, [duration * full.quantum for duration in durations])
     frame = compose(site, full, dict(zip(durations, steps, strict=True)), numbers=numbers.arithmetic)
-    first = {one: len(kind.states) + k for k, one in enumerate(schedule.carried)}
+    first = {value: len(kind.states) + k for k, value in enumerate(schedule.carried)}
     signals = [
         (
-            Port(one.name, one.unit),
-            one.place[0] if one.role == "state" else first[Value(one.place[0], one.place[1], -1)],
+            Port(local_signal.name, local_signal.unit),
+            local_signal.place[0]
+            if local_signal.role == "state"
+            else first[Value(local_signal.place[0], local_signal.place[1], -1)],
         )
-        for one in local_signals(kind, group.schedule)
-        if one.role in ("state", "output")
+        for local_signal in local_signals(kind, group.schedule)
+        if local_signal.role in ("state", "output")
     ]
     inputs = [Port(f"force on {push.part}", "N") for push in forces]
     inputs += [Port(f"noise on {kind.states[place].name}", kind.states[place].unit) for place in noises]
@@ -291,11 +293,11 @@ def _remembering(group: PeerGroup) -> Schedule:
     schedule, kind = group.schedule, group.jacobians.kind
     at = _instants(schedule)
     kept = [Value(p, o, -1) for p in ticking_partitions(schedule) for o in range(len(kind.clocks[p].outputs))]
-    kept = [one for one in kept if one not in schedule.carried]
+    kept = [value for value in kept if value not in schedule.carried]
     names = [
-        f"{kind.clocks[one.partition].outputs[one.output]}"
-        f"({float((at[one.partition][-1] - schedule.frame) * schedule.quantum * 1000):.6g} ms)"
-        for one in kept
+        f"{kind.clocks[value.partition].outputs[value.output]}"
+        f"({float((at[value.partition][-1] - schedule.frame) * schedule.quantum * 1000):.6g} ms)"
+        for value in kept
     ]
     return replace(
         schedule,
@@ -324,17 +326,17 @@ def _masses(system: CompiledSystem, group: PeerGroup) -> tuple[list[Push], list[
         if state.unit == "m"
     ]
     pushes: dict[str, Push] = {}
-    for one in found:
-        if isinstance(one, Push):
-            pushes.setdefault(one.part, one)
-    refused = dict.fromkeys(f"no force of its own: {one}" for one in found if isinstance(one, str))
+    for push in found:
+        if isinstance(push, Push):
+            pushes.setdefault(push.part, push)
+    refused = dict.fromkeys(f"no force of its own: {text}" for text in found if isinstance(text, str))
     return list(pushes.values()), list(refused)
 
 
 def _measured(site: LinearSite) -> list[int]:
     """Return the states that something samples."""
     looking = [
-        one.any(axis=0) for one in (*(tick.x for tick in site.ticks), *(send.x for send in site.sends))
+        values.any(axis=0) for values in (*(tick.x for tick in site.ticks), *(send.x for send in site.sends))
     ]
     places: list[int] = np.flatnonzero(np.any(looking, axis=0)).tolist() if looking else []
     return places
@@ -382,7 +384,7 @@ def _cut_open(site: LinearSite, schedule: Schedule, cut: str) -> tuple[LinearSit
     at, ports = _instants(schedule), []
     for partition, output in cuts:
         clock = kind.clocks[partition]
-        times = [float(one * schedule.quantum * 1000) for one in at[partition]]
+        times = [float(number * schedule.quantum * 1000) for number in at[partition]]
         ports += [Port(f"{clock.outputs[output]} at {when:.6g} ms", clock.units[output]) for when in times]
     if len(schedule.heard) + len(ports) > MOST_PACKETS:
         what = f"{len(ports):,} ticks a frame, each an input where it is cut, and {MOST_PACKETS} are the most"
@@ -396,10 +398,10 @@ def _cut_open(site: LinearSite, schedule: Schedule, cut: str) -> tuple[LinearSit
 
 def _check_size(system: CompiledSystem, opened: Sequence[_Opened]) -> None:
     """Refuse a scene whose matrix does not fit the memory: ApcError E951."""
-    columns = sum(one.group.count * states_of(one.group.schedule, one.group.jacobians) for one in opened)
-    peers = sum(one.group.count for one in opened)
+    columns = sum(item.group.count * states_of(item.group.schedule, item.group.jacobians) for item in opened)
+    peers = sum(item.group.count for item in opened)
     what = f"{columns:,} × {columns:,} numbers, the states and inputs of all {peers:,} peers together,"
-    first = max(opened, key=lambda one: one.group.count).group
+    first = max(opened, key=lambda opened: opened.group.count).group
     hint = f"fewer peers: --set {system.groups[0].name if len(opened) == 1 else first.name}.count=10"
     refuse_beyond(ENTRY * columns**2, "E951", Place(system.origin.topology), what, hint)
 
@@ -420,7 +422,7 @@ def _closed(
         [row for row, what in enumerate(rows) if what is OUTSIDE or (link and what.way.link == link)]
         for rows in heard
     ]
-    maps = [_from_outside(one.map, rows) for one, rows in zip(sites, opened, strict=True)]
+    maps = [_from_outside(site.map, rows) for site, rows in zip(sites, opened, strict=True)]
     whole = close_outside(loop, maps, [*map(len, opened)], layout, numbers=arithmetic)
 
     def spread(listed: Sequence[Placed]) -> tuple[Labels, Places]:
@@ -445,7 +447,7 @@ def _closed(
         blocks = matrix[np.ix_(kept, kept)], matrix[np.ix_(kept, drawn)], c, np.zeros((len(c), len(drawn)))
         return blocks, (states, inputs, outputs)
     if link:
-        sent = {name: unit for one in units.values() for name, unit in one.items()}
+        sent = {name: unit for item in units.values() for name, unit in item.items()}
         forces, _ = spread([_heard_ports(rows, link, sent) for rows in heard])
         back = -np.concatenate([r[rows] for r, rows in zip(whole.heard, opened, strict=True)])
     else:
@@ -455,11 +457,11 @@ def _closed(
     return blocks, (states, forces, outputs)
 
 
-def _from_outside(one: FrameMap, rows: Sequence[int]) -> FrameMap:
+def _from_outside(frame_map: FrameMap, rows: Sequence[int]) -> FrameMap:
     """Return a peer's map that takes some of what it hears from outside, behind all that it hears."""
-    q, d = (np.concatenate([block, block[:, rows]], axis=1) for block in (one.q, one.d))
+    q, d = (np.concatenate([block, block[:, rows]], axis=1) for block in (frame_map.q, frame_map.d))
     q[:, rows] = d[:, rows] = 0.0
-    return replace(one, q=q, d=d)
+    return replace(frame_map, q=q, d=d)
 
 
 def _named(port: Port, peer: str) -> Port:

@@ -162,7 +162,7 @@ class _Writer:
 
     def name(self, wanted: str) -> str:
         """Return a name that nothing else has, of letters that Modelica takes in quotes."""
-        wanted = name = "".join(one if one.isascii() and one.isprintable() else "_" for one in wanted)
+        wanted = name = "".join(text if text.isascii() and text.isprintable() else "_" for text in wanted)
         count = 1
         while name in self.taken:
             count += 1
@@ -279,7 +279,7 @@ class _Writer:
         made: dict[tuple[Fraction, Fraction], str] = {}
         names: dict[str, str] = {}
         lines: list[str] = []
-        for clock, grid in sorted(self.grids.items(), key=lambda one: one[1][0]):
+        for clock, grid in sorted(self.grids.items(), key=lambda pair: pair[1][0]):
             if clock not in used:
                 continue
             if grid not in made:
@@ -293,7 +293,7 @@ class _Writer:
         """Write a clock, of a faster one where one begins with it; return its name."""
         (period, phase), name = grid, self.name(clock)
         self._check(period.numerator, period.denominator, (phase / period).denominator)
-        finer = next((one for one in made if one[1] == phase), None)
+        finer = next((item for item in made if item[1] == phase), None)
         value, derived = f"Clock({period.numerator}, {period.denominator})", ""
         if finer is not None:
             ratio, value = period / finer[0], made[finer]
@@ -360,7 +360,8 @@ class _Peer:
         """Return states, holds and time as a clock samples them, those that are needed."""
         sampled = self.writer.sampled
         return [
-            [functools.partial(sampled, one, clock) for one in listed] for listed in (self.x, self.u, [TIME])
+            [functools.partial(sampled, text, clock) for text in listed]
+            for listed in (self.x, self.u, [TIME])
         ]
 
     def sends(self) -> None:
@@ -370,7 +371,7 @@ class _Peer:
             self.writer.comment(f"{self.name}: what it sends over {sending.link}")
             x, u, t = self._sampled(self.writer.clock_of[sending.link])
             values = written(sending.send, [x, u, self.p, t], self.keep)
-            starts = [number(float(one)) for one in begin[sending.link]]
+            starts = [number(float(item)) for item in begin[sending.link]]
             names = [f"{self.name}.{channel} sent" for channel in sending.channels]
             texts = [value.text for value in values]
             variables = map(self.writer.let, names, texts, sending.units, starts)
@@ -426,11 +427,13 @@ class _Peer:
             check_mean(exchange, self.number, link, receive.operator, bool(terms), divided)
         if receive.operator in ("max", "min"):
             joined = "{}({}, {})".format
-            value = functools.reduce(lambda a, b: joined(receive.operator, a, b), [one.text for one in terms])
+            value = functools.reduce(
+                lambda a, b: joined(receive.operator, a, b), [term.text for term in terms]
+            )
         else:
             value = " + ".join(
-                one.within(SUM) if weight == 1 else f"{number(float(weight)).within(SUM + 1)}*({one.text})"
-                for one, weight in zip(terms, weights, strict=True)
+                term.within(SUM) if weight == 1 else f"{number(float(weight)).within(SUM + 1)}*({term.text})"
+                for term, weight in zip(terms, weights, strict=True)
             )
             if receive.operator == "mean" and total != 1:
                 value = f"({value})/{number(float(total)).within(SUM + 1)}"

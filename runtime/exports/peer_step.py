@@ -172,7 +172,11 @@ class Peer:
         """What there is to look at: states that its computer moves, what is computed, what acts later."""
         outside = {("state", (row,)) for row in self.outside}
         every = local_signals(self.kind, self.schedule)
-        return tuple(one for one in every if one.role != "limited" and (one.role, one.place) not in outside)
+        return tuple(
+            local_signal
+            for local_signal in every
+            if local_signal.role != "limited" and (local_signal.role, local_signal.place) not in outside
+        )
 
     @property
     def sending(self) -> tuple[Line, ...]:
@@ -222,7 +226,7 @@ def peer_of(
     pushed = unique(
         (identifier(force.name) for force in forces), [*names, *(f"{line}_sent" for line in names)]
     )
-    x, _, memories = start_values(site, [float(one) for one in vector])
+    x, _, memories = start_values(site, [float(item) for item in vector])
     return Peer(
         system=system,
         name=label,
@@ -255,13 +259,22 @@ def _settable(kind: Kind) -> tuple[int, ...]:
     """Return the places of the parameters that only ticks read: how states move, what they and packets start
     with, is the same whatever these are."""
     ticks = [
-        one for clock in kind.clocks for one in (clock.tick, *(each.edge for each in clock.receives)) if one
+        function
+        for clock in kind.clocks
+        for function in (clock.tick, *(each.edge for each in clock.receives))
+        if function
     ]
     others = [kind.derivative, *(sending.send for sending in kind.sends)]
-    fixed = {state.start for state in kind.states} | {one for clock in kind.clocks for one in clock.starts}
+    fixed = {state.start for state in kind.states} | {
+        start for clock in kind.clocks for start in clock.starts
+    }
     read, moves = (
         np.any(
-            [structural_pattern(one.jac_sparsity(0, one.n_in() - 2)).any(axis=0) for one in functions], axis=0
+            [
+                structural_pattern(function.jac_sparsity(0, function.n_in() - 2)).any(axis=0)
+                for function in functions
+            ],
+            axis=0,
         )
         for functions in (ticks, others)
     )
@@ -316,15 +329,15 @@ def _outside(
     pattern = structural_pattern(kind.derivative.jac_sparsity(0, 0)).astype(float)
     tied = [set(rows.tolist()) for rows in moved_together(pattern)]
     if device is not None:
-        chosen = {one.strip() for one in device.split(",")}
-        for one in sorted(chosen - masses):
-            near = nearest(one, masses) or min(masses, default=NO_DEVICE)
-            what = f"--device: no mass of {name} is called {one[:40] or 'so'}"
+        chosen = {part.strip() for part in device.split(",")}
+        for mass in sorted(chosen - masses):
+            near = nearest(mass, masses) or min(masses, default=NO_DEVICE)
+            what = f"--device: no mass of {name} is called {mass[:40] or 'so'}"
             raise refused(system, what, f"--device {near}", "E961")
     else:
         unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
         devices = find_devices(site, vector, unit_of, direct=coupled_directly(system.kinds))
-        chosen = {one.rpartition(".")[0] if one.endswith("]") else one for one in devices}
+        chosen = {device.rpartition(".")[0] if device.endswith("]") else device for device in devices}
     if not chosen:
         hint = f"--device {NO_DEVICE} if its computer moves them all, or --device "
         what = f"{name} has no device: others are told of every mass of it"
@@ -391,7 +404,7 @@ def _forces(
             raise refused(system, f"{name}: {device or f'{state} is no mass'}", code="E961")
         function = casadi.Function("slopes", [x, u, p, t], [casadi.densify(axis)])
         values = evaluate_exact(function, [numbers[0], numbers[1], numbers[4], numbers[5]])[0]
-        terms = tuple((h, float(one / device.inverse)) for h, one in enumerate(values) if one)
+        terms = tuple((h, float(value / device.inverse)) for h, value in enumerate(values) if value)
         part, _, own = state.rpartition(".")
         found.append(Force(f"{part}.f{own.removeprefix(whole_and_index(own)[0])}", terms))
     return tuple(found)
@@ -421,7 +434,7 @@ def _moves(
         what = f"{name}: the rates of {names} are solved for by iteration, which is not written as C"
         raise refused(system, what, "equations that can be solved for these")
     every = zip(system.groups, plan.numbers.parameters, strict=True)
-    numbers = [row for one, rows in every if one.kind == place for row in rows]
+    numbers = [row for group, rows in every if group.kind == place for row in rows]
     flow = flow_of(kind, method, flowing, state_scales(system, kind, site, numbers))
     linear = rates(kind, [*sorted(outside), *flowing])
     if linear.timed:
@@ -445,18 +458,18 @@ def _moves(
 
 def _instants(schedule: Schedule) -> tuple[tuple[Instant, ...], tuple[int, ...]]:
     """Return the instants of a frame, and the lengths of time between them in quanta."""
-    lengths = sorted({one.duration for one in schedule.events if isinstance(one, frames.Propagate)})
+    lengths = sorted({event.duration for event in schedule.events if isinstance(event, frames.Propagate)})
     ticked: Counter[int] = Counter()
     found = []
     for _, group in groupby(timed_events(schedule), itemgetter(0)):  # each ends with a length of time
         *listed, move = (event for _, event in group)
         assert isinstance(move, frames.Propagate), "an instant is over when time goes on"
-        ticks = tuple(one.partition for one in listed if isinstance(one, frames.Tick))
+        ticks = tuple(tick.partition for tick in listed if isinstance(tick, frames.Tick))
         ticked.update(ticks)
-        acts = [(one.hold, one.value) for one in listed if isinstance(one, frames.Act)]
+        acts = [(act.hold, act.value) for act in listed if isinstance(act, frames.Act)]
         found.append(
             Instant(
-                tuple(one.partition for one in listed if isinstance(one, frames.Send)),
+                tuple(send.partition for send in listed if isinstance(send, frames.Send)),
                 ticks,
                 tuple(Act(hold, ticked[value.partition] - 1 - value.index) for hold, value in acts),
                 lengths.index(move.duration),
@@ -485,18 +498,18 @@ def lines_of(plan: Plan, number: int) -> tuple[tuple[Line, ...], dict[tuple[int,
     for name, (link, declared) in zip(
         unique(map(identifier, exchange.links)), exchange.links.items(), strict=True
     ):
-        sent = {one.channel for one in schedule.sent if one.link == link}
-        of = {key: site.pattern.ticks[key[0]].channels[key[1]] for key, one in read.items() if one == link}
+        sent = {sent.channel for sent in schedule.sent if sent.link == link}
+        of = {key: site.pattern.ticks[key[0]].channels[key[1]] for key, text in read.items() if text == link}
         hears = {channel for channels in of.values() for channel in channels}
         if not hears and not sent:
             continue
         place, known = next(
-            (place, one)
+            (place, send)
             for each in (kind, *system.kinds)
-            for place, one in enumerate(each.sends)
-            if one.link == link
+            for place, send in enumerate(each.sends)
+            if send.link == link
         )
-        used = [i for i, one in enumerate(known.channels) if i in hears or one in sent]
+        used = [i for i, channel in enumerate(known.channels) if i in hears or channel in sent]
         places |= {key: tuple(map(used.index, channels)) for key, channels in of.items()}
         channels = tuple(known.channels[i] for i in used)
         members = unique(map(identifier, channels))
@@ -513,8 +526,10 @@ def lines_of(plan: Plan, number: int) -> tuple[tuple[Line, ...], dict[tuple[int,
                 packet=tuple(map(Entry, channels, [known.units[i] for i in used], members)),
                 sending=place if sent else -1,
                 senders=tuple(
-                    Sender(one, exchange.peer_name(one), weight, first_packet(plan, link, one, channels))
-                    for one, weight in senders
+                    Sender(
+                        number, exchange.peer_name(number), weight, first_packet(plan, link, number, channels)
+                    )
+                    for number, weight in senders
                 ),
                 missing=law is not None and law.on_loss == "zero" and bool(senders),
                 complete=exchange.is_complete(link),
@@ -529,11 +544,11 @@ def first_packet(plan: Plan, link: str, number: int, channels: Sequence[str]) ->
     sent: dict[str, float] = {}
     for sending in site.kind.sends:
         if sending.link == link:
-            vector = [float(one) for one in _parameters(plan, number)]
+            vector = [float(matrix) for matrix in _parameters(plan, number)]
             x, u, _ = start_values(site, vector)
             values = np.asarray(sending.send(x, u, vector, 0.0), np.float64).ravel().tolist()
             sent = dict(zip(sending.channels, values, strict=True))
-    return tuple(sent.get(one, 0.0) for one in channels)
+    return tuple(sent.get(channel, 0.0) for channel in channels)
 
 
 def heard_of(
@@ -541,22 +556,24 @@ def heard_of(
 ) -> Iterator[tuple[int, float]]:
     """Yield the peers that one hears over a link, with their weights, in the scene's order."""
     if exchange.is_complete(link):
-        listed = [(one, 1.0) for one in range(exchange.peers) if one != number]
+        listed = [(index, 1.0) for index in range(exchange.peers) if index != number]
     else:
         pairs, weights = exchange.arcs(link)
         mine = np.flatnonzero(pairs[:, 1] == number)
         listed = sorted(zip(pairs[mine, 0].tolist(), weights[mine].tolist(), strict=True))
     kinds = [system.kinds[group.kind] for group in system.groups]
     sends = [any(sending.link == link for sending in kind.sends) for kind in kinds]
-    return ((one, weight) for one, weight in listed if sends[exchange.group_of(one)])
+    return ((number, weight) for number, weight in listed if sends[exchange.group_of(number)])
 
 
 def computing(kind: Kind) -> list[tuple[Any, str, str, str]]:
     """Return all that a peer computes at instants: each function, when, what it gives, over which link."""
-    found = [(one.tick, f"at a tick of {one.clock} ", ", ".join(one.outputs), "") for one in kind.clocks]
-    edges = [each.edge for one in kind.clocks for each in one.receives if each.edge is not None]
+    found = [
+        (clock.tick, f"at a tick of {clock.clock} ", ", ".join(clock.outputs), "") for clock in kind.clocks
+    ]
+    edges = [each.edge for clock in kind.clocks for each in clock.receives if each.edge is not None]
     found += [(edge, "", "a look at others", "") for edge in edges]
-    return [*found, *((one.send, "", ", ".join(one.channels), f" of {one.link}") for one in kind.sends)]
+    return [*found, *((send.send, "", ", ".join(send.channels), f" of {send.link}") for send in kind.sends)]
 
 
 def has_edge(kind: Kind, partition: int, receive: int) -> bool:

@@ -31,21 +31,23 @@ def pushed(system: CompiledSystem) -> CompiledSystem:
     system
         The compiled scene. A peer without a device, or whose forces no clock computes, is left as it is.
     """
-    unit_of = {one.name: one.unit for one in system.parameters}
+    unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
     numbers, direct = resolve(system), coupled_directly(system.kinds)
-    periods = {one.name: numbers.timings[one.period] for one in system.clocks}
+    periods = {clock.name: numbers.timings[clock.period] for clock in system.clocks}
     kinds, added = list(system.kinds), dict[str, Parameter]()
     for place, group in enumerate(system.groups):
         kind = system.kinds[group.kind]
         if kinds[group.kind] is not kind or not kind.clocks:
             continue
         found = find_devices(jacobians(kind), numbers.parameters[place][0], unit_of, direct=direct)
-        devices = {f"{FORCE_ON}{one.part}": one for one in found.values() if isinstance(one, Device)}
+        devices = {
+            f"{FORCE_ON}{device.part}": device for device in found.values() if isinstance(device, Device)
+        }
         fastest = min(range(len(kind.clocks)), key=lambda number: periods[kind.clocks[number].clock])
         if devices:
             kinds[group.kind] = _pushed(kind, devices, fastest)
             added |= {name: Parameter(name, "N", 0.0, about="a force from outside") for name in devices}
-    timings = {one.name: one for one in (Timing(NO_DELAY, Fraction(0)), *system.timings)}
+    timings = {timing.name: timing for timing in (Timing(NO_DELAY, Fraction(0)), *system.timings)}
     return replace(
         system,
         kinds=tuple(kinds),
@@ -63,8 +65,8 @@ def _pushed(kind: Kind, devices: dict[str, Device], fastest: int) -> Kind:
     def rates(x: Any, u: Any, p: Any, t: Any) -> Any:
         old = x, u[:held], p[:own], t
         found = casadi.vertsplit(kind.derivative(*old))
-        for one, force in zip(devices.values(), casadi.vertsplit(u[held:]), strict=True):
-            found[one.velocity] += one.symbolic(*old) * force
+        for device, force in zip(devices.values(), casadi.vertsplit(u[held:]), strict=True):
+            found[device.velocity] += device.symbolic(*old) * force
         return casadi.vertcat(*found)
 
     larger = replace(kind, parameters=(*kind.parameters, *devices), holds=(*kind.holds, *holds))

@@ -109,8 +109,8 @@ def one_peer(plan: Plan, number: int, method: Method) -> CScene:
         for k, sender in enumerate(line.senders):
             label, member = f"{line.link}.{sender.name}", f"in0[0].{line.name}[{k}]"
             variables += [
-                Variable(f"{label}.{one.name}", one.unit, f"{member}.{one.member}", "input", start)
-                for one, start in zip(line.packet, sender.start, strict=True)
+                Variable(f"{label}.{entry.name}", entry.unit, f"{member}.{entry.member}", "input", start)
+                for entry, start in zip(line.packet, sender.start, strict=True)
             ]
             if line.missing:
                 flag = Variable(f"{label}.missing", "1", f"{member}.missing", "flag")
@@ -121,7 +121,7 @@ def one_peer(plan: Plan, number: int, method: Method) -> CScene:
         for entry in line.packet
     ]
     variables += _looked_at(peer, "peer0[0]", "")
-    variables.sort(key=lambda one: not one.given)
+    variables.sort(key=lambda variable: not variable.given)
     return CScene(peer.identifier, peer.schedule.quantum, (peer,), ((0, 0),), (), tuple(variables))
 
 
@@ -161,19 +161,19 @@ def c_scene(plan: Plan, method: Method) -> CScene:
     first = sites_of(plan)
     sites = [*dict.fromkeys(first)]
     names = unique(identifier(exchange.peer_name(site)) for site in sites)
-    codes = tuple(peer_of(plan, one, method, name=name) for one, name in zip(sites, names, strict=True))
+    codes = tuple(peer_of(plan, site, method, name=name) for site, name in zip(sites, names, strict=True))
     placed: Counter[int] = Counter()
     peers = []
-    for one in map(sites.index, first):
-        peers.append((one, placed[one]))
-        placed[one] += 1
+    for number in map(sites.index, first):
+        peers.append((number, placed[number]))
+        placed[number] += 1
     quantum = codes[0].schedule.quantum
     variables = [
-        one
+        variable
         for k, (site, place) in enumerate(peers)
-        for one in _looked_at(codes[site], f"peer{site}[{place}]", f"{exchange.peer_name(k)}.")
+        for variable in _looked_at(codes[site], f"peer{site}[{place}]", f"{exchange.peer_name(k)}.")
     ]
-    variables.sort(key=lambda one: not one.given)
+    variables.sort(key=lambda variable: not variable.given)
     links = _links(plan, quantum)
     return CScene(identifier(system.name), quantum, codes, tuple(peers), links, tuple(variables))
 
@@ -187,13 +187,14 @@ def _links(plan: Plan, quantum: Fraction) -> tuple[Link, ...]:
         for line in lines_of(plan, peer)[0]:
             used.setdefault(line.link, {}).update(dict.fromkeys(line.channels))
             ways.setdefault(line.link, []).extend((sender.peer, peer) for sender in line.senders)
-    clocks = {one.name: one for one in plan.system.clocks}
+    clocks = {clock.name: clock for clock in plan.system.clocks}
     found = []
     for name, (link, channels) in zip(unique(map(identifier, used)), used.items(), strict=True):
         clock = clocks[exchange.links[link].clock]
-        period, phase = (int(timings[one] / quantum) for one in (clock.period, clock.phase))
+        period, phase = (int(timings[text] / quantum) for text in (clock.period, clock.phase))
         delays = [
-            timings[exchange.delay(link, *(exchange.group_of(one) for one in way))] for way in ways[link]
+            timings[exchange.delay(link, *(exchange.group_of(number) for number in way))]
+            for way in ways[link]
         ]
         lucks = [
             (luck_of(plan.system, timings, exchange, route, quantum), route)
@@ -237,7 +238,7 @@ def shared(scene: CScene) -> dict[str, Any]:
             (
                 link,
                 lines[link.link],
-                [(link.channels.index(one.name), one.member) for one in lines[link.link].packet],
+                [(link.channels.index(entry.name), entry.member) for entry in lines[link.link].packet],
             )
             for link in scene.links
             if link.link in lines
@@ -248,6 +249,6 @@ def shared(scene: CScene) -> dict[str, Any]:
         "sites": sites,
         "lucky": [link for link in scene.links if link.luck],
         "luck": luck_text(),
-        "quanta": lambda link: [int(one / scene.quantum) for one in link.delays],
-        "first": lambda link, numbers: map([one for _, one in link.ways].index, numbers),
+        "quanta": lambda link: [int(delay / scene.quantum) for delay in link.delays],
+        "first": lambda link, numbers: map([item for _, item in link.ways].index, numbers),
     }

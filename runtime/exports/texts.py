@@ -53,7 +53,7 @@ def number(value: float) -> str:
 
 def row(values: Iterable[Any]) -> str:
     """Return what stands between the braces of an array, which has at least one entry."""
-    return ", ".join(number(one) if isinstance(one, float) else str(one) for one in values) or "0"
+    return ", ".join(number(value) if isinstance(value, float) else str(value) for value in values) or "0"
 
 
 def comment(text: str) -> str:
@@ -64,7 +64,7 @@ def comment(text: str) -> str:
 
 def line_of(text: str) -> str:
     """Return a text on one line."""
-    return "".join(one if one.isprintable() else " " for one in text)
+    return "".join(item if item.isprintable() else " " for item in text)
 
 
 def quoted(text: str) -> str:

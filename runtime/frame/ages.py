@@ -91,7 +91,7 @@ def nominal(
     exchange = build_exchange(system, timings)
     kinds = []
     for number, kind in enumerate(system.kinds):
-        partitions = [_ages(system, exchange, timings, number, one, order) for one in kind.clocks]
+        partitions = [_ages(system, exchange, timings, number, clock, order) for clock in kind.clocks]
         kinds.append(_nominal(kind, tuple(partitions)) if _hears_ages(kind) else kind)
     return replace(system, kinds=tuple(kinds))
 
@@ -105,7 +105,7 @@ def _ages(
     order: Sequence[str],
 ) -> tuple[_Ages, ...]:
     """Return the ages that the ticks of a kind's clock find on each link, until they come again."""
-    links = list(dict.fromkeys(one.link for one in partition.receives if one.age))
+    links = list(dict.fromkeys(receive.link for receive in partition.receives if receive.age))
     if not links:
         return ()
     clock_of = {clock.name: clock for clock in system.clocks}
@@ -181,12 +181,12 @@ def _with_ages(partition: ClockPartition, ages: Sequence[_Ages]) -> ClockPartiti
             own.append((0, ((places[key], float(age) if receive.age == "factor" else 1),)))
     r = type(x).sym("r", len(receives))
     values = [partition.tick(x, u, m, _column(own, r), p, t) for own in rows]
-    number = {one: place for place, one in enumerate(different)}
+    number = {pairs: place for place, pairs in enumerate(different)}
     return replace(
         partition,
         receives=tuple(receives),
         tick=_function(partition.tick, [x, u, m, r, p, t], casadi.vertcat(*values)),
-        variants=tuple(number[one] for one in ages) if len(different) > 1 else (),
+        variants=tuple(number[age] for age in ages) if len(different) > 1 else (),
     )
 
 
@@ -236,7 +236,9 @@ def stamped(system: CompiledSystem) -> CompiledSystem:
     asked: dict[str, dict[str, None]] = {}
     for kind in system.kinds:
         channels = {sending.link: sending.channels for sending in kind.sends}
-        for receive in (one for partition in kind.clocks for one in partition.receives if one.age):
+        for receive in (
+            receive for partition in kind.clocks for receive in partition.receives if receive.age
+        ):
             of = channels[receive.link][receive.channel] if receive.age == "factor" else ""
             asked.setdefault(receive.link, {})[of] = None
     wanted = tuple((link, tuple(names)) for link, names in asked.items())
@@ -247,14 +249,14 @@ def stamped(system: CompiledSystem) -> CompiledSystem:
 def _stamped(kind: Kind, wanted: tuple[tuple[str, tuple[str, ...]], ...]) -> Kind:
     """Return a kind that stamps its packets: by link, the channels that are sent times their moment too."""
     asked = dict(wanted)
-    sends = tuple(_stamping(one, asked[one.link]) if one.link in asked else one for one in kind.sends)
-    channels = {one.link: one.channels for one in sends}
+    sends = tuple(_stamping(send, asked[send.link]) if send.link in asked else send for send in kind.sends)
+    channels = {send.link: send.channels for send in sends}
     return replace(
         kind,
         sends=sends,
         clocks=tuple(
-            _by_stamps(one, channels) if any(receive.age for receive in one.receives) else one
-            for one in kind.clocks
+            _by_stamps(clock, channels) if any(receive.age for receive in clock.receives) else clock
+            for clock in kind.clocks
         ),
     )
 
@@ -266,7 +268,7 @@ def _stamp(channel: str) -> str:
 def _stamping(sending: SendPartition, asked: Sequence[str]) -> SendPartition:
     x, u, p, t = _symbols(sending.send)
     sent = sending.send(x, u, p, t)
-    more = [t * sent[sending.channels.index(one)] if one else t for one in asked]
+    more = [t * sent[sending.channels.index(text)] if text else t for text in asked]
     return replace(
         sending,
         channels=(*sending.channels, *map(_stamp, asked)),

@@ -196,8 +196,8 @@ def _courses(
             last = end.value.reshape(-1, 2, count)[states, :, np.arange(count)]
             path = np.concatenate([*parts, last[None]])
             for mode in np.flatnonzero(states >= n_x):
-                one = schedule.carried[states[mode] - n_x]
-                ticks = [replace(one, index=one.index + i) for i in range(schedule.ticks[one.partition])]
+                item = schedule.carried[states[mode] - n_x]
+                ticks = [replace(item, index=item.index + i) for i in range(schedule.ticks[item.partition])]
                 told = [computed[tick].reshape(2, count)[:, mode] for tick in ticks if tick in computed]
                 path[:, mode] = last[mode]
                 path[: len(told), mode] = told

@@ -101,10 +101,10 @@ def find_device(
     found = find_devices(site, parameters, unit_of, listening, part=part, direct=direct)
     if not found:
         return None
-    if len(found) > 1 and any(isinstance(one, Device) for one in found.values()):
+    if len(found) > 1 and any(isinstance(item, Device) for item in found.values()):
         return f"a hand may hold any of {', '.join(found)} ({kind.name})"
-    one = next(iter(found.values()))
-    return f"{one} ({kind.name})" if isinstance(one, str) else one
+    text = next(iter(found.values()))
+    return f"{text} ({kind.name})" if isinstance(text, str) else text
 
 
 def _is_plain(site: SiteJacobians) -> bool:
@@ -135,7 +135,7 @@ def find_devices(
         others are told about, too, if it is no copy of a shared one.
     """
     kind = site.kind
-    owners = {_part(one.name) for one in kind.states}
+    owners = {_part(state.name) for state in kind.states}
     gripped = {own for own in owners if _grips(kind, own)}
     if not _is_plain(site):
         return {}
@@ -199,7 +199,7 @@ def coupled_directly(kinds: tuple[Kind, ...]) -> bool:
 
 def _grips(kind: Kind, part: str) -> bool:
     """Say whether a hand of the scene is joined to a part."""
-    return any(part == one or part.startswith(f"{one}.") for one in kind.held)
+    return any(part == text or part.startswith(f"{text}.") for text in kind.held)
 
 
 def _keeps_to_itself(site: SiteJacobians) -> bool:
@@ -221,8 +221,8 @@ def _told_of(site: SiteJacobians) -> set[str]:
         for send, sending in zip(site.pattern.sends, kind.sends, strict=True)
         for row, held, unit in zip(send.x, send.u, sending.units, strict=True)
         if unit == "m"
-        for one in (row, *(computed[hold] for hold in np.flatnonzero(held)))
-        for place in np.flatnonzero(one)
+        for item in (row, *(computed[hold] for hold in np.flatnonzero(held)))
+        for place in np.flatnonzero(item)
     }
 
 
@@ -273,8 +273,8 @@ def find_push(
     driven = np.flatnonzero(site.pattern.a[position])
     masses = [
         place
-        for place, one in enumerate(kind.parameters)
-        if unit_of.get(one) == "kg" and _part(one) == _part(name)
+        for place, parameter in enumerate(kind.parameters)
+        if unit_of.get(parameter) == "kg" and _part(parameter) == _part(name)
     ]
     if why is None or len(driven) != 1 or len(masses) != 1 or not site.walkable:
         return why
@@ -313,7 +313,7 @@ def _part(name: str) -> str:
 def _slopes(kind: Kind, velocity: int, masses: tuple[int, ...]) -> Any:
     """Return the slopes of a velocity's rate over states and holds, and how they change with each mass."""
     slopes, changes, inputs = _rates(kind, velocity, masses)
-    return casadi.Function("slopes", inputs, [casadi.densify(one) for one in (slopes, *changes)])
+    return casadi.Function("slopes", inputs, [casadi.densify(item) for item in (slopes, *changes)])
 
 
 def _rates(kind: Kind, velocity: int, masses: Sequence[int]) -> tuple[Any, list[Any], list[Any]]:
@@ -350,16 +350,16 @@ def devices_of(system: CompiledSystem, *, option: str) -> dict[int, Device]:
     ApcError
         E931 no peer with a device, or one with several that a hand might hold.
     """
-    unit_of = {one.name: one.unit for one in system.parameters}
+    unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
     numbers, direct = resolve(system), coupled_directly(system.kinds)
     found: dict[int, Device] = {}
     for place, group in enumerate(system.groups):
         site = jacobians(system.kinds[group.kind])
-        one = find_device(site, numbers.parameters[place][0], unit_of, direct=direct)
-        if isinstance(one, str):
-            raise ApcError(Mistake("E931", Place(system.origin.topology), f"{option}: {one}"))
-        if one is not None:
-            found.setdefault(group.kind, one)
+        device = find_device(site, numbers.parameters[place][0], unit_of, direct=direct)
+        if isinstance(device, str):
+            raise ApcError(Mistake("E931", Place(system.origin.topology), f"{option}: {device}"))
+        if device is not None:
+            found.setdefault(group.kind, device)
     if not found:
         raise no_device(system, option)
     return found
@@ -375,17 +375,17 @@ def directions_of(system: CompiledSystem) -> dict[str, CompiledSystem]:
     system
         The compiled scene.
     """
-    unit_of = {one.name: one.unit for one in system.parameters}
+    unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
     numbers, direct = resolve(system), coupled_directly(system.kinds)
     wanted: dict[str, None] = {}
     for place, group in enumerate(system.groups):
         site = jacobians(system.kinds[group.kind])
         found = find_devices(site, numbers.parameters[place][0], unit_of, direct=direct)
-        axes = {own: one for own, one in found.items() if isinstance(one, Device)}
+        axes = {own: device for own, device in found.items() if isinstance(device, Device)}
         wholes = {whole_and_index(own)[0] if own.endswith("]") else "" for own in axes}
         if len(axes) == len(found) > 1 and len(wholes) == 1 and "" not in wholes:
             wanted |= dict.fromkeys(own.rpartition(".")[2] for own in axes)
-    return {axis: _along(system, [one for one in wanted if one != axis]) for axis in wanted}
+    return {axis: _along(system, [text for text in wanted if text != axis]) for axis in wanted}
 
 
 def _along(system: CompiledSystem, others: Sequence[str]) -> CompiledSystem:
@@ -439,9 +439,9 @@ def without_hands(system: CompiledSystem, option: str) -> CompiledSystem:
     """
     if not any(kind.hands for kind in system.kinds):
         return system
-    unit_of = {one.name: one.unit for one in system.parameters}
+    unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
     kinds = tuple(_without_hands(kind, tuple(map(unit_of.get, kind.parameters))) for kind in system.kinds)
-    bare = tuple(one or kind for one, kind in zip(kinds, system.kinds, strict=True))
+    bare = tuple(item or kind for item, kind in zip(kinds, system.kinds, strict=True))
     found = replace(system, kinds=bare)
     refuse_hands(found, option)
     return found
@@ -501,14 +501,19 @@ def with_hands(system: CompiledSystem, hands: str) -> CompiledSystem:
     if hands in (FREE, PASSIVE):
         return system
     if hands == CLAMPED:
-        one, name = clamped(system, option=option), "devices clamped"
+        compiled_system, name = clamped(system, option=option), "devices clamped"
     elif hands in HANDS:
-        one, name = held(system, option=option), "devices held"
+        compiled_system, name = held(system, option=option), "devices held"
     else:
         usual = {name: numbers[2] for name, numbers in published(hands).items()}
-        one, name = held(system, option=option), f"hands {hands}"
-        one = apply(one, [parse_override(one, f"{name}={value}") for name, value in usual.items()])
-    return replace(one, name=f"{system.name}, {name}", origin=system.origin.after((HANDS_CHANGE, hands)))
+        compiled_system, name = held(system, option=option), f"hands {hands}"
+        compiled_system = apply(
+            compiled_system,
+            [parse_override(compiled_system, f"{name}={value}") for name, value in usual.items()],
+        )
+    return replace(
+        compiled_system, name=f"{system.name}, {name}", origin=system.origin.after((HANDS_CHANGE, hands))
+    )
 
 
 def clamped(system: CompiledSystem, *, option: str = "--hands clamped") -> CompiledSystem:
@@ -620,16 +625,18 @@ def rewritten(
         named = function.name_in(), function.name_out()
         return casadi.Function(function.name(), [x, u, *between, p, t], [value], *named)
 
-    def receiving(one: Receive) -> Receive:
-        return one if one.edge is None else replace(one, edge=again(one.edge))
+    def receiving(receive: Receive) -> Receive:
+        return receive if receive.edge is None else replace(receive, edge=again(receive.edge))
 
     clocks = tuple(
-        replace(one, tick=again(one.tick), receives=tuple(map(receiving, one.receives)))
-        for one in kind.clocks
+        replace(clock, tick=again(clock.tick), receives=tuple(map(receiving, clock.receives)))
+        for clock in kind.clocks
     )
-    sends = tuple(replace(one, send=again(one.send)) for one in kind.sends)
+    sends = tuple(replace(send, send=again(send.send)) for send in kind.sends)
     ports = None if kind.ports is None else Ports(kind.ports.parts, again(kind.ports.port))
-    limits = tuple(one if one.value is None else replace(one, value=again(one.value)) for one in kind.limits)
+    limits = tuple(
+        limit if limit.value is None else replace(limit, value=again(limit.value)) for limit in kind.limits
+    )
     derivative = again(kind.derivative, rates)
     return replace(kind, derivative=derivative, clocks=clocks, sends=sends, ports=ports, limits=limits)
 
@@ -651,7 +658,11 @@ def published(name: str) -> dict[str, tuple[str, str, str]]:
     from apc.compiler.components.library import Library
 
     known = Library()
-    found = {one: ranges for one in known.component_names if (ranges := _ranges(known.component(one)))}
+    found = {
+        component_name: ranges
+        for component_name in known.component_names
+        if (ranges := _ranges(known.component(component_name)))
+    }
     if name not in found:
         listed = (*HANDS, *found)
         got = f"{name[:40]} are no hands" if name.strip() else "no hands are named"
@@ -663,12 +674,12 @@ def published(name: str) -> dict[str, tuple[str, str, str]]:
 
 def _ranges(component: Component | None) -> dict[str, tuple[str, str, str]]:
     """Return the bounds and defaults of a hand's mass, damping and stiffness, nothing if they have none."""
-    numbers = {} if component is None else {one.name: one for one in component.numbers}
+    numbers = {} if component is None else {number.name: number for number in component.numbers}
     found = {}
     for name, unit, _ in _NUMBERS:
-        one = numbers.get(name)
-        if one is None or one.minimum is None or one.maximum is None or one.default is None:
+        number = numbers.get(name)
+        if number is None or number.minimum is None or number.maximum is None or number.default is None:
             return {}
-        low, high, usual = (f"{float(v)!r} {unit}" for v in (one.minimum, one.maximum, one.default))
+        low, high, usual = (f"{float(v)!r} {unit}" for v in (number.minimum, number.maximum, number.default))
         found[f"{HAND}.{name}"] = low, high, usual
     return found

@@ -245,7 +245,7 @@ def step_rows(a: Floats, b: Floats, seconds: float) -> Step:
     size, roundings = np.full(matrix.shape, UNDERFLOW), 1.0
     for states, inputs in _pieces(np.asarray(a.any(axis=0)), np.asarray(b.any(axis=0))):
         own, pushed = a[:, states[:, None], states], b[:, states[:, None], inputs]
-        some = slice(1 if all((one == one[:1]).all() for one in (own, pushed)) else sites)
+        some = slice(1 if all((values == values[:1]).all() for values in (own, pushed)) else sites)
         step = exponential_rows(own[some], pushed[some], seconds)
         places = slice(None), states[:, None], np.concatenate([states, n_x + inputs])
         matrix[places], size[places] = step.matrix, step.size
@@ -381,8 +381,8 @@ def moved_together(a: NDArray[Any]) -> Iterator[Integers]:
             new = neighbours[waiting.pop()] - found
             found |= new
             waiting += new
-        for one in found:
-            del left[one]
+        for item in found:
+            del left[item]
         yield np.array(sorted(found), np.int64)
 
 

@@ -63,13 +63,13 @@ def guards_of(expression: Any, moving: Any, *, tables: bool = True) -> list[Any]
             found.append(_whole(parts[0]))
     if tables:
         found += [_whole(function_of(table.positions())(at)) for table, at in lookups_of(expression)]
-    return [one for one in found if casadi.depends_on(one, moving)]
+    return [item for item in found if casadi.depends_on(item, moving)]
 
 
 def lookups_of(expression: Any) -> list[tuple[Interpolation, Any]]:
     """Return each table that is looked up in an expression, with where in it, `casadi.SX`."""
     calls = [node for node in _nodes(expression) if node.op() == casadi.OP_CALL]
-    return [(table_of(one.which_function()), one.dep(0)) for one in calls]
+    return [(table_of(call.which_function()), call.dep(0)) for call in calls]
 
 
 def _whole(expression: Any) -> Any:
@@ -199,7 +199,7 @@ def jacobians(kind: Kind) -> SiteJacobians:
 
 def _patterns(kind: Kind, blocks: Sequence[Any]) -> list[NDArray[np.bool_]]:
     """Return the pattern of each block; of a clock's, of all its variants together."""
-    heights = [0, 0, *(len(one.outputs) for one in kind.clocks for _ in range(4))]
+    heights = [0, 0, *(len(clock.outputs) for clock in kind.clocks for _ in range(4))]
     found = []
     for block, height in itertools.zip_longest(blocks, heights, fillvalue=0):
         pattern = structural_pattern(block)
@@ -232,7 +232,7 @@ def _depends(expression: Any, symbols: Any) -> bool:
 
 def _functions(kind: Kind) -> list[Any]:
     """Return the functions that a linearization is of, but for edges."""
-    return [kind.derivative, *(one.tick for one in kind.clocks), *(one.send for one in kind.sends)]
+    return [kind.derivative, *(clock.tick for clock in kind.clocks), *(send.send for send in kind.sends)]
 
 
 def _refuse_loop_with_edges(kind: Kind) -> None:
@@ -251,7 +251,7 @@ def _edge(kind: Kind, partition: ClockPartition, receive: Receive) -> Edge:
     """Build a receive's edge function with its slopes; without one, it is the channel itself."""
     symbol = casadi.SX.sym
     channels = next(
-        (len(one.channels) for one in kind.sends if one.link == receive.link), receive.channel + 1
+        (len(send.channels) for send in kind.sends if send.link == receive.link), receive.channel + 1
     )
     x, u, m = (
         symbol("x", len(kind.states)),

@@ -54,7 +54,7 @@ class FrameMap:
 
     def mapped(self, change: Callable[..., Matrix], *others: FrameMap) -> FrameMap:
         """Return the map whose blocks are made of these and of those of others."""
-        return FrameMap(*map(change, self.blocks, *(one.blocks for one in others)))
+        return FrameMap(*map(change, self.blocks, *(other.blocks for other in others)))
 
 
 def lift(
@@ -352,7 +352,7 @@ class _Playing:
         sends = [_beside(send.x, send.u) for send in site.sends]
         ticks = [_beside(tick.x, tick.u, tick.m, tick.r) for tick in site.ticks]
         parts = (site.a, *steps.values(), *sends, *ticks)
-        many = common_shape(*(one.shape[:-2] for one in parts))
+        many = common_shape(*(part.shape[:-2] for part in parts))
         return cls(
             *(site.kind, sends, ticks, steps, site.b.shape[-1], many),
             *(np.result_type(number, *parts), multiply, watch),
@@ -366,8 +366,8 @@ class _Playing:
     def begin(self, schedule: Schedule, start: Matrix) -> _Moment:
         """Return the start of a frame, from z (n_z, columns)."""
         at = self.at_rest(start[..., : self.states, :])
-        for row, one in enumerate(schedule.carried, self.states):
-            at.value[one] = start[..., row, :]
+        for row, value in enumerate(schedule.carried, self.states):
+            at.value[value] = start[..., row, :]
         for hold, acting in enumerate(schedule.acting, self.states):
             if acting is not None:
                 at.moving[..., hold, :] = at.value.get(acting, at.nothing)
@@ -382,8 +382,8 @@ class _Playing:
 
     def end(self, schedule: Schedule, at: _Moment) -> Matrix:
         """Return z⁺ (n_z, columns) at the end of a frame."""
-        later = [shifted(one, schedule.ticks) for one in schedule.carried]
-        return _over(at.moving[..., : self.states, :], [at.value[one] for one in later])
+        later = [shifted(value, schedule.ticks) for value in schedule.carried]
+        return _over(at.moving[..., : self.states, :], [at.value[value] for value in later])
 
     def play(
         self, events: Sequence[Event], at: _Moment, hear: Callable[[int], Matrix | None]
@@ -415,7 +415,7 @@ class _Playing:
 
 def _beside(*blocks: Matrix) -> Matrix:
     """Return blocks side by side; one without columns would spoil the order in memory that they share."""
-    return np.concatenate([one for one in blocks if one.shape[-1]] or blocks[:1], axis=-1)
+    return np.concatenate([block for block in blocks if block.shape[-1]] or blocks[:1], axis=-1)
 
 
 def _over(block: Matrix, rows: Sequence[Matrix]) -> Matrix:

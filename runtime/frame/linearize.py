@@ -96,7 +96,7 @@ def sends_nothing(kind: Kind, rows: NDArray[np.float64]) -> bool:
     rows
         The parameters of each different one, in SI (k, n_p).
     """
-    if not all(one.send.is_a("SXFunction") for one in kind.sends):
+    if not all(send.send.is_a("SXFunction") for send in kind.sends):
         return False
     place = {name: index for index, name in enumerate(kind.parameters)}
     starts = sorted({place[name] for name in _starts(kind)})
@@ -106,7 +106,7 @@ def sends_nothing(kind: Kind, rows: NDArray[np.float64]) -> bool:
         listed = [known.get(index, symbol) for index, symbol in enumerate(symbols)]
         x = casadi.vertcat(*(listed[place[state.start]] for state in kind.states))
         arguments = [x, casadi.SX.zeros(len(kind.holds)), casadi.vertcat(*listed), casadi.SX(0)]
-        if not all(one.send(*arguments).is_zero() for one in kind.sends):
+        if not all(send.send(*arguments).is_zero() for send in kind.sends):
             return False
     return True
 
@@ -125,7 +125,7 @@ def at_start(site: SiteJacobians, *, silent: bool = False) -> SiteJacobians | No
     symbols = site.function.sx_in()
     parameters, heard = symbols[4], symbols[3]
     x, u, memories = start_values(site, casadi.vertsplit(parameters) if parameters.numel() else [])
-    m = [value for one in memories for value in one]
+    m = [value for memory in memories for value in memory]
     flat = site.function(casadi.vertcat(*x), casadi.vertcat(*u), casadi.vertcat(*m), heard, parameters, 0)
     if flat.numel() and casadi.depends_on(flat, heard):
         if not silent:
@@ -150,7 +150,7 @@ def start_arguments(
         x, u, m, r = ([zero] * size for size in sizes)
         return [x, u, m, r, parameters, [zero]]
     x, u, memories = start_values(site, parameters)
-    m = [value for one in memories for value in one]
+    m = [value for memory in memories for value in memory]
     if listening is not None:
         r = [number(value) for value in listening.values]  # type: ignore[arg-type] # Fraction and float take both
         return [x, u, m, r, parameters, [zero]]
@@ -340,16 +340,16 @@ def of_rows(function: Any, given: Mapping[int, NDArray[np.float64]]) -> list[NDA
     """
     count = len(next(iter(given.values())))
     sizes, stored = _layout(function)
-    found = [np.empty((count, one)) for one in stored]
-    if not any(one.size for one in found):
+    found = [np.empty((count, number)) for number in stored]
+    if not any(values.size for values in found):
         return found
     # Evaluated where the numbers stand: CasADi's own matrices are copied entry by entry.
     buffer, evaluate = _of_many(function, count).buffer()
     numbers = [np.zeros(max(1, count * size)) for size in sizes]
     for place, rows in given.items():
         numbers[place] = np.array(rows, dtype=np.float64, order="C").ravel()
-    for place, one in enumerate(numbers):
-        buffer.set_arg(place, one.data)
+    for place, number in enumerate(numbers):
+        buffer.set_arg(place, number.data)
     for place, rows in enumerate(found):
         buffer.set_res(place, rows.reshape(-1).data)
     evaluate()

@@ -96,8 +96,8 @@ def hearing_of(
                 continue
             names = _channels(system, group, receive.link)
             sending = [
-                any(send.link == receive.link for send in system.kinds[one.kind].sends)
-                for one in system.groups
+                any(send.link == receive.link for send in system.kinds[group.kind].sends)
+                for group in system.groups
             ]
             senders = exchange.hears(receive.link, group, sending)
             if not senders and receive.operator != "sum":

@@ -73,8 +73,12 @@ class Range:
 def proposed_range(system: CompiledSystem, wanted: str = "", *, without: str = "") -> str:
     """Return a range of a stiffness or damping to propose, `NAME=LOW:HIGH`: the wanted one, if it is one."""
     units = {"N/m": 1000, "N*s/m": 10}
-    named = [one for one in system.parameters if is_named(one.name) and one.unit in units]
-    named = [one for one in named if one.name == wanted] or [one for one in named if one.name != without]
+    named = [
+        parameter for parameter in system.parameters if is_named(parameter.name) and parameter.unit in units
+    ]
+    named = [parameter for parameter in named if parameter.name == wanted] or [
+        parameter for parameter in named if parameter.name != without
+    ]
     if not named:
         return "NAME=LOW:HIGH"
     first = named[0]
@@ -83,7 +87,7 @@ def proposed_range(system: CompiledSystem, wanted: str = "", *, without: str = "
 
 def given_ranges(system: CompiledSystem, others: Collection[Range] = ()) -> list[Range]:
     """Return the ranges that a topology gives in the place of a number, but those of `others`, and these."""
-    taken = {one.free.name for one in others}
+    taken = {other.free.name for other in others}
     axes = (axis for axis in system.within if axis.parameter not in taken)
     return [*(Range(Free(axis.parameter), "s", axis.low, axis.high) for axis in axes), *others]
 
@@ -133,7 +137,7 @@ def find(system: CompiledSystem, name: str, place: Place = OVERRIDE, *, counts: 
     if name.startswith(COUNT):
         what = f"{written} is how many peers are heard, by their weights: from {sizes[0]} and the graph"
         raise ApcError(Mistake("E623", place, what))
-    if name in HELD and not any(one.startswith("hand.") for one in known):
+    if name in HELD and not any(text.startswith("hand.") for text in known):
         what = f"{written} is of the hand that --hands held puts on each device"
         raise ApcError(Mistake("E622", place, what, hint=f"--hands held --set {name}=…"))
     one_peer = _ONE_PEER.fullmatch(name)
@@ -152,10 +156,10 @@ def find(system: CompiledSystem, name: str, place: Place = OVERRIDE, *, counts: 
 
 def _of_one_peer(system: CompiledSystem, found: re.Match[str], place: Place) -> ApcError:
     """Return what is told of a value for one peer of a group: `user[1].device.x`."""
-    group, rest = next(one for one in system.groups if one.name == found["group"]), found["rest"]
+    group, rest = next(group for group in system.groups if group.name == found["group"]), found["rest"]
     what = f"{found[0]} is of one peer, and a setting is of all or of one group: a list gives each its own"
-    parameter = next(one for one in system.parameters if one.name == rest)
-    own = next((one for one in group.values if one.name == rest), parameter)
+    parameter = next(parameter for parameter in system.parameters if parameter.name == rest)
+    own = next((value for value in group.values if value.name == rest), parameter)
     value = with_unit(f"{own.value:.12g}", own.unit)
     values = [GIVEN if k == int(found["peer"]) else value for k in range(1, group.count + 1)]
     hint = f"peers: {{{group.name}: {{count: {group.count}, set: {{{rest}: [{', '.join(values)}]}}}}}}"
@@ -195,16 +199,16 @@ def value_now(system: CompiledSystem, free: Free) -> float:
 
 def unit_of(system: CompiledSystem, name: str) -> Unit:
     """Return the unit a parameter or timing wants."""
-    return next((Unit.of(one) for one in system.parameters if one.name == name), Unit("s"))
+    return next((Unit.of(parameter) for parameter in system.parameters if parameter.name == name), Unit("s"))
 
 
 def values_by_group(system: CompiledSystem, free: Free) -> tuple[tuple[str, float | None], ...]:
     """Return what each group has of a parameter, None where its peers differ; nothing where all are alike."""
     name, only = free.name, free.group
-    several = {group.name for group in system.groups if name in {one.name for one in group.columns}}
+    several = {group.name for group in system.groups if name in {column.name for column in group.columns}}
     if only is not None:
         return ((only, None),) if only in several else ()
-    own = {group.name for group in system.groups if name in {one.name for one in group.values}}
+    own = {group.name for group in system.groups if name in {value.name for value in group.values}}
     if not several | own:
         return ()
     return tuple(

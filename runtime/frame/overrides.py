@@ -57,12 +57,16 @@ def parse_override(system: CompiledSystem, text: str) -> Override:
     try:
         free = find(system, name, OVERRIDE, counts=True)
     except ApcError as error:  # of one peer, with the value that it was to have
-        raise ApcError(replace(one, hint=one.hint.replace(GIVEN, value)) for one in error.mistakes) from None
+        raise ApcError(
+            replace(mistake, hint=mistake.hint.replace(GIVEN, value)) for mistake in error.mistakes
+        ) from None
     unit = unit_of(system, free.name)
     try:
         found = quantity(value, OVERRIDE, what=name, unit=unit)
     except ApcError as error:  # what is to be written is a setting, too
-        mistakes = [replace(one, hint=one.hint.replace(f"{name}: ", f"{name}=")) for one in error.mistakes]
+        mistakes = [
+            replace(mistake, hint=mistake.hint.replace(f"{name}: ", f"{name}=")) for mistake in error.mistakes
+        ]
         raise ApcError(mistakes) from None
     return Override(free, found.value)
 
@@ -78,7 +82,7 @@ def apply(system: CompiledSystem, overrides: Sequence[Override]) -> CompiledSyst
     """
     if not overrides:
         return system
-    everywhere = {one.free.name: one.value for one in overrides if one.free.group is None}
+    everywhere = {override.free.name: override.value for override in overrides if override.free.group is None}
     counts = _counts(system, everywhere)
     if counts:
         everywhere |= peers_of(counts)
@@ -87,7 +91,9 @@ def apply(system: CompiledSystem, overrides: Sequence[Override]) -> CompiledSyst
     common = _changed(scope_of(system), everywhere)
     groups = []
     for group in system.groups:
-        own = {one.free.name: one.value for one in overrides if one.free.group == group.name}
+        own = {
+            override.free.name: override.value for override in overrides if override.free.group == group.name
+        }
         # Set for everybody means for this group as well: its own old value goes. A time of its own stays.
         shared = {name: value for name, value in everywhere.items() if f"{group.name}.{name}" not in timings}
         values = {value.name: value for value in group.values if value.name not in shared}
@@ -99,14 +105,15 @@ def apply(system: CompiledSystem, overrides: Sequence[Override]) -> CompiledSyst
         if own:
             # What a group leaves to everybody is its own as soon as it depends on a value of its own.
             values |= {
-                name: one
-                for name, one in parameters.items()
-                if name not in values and _renewed(one, changed, given) != _renewed(one, common, everywhere)
+                name: parameter
+                for name, parameter in parameters.items()
+                if name not in values
+                and _renewed(parameter, changed, given) != _renewed(parameter, common, everywhere)
             }
         groups.append(
             replace(
                 group,
-                values=tuple(_renewed(one, changed, given) for one in values.values()),
+                values=tuple(_renewed(value, changed, given) for value in values.values()),
                 # One value for the group, or for everybody, is one for each of its peers.
                 columns=tuple(
                     column for column in group.columns if column.name not in everywhere.keys() | own.keys()
@@ -115,9 +122,9 @@ def apply(system: CompiledSystem, overrides: Sequence[Override]) -> CompiledSyst
         )
     found = replace(
         system,
-        origin=system.origin.after(*((one.free.label, str(one.value)) for one in overrides)),
-        parameters=tuple(_renewed(one, common, everywhere) for one in system.parameters),
-        timings=tuple(_renewed(one, common, everywhere) for one in system.timings),
+        origin=system.origin.after(*((override.free.label, str(override.value)) for override in overrides)),
+        parameters=tuple(_renewed(parameter, common, everywhere) for parameter in system.parameters),
+        timings=tuple(_renewed(timing, common, everywhere) for timing in system.timings),
         groups=tuple(groups),
         within=tuple(axis for axis in system.within if axis.parameter not in everywhere),
     )
@@ -144,14 +151,14 @@ def _changed(scope: Scope, given: Mapping[str, Fraction]) -> dict[str, Fraction]
     return scope.follow(given, exact_value, lambda name: scope.holder[name].number)
 
 
-def _renewed(one: N, changed: Mapping[str, Fraction], given: Collection[str]) -> N:
+def _renewed(item: N, changed: Mapping[str, Fraction], given: Collection[str]) -> N:
     """Return a number with its value; one that is given loses its formula."""
-    if one.name not in changed:
-        return one
-    value, formula = changed[one.name], None if one.name in given else one.formula
-    if isinstance(one, Timing):
-        return replace(one, value=value, formula=formula)
-    return replace(one, value=float(value), exact=value, formula=formula)
+    if item.name not in changed:
+        return item
+    value, formula = changed[item.name], None if item.name in given else item.formula
+    if isinstance(item, Timing):
+        return replace(item, value=value, formula=formula)
+    return replace(item, value=float(value), exact=value, formula=formula)
 
 
 def _check_times(
@@ -168,7 +175,7 @@ def _check_times(
     """
     changed = _changed(scope_of(system, [*values, *system.timings]), own)
     shared = {timing.name: "one time for all groups" for timing in system.timings}
-    shared |= {group_count(one.name): "one number of the scene" for one in system.groups}
+    shared |= {group_count(group.name): "one number of the scene" for group in system.groups}
     for name, meant in shared.items():
         if name in changed:
             what = f"{name} is {meant}, and depends on what is set for {group}"

@@ -61,7 +61,7 @@ class Scope:
         found = dict(given)
         for name, formula in self.formulas.items():
             if name in needed and name not in given and not found.keys().isdisjoint(formula.names):
-                values = [found[one] if one in found else now(one) for one in formula.names]
+                values = [found[name] if name in found else now(name) for name in formula.names]
                 found[name] = compute(name, formula, values)
         return found
 
@@ -89,7 +89,7 @@ def scope_of(
         Names that follow from nothing here.
     """
     numbers: list[Parameter | Timing] = [*system.timings, *system.parameters, *own]
-    holder = {one.name: one for one in numbers}
+    holder = {number.name: number for number in numbers}
     formulas = {
         name: formula
         for name in system.followers
@@ -224,11 +224,11 @@ def free_rows(
     The vectors (k, n_p), or (1, n_p) when none of the values reaches this peer.
     """
     listed = free_values(system, group, peer, values, ROWS.__getitem__)
-    count = max((len(one) for one in listed if np.ndim(one)), default=1)
-    dtype = np.result_type(np.float64, *(one.dtype for one in listed if np.ndim(one)))
+    count = max((len(item) for item in listed if np.ndim(item)), default=1)
+    dtype = np.result_type(np.float64, *(item.dtype for item in listed if np.ndim(item)))
     rows = np.empty((count, len(listed)), dtype=dtype)
-    for place, one in enumerate(listed):
-        rows[:, place] = one
+    for place, item in enumerate(listed):
+        rows[:, place] = item
     return rows
 
 

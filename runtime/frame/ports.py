@@ -100,10 +100,10 @@ def with_cuts(
         into = np.zeros((len(tick.r), 1), dtype=tick.r.dtype)
         blocks = []
         for block in (tick.x, tick.u, tick.m, np.concatenate([tick.r, into], axis=1)):
-            one = block.reshape(variants, outputs, block.shape[1])
-            one = np.concatenate([one, one[:, output : output + 1]], axis=1)
-            one[:, output] = 0
-            blocks.append(one.reshape(variants * (outputs + 1), block.shape[1]))
+            values = block.reshape(variants, outputs, block.shape[1])
+            values = np.concatenate([values, values[:, output : output + 1]], axis=1)
+            values[:, output] = 0
+            blocks.append(values.reshape(variants * (outputs + 1), block.shape[1]))
         x, u, m, r = blocks
         r[output :: outputs + 1, -1] = 1
         ticks[partition] = replace(tick, x=x, u=u, m=m, r=r)
@@ -114,10 +114,10 @@ def with_cuts(
         carried += [Value(partition, outputs, index - count) for index in range(count)]
         heard += [OUTSIDE] * count
     events = tuple(
-        replace(one, heard=(*one.heard, *((row + one.index,) for row in rows.get(one.partition, ()))))
-        if isinstance(one, Tick)
-        else one
-        for one in schedule.events
+        replace(event, heard=(*event.heard, *((row + event.index,) for row in rows.get(event.partition, ()))))
+        if isinstance(event, Tick)
+        else event
+        for event in schedule.events
     )
     kind = replace(site.kind, clocks=tuple(clocks))
     cut = replace(schedule, events=events, carried=tuple(carried), heard=tuple(heard), repeats=None)
@@ -164,11 +164,11 @@ def with_ports(
     )
     count, taken = len(drawn_at), len(read_at)
     carries = bool(count and drawn_at[0] > 0)  # the last value of a frame acts on in the next
-    drawn = [Value(clock, one, number - count) for number in range(count) for one in range(inputs)]
-    before = [Value(clock, inputs + one, -1) for one in range(inputs)] if carries else []
-    read = [Value(clock + 1, one, number - taken) for number in range(taken) for one in range(outputs)]
+    drawn = [Value(clock, index, number - count) for number in range(count) for index in range(inputs)]
+    before = [Value(clock, inputs + index, -1) for index in range(inputs)] if carries else []
+    read = [Value(clock + 1, index, number - taken) for number in range(taken) for index in range(outputs)]
     acts: dict[int, list[Event]] = {
-        instant: [Act(first + one, drawn[number * inputs + one]) for one in range(inputs)]
+        instant: [Act(first + index, drawn[number * inputs + index]) for index in range(inputs)]
         for number, instant in enumerate(drawn_at)
     }
     taking = {instant: Tick(clock + 1, number, ()) for number, instant in enumerate(read_at)}
@@ -203,7 +203,7 @@ def with_ports(
         read=np.arange(behind, behind + len(read)).reshape(taken, outputs),
         added=range(start, behind + len(read)),
     )
-    made = [_with_clocks(one, kind, inputs, rows) for one, rows in zip(sites, readings, strict=True)]
+    made = [_with_clocks(site, kind, inputs, rows) for site, rows in zip(sites, readings, strict=True)]
     return made, full, ports
 
 
@@ -238,7 +238,7 @@ def _stopping(schedule: Schedule, at: set[int]) -> list[tuple[int, Event]]:
             found.append((now, event))
             continue
         end = now + event.duration
-        for stop in sorted({one for one in at if now < one < end} | {end}):
+        for stop in sorted({number for number in at if now < number < end} | {end}):
             found.append((now, Propagate(stop - now)))
             now = stop
     return found

@@ -208,9 +208,9 @@ class Schedule:
 
     def ways(self, partition: int, receive: int) -> tuple[tuple[Way, str], ...]:
         """Return the ways and channels a receive of a clock partition hears, whatever the tick."""
-        ticks = [one for one in self.events if isinstance(one, Tick) and one.partition == partition]
+        ticks = [event for event in self.events if isinstance(event, Tick) and event.partition == partition]
         heard = [self.heard[row] for tick in ticks for row in tick.heard[receive]]
-        return tuple(dict.fromkeys((one.way, one.sent.channel) for one in heard))
+        return tuple(dict.fromkeys((item.way, item.sent.channel) for item in heard))
 
 
 def tick_by_tick(schedule: Schedule) -> Schedule:

@@ -148,13 +148,13 @@ def _schedules(of: _Timed) -> tuple[Schedule, ...]:
         if (group.kind, own) not in known:
             heard = _heard_at_ticks(patterns[group.kind], exchange, live[group.kind], own, times, rank, kept)
             known[group.kind, own] = heard
-            for one in (one for row in heard.values() for receive in row for one in receive):
-                if isinstance(one, Selected):
-                    link = one.way.link
+            for item in (item for row in heard.values() for receive in row for item in receive):
+                if isinstance(item, Selected):
+                    link = item.way.link
                     slots = times.frame // times.clocks[exchange.links[link].clock].period
-                    depth |= {Sent(link, one.channel, k): kept[link] for k in range(slots)}
+                    depth |= {Sent(link, item.channel, k): kept[link] for k in range(slots)}
                 else:
-                    depth[one.sent] = max(depth.get(one.sent, 0), one.lag)
+                    depth[item.sent] = max(depth.get(item.sent, 0), item.lag)
     _check_depth(system, depth)
     built = {
         (kind, own): _build(patterns[kind], system, live[kind], heard, depth, times, rank)
@@ -271,11 +271,11 @@ def _build(
     """Build one schedule, once it is known what the whole system hears."""
     kind = pattern.kind
     grid_of = {link.name: times.clocks.get(link.clock) for link in system.links}
-    every = {one for row in heard_at.values() for receive in row for one in receive}
-    heard = tuple(sorted(one for one in every if isinstance(one, Heard)))
-    selected = tuple(sorted(one for one in every if isinstance(one, Selected)))
+    every = {item for row in heard_at.values() for receive in row for item in receive}
+    heard = tuple(sorted(heard for heard in every if isinstance(heard, Heard)))
+    selected = tuple(sorted(selected for selected in every if isinstance(selected, Selected)))
     channels = {sending.link: sending.channels for sending in kind.sends}
-    sent = tuple(sorted(one for one in depth if one.channel in channels.get(one.link, ())))
+    sent = tuple(sorted(sent for sent in depth if sent.channel in channels.get(sent.link, ())))
     acting, switches = _switches(pattern, live, times, rank)
     marks = _marks(times)
     events = _in_order(
@@ -299,12 +299,12 @@ def _build(
         carried=carried,
         heard=heard,
         sent=sent,
-        depths=tuple(depth[one] for one in sent),
+        depths=tuple(depth[item] for item in sent),
         ticks=ticks,
         marks=marks,
         value_names=tuple(_value_name(pattern, value, times) for value in carried),
-        sent_names=tuple(f"{one.channel} sent" for one in sent),
-        sent_times=tuple(_slot_time(one, grid_of) for one in sent),
+        sent_names=tuple(f"{item.channel} sent" for item in sent),
+        sent_times=tuple(_slot_time(item, grid_of) for item in sent),
         selected=selected,
         repeats=_repeats(pattern, live, events, carried, ticks),
     )
@@ -338,9 +338,9 @@ def _computations(
     rank: int,
 ) -> Iterator[_Happening]:
     """Yield when a site's clocks tick in a frame, and the rows of r that each receive adds up."""
-    place_of = {one: index for index, one in enumerate(received)}
+    place_of = {item: index for index, item in enumerate(received)}
     for (p, index), row in heard_at.items():
-        places = tuple(tuple(place_of[one] for one in receive) for receive in row)
+        places = tuple(tuple(place_of[item] for item in receive) for receive in row)
         partition = pattern.kind.clocks[p]
         variant = partition.variants[index % len(partition.variants)] if partition.variants else None
         yield times.clocks[partition.clock].at(index), rank, Tick(p, index, places, variant)
@@ -354,9 +354,9 @@ def _sendings(
         grid = grid_of[sending.link]
         for slot in range(frame // grid.period if grid else 0):
             rows = tuple(
-                (sending.channels.index(one.channel), place)
-                for place, one in enumerate(sent)
-                if one.link == sending.link and one.slot == slot
+                (sending.channels.index(item.channel), place)
+                for place, item in enumerate(sent)
+                if item.link == sending.link and item.slot == slot
             )
             if rows:
                 assert grid is not None
@@ -449,7 +449,7 @@ def _repeats(
 ) -> Repeats | None:
     """Return the longest row of events that come again and again, as of a clock's ticks between packets."""
     counted = [*_counted(events, len(ticks))]
-    first, length, count = _longest_run([_form(*one) for one in zip(events, counted, strict=False)])
+    first, length, count = _longest_run([_form(*pair) for pair in zip(events, counted, strict=False)])
     work = sum(isinstance(event, Tick | Propagate) for event in events[first : first + length])
     if (count - 1) * work < WORTH * (count.bit_length() + count.bit_count() - 1):
         return None

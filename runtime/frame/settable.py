@@ -83,13 +83,26 @@ def _rows(system: CompiledSystem) -> Iterator[Settable]:
 
 def _count(system: CompiledSystem, group: Group) -> Settable:
     """Return how many peers a group has: to be set where they are alike and no graph names them."""
-    one = next(one for one in system.parameters if one.name == group_count(group.name))
+    parameter = next(
+        parameter for parameter in system.parameters if parameter.name == group_count(group.name)
+    )
     named = [link.name for link in system.links if link.graph.shape == "arcs"]
     own = [column.name for column in group.columns if not counts_peers(column.name)]
     fixed = f"the graph of {named[0]} names the peers" if named else ""
     fixed = f"{own[0]} has a value for each peer" if own else fixed
     most = float(LARGEST_COUNT)
-    return Settable(one.name, one.value, one.value, "1", 1.0, False, most, _text(one), fixed, one.about)
+    return Settable(
+        parameter.name,
+        parameter.value,
+        parameter.value,
+        "1",
+        1.0,
+        False,
+        most,
+        _text(parameter),
+        fixed,
+        parameter.about,
+    )
 
 
 def _span(system: CompiledSystem, group: Group, parameter: Parameter) -> tuple[float, float]:
@@ -97,10 +110,19 @@ def _span(system: CompiledSystem, group: Group, parameter: Parameter) -> tuple[f
     return (parameter.value, parameter.value) if values is None else (float(min(values)), float(max(values)))
 
 
-def _number(one: Parameter, name: str, low: float, high: float) -> Settable:
-    about = one.about
+def _number(parameter: Parameter, name: str, low: float, high: float) -> Settable:
+    about = parameter.about
     return Settable(
-        name, low, high, Unit.of(one), one.minimum, one.open_minimum, one.maximum, _text(one), "", about
+        name,
+        low,
+        high,
+        Unit.of(parameter),
+        parameter.minimum,
+        parameter.open_minimum,
+        parameter.maximum,
+        _text(parameter),
+        "",
+        about,
     )
 
 
@@ -114,10 +136,10 @@ def _time(system: CompiledSystem, timing: Timing) -> Settable:
             about = f"first tick of {clock.name}, below its period"
     if any(timing.name == link.delay for link in system.links):
         about = "from a packet's sending to where it can be heard"
-    told = next((one.about for one in system.parameters if one.name == timing.name), about)
+    told = next((parameter.about for parameter in system.parameters if parameter.name == timing.name), about)
     is_period = timing.name in {clock.period for clock in system.clocks}
     return Settable(timing.name, value, value, "s", 0.0, is_period, None, _text(timing), "", told)
 
 
-def _text(one: Parameter | Timing) -> str:
-    return "" if one.formula is None else one.formula.text
+def _text(item: Parameter | Timing) -> str:
+    return "" if item.formula is None else item.formula.text

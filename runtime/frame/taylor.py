@@ -102,7 +102,7 @@ def corners(matrix: Matrix) -> list[Matrix]:
     found = [matrix[..., :2, :, :]]
     for by in range(2, matrix.shape[-3]):
         slope = RADII.exact(matrix[..., by, :, :])
-        found = [turn(one, slope) for one in found for turn in (RADII.add, RADII.subtract)]
+        found = [turn(values, slope) for values in found for turn in (RADII.add, RADII.subtract)]
     return found
 
 
@@ -143,7 +143,7 @@ def step_over(a: Matrix, b: Matrix, seconds: float) -> Matrix:
     if not size < SHORT * 2.0**MOST_SQUARINGS:
         return np.full((*a.shape[:-1], n_x + n_u), np.nan)
     squarings = max(0, int(np.ceil(np.log2(max(size, SHORT) / SHORT) + 1e-9)))
-    x, g = (_scaled(one, seconds * 2.0**-squarings) for one in (a, b))
+    x, g = (_scaled(values, seconds * 2.0**-squarings) for values in (a, b))
     unit = numbers.exact(np.eye(n_x))
     phi = unit
     for term in range(TERMS, 0, -1):

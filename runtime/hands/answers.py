@@ -70,17 +70,17 @@ def responses(system: CompiledSystem, prepared: Prepared, port: Port, other: Por
         E931 a peer without a device; E933 a scene too large.
     """
     groups, exchange = lifted_groups(system, prepared=prepared)
-    unit_of = {one.name: one.unit for one in system.parameters}
+    unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
     direct = coupled_directly(system.kinds)
     opened, sites, held = [], {}, {}
     for group in groups:
         device = None
-        for one in (other, port):
-            if one.peer not in group.peers:
+        for item in (other, port):
+            if item.peer not in group.peers:
                 continue
             along = port.peer in group.peers or whole_and_index(port.part)[1]
-            named = one.part or (port.part if along else "")
-            held[one] = device = _held_device(system, prepared, group, named, unit_of)
+            named = item.part or (port.part if along else "")
+            held[item] = device = _held_device(system, prepared, group, named, unit_of)
         if device is None:
             found = find_device(group.jacobians, group.parameters, unit_of, group.listening, direct=direct)
             device = found if isinstance(found, Device) else None
@@ -95,8 +95,8 @@ def responses(system: CompiledSystem, prepared: Prepared, port: Port, other: Por
         hint = f"fewer peers that differ: {MOST_TOGETHER:,} at most"
         raise ApcError(Mistake("E933", Place(system.origin.topology), f"apc feel: {what}", hint=hint))
     here, there = (
-        next(place for place, site in enumerate(common.sites) if one.peer in site.peers)
-        for one in (port, other)
+        next(place for place, site in enumerate(common.sites) if item.peer in site.peers)
+        for item in (port, other)
     )
     name = common.sites[here].name
     apart = [number for number, loop in enumerate(wide) if number and loop.sites[0].name == name]
@@ -133,7 +133,7 @@ def _held_device(
 
 def held_names(system: CompiledSystem, prepared: Prepared) -> list[str]:
     """Return what hands may hold, of the first peer of each group: `left[1].device`."""
-    unit_of, numbers = {one.name: one.unit for one in system.parameters}, resolve(system)
+    unit_of, numbers = {parameter.name: parameter.unit for parameter in system.parameters}, resolve(system)
     direct = coupled_directly(system.kinds)
     return [
         f"{group.name}[1].{part}"
@@ -273,10 +273,12 @@ class Responses:
                 for place, weight in weights[part].items()
             ]
             moved = spectra(self.loops[number], site, [row for _, row, _ in rows], s)
-            for (of, _, weight), one in zip(rows, moved, strict=True):
+            for (of, _, weight), matrix in zip(rows, moved, strict=True):
                 by = np.array([[weight * share]])
-                found[of] = RADII.add(found[of], RADII.multiply(one, with_radius(by, 8 * UNIT * np.abs(by))))
-        return [(one[:, 0, 0, 0], one[:, 1, 0, 0].real) for one in found]
+                found[of] = RADII.add(
+                    found[of], RADII.multiply(matrix, with_radius(by, 8 * UNIT * np.abs(by)))
+                )
+        return [(matrix[:, 0, 0, 0], matrix[:, 1, 0, 0].real) for matrix in found]
 
     @property
     def velocity(self) -> Weights:
@@ -295,9 +297,9 @@ class Responses:
         """How far the pushed peer's copy is from the mean of all others' of its name; nothing if none."""
         own = self.copies[self.own]
         others = {
-            (place, one[1]): self.members[place] - (place == self.own)
-            for place, one in enumerate(self.copies)
-            if own and one and one[0] == own[0]
+            (place, copy[1]): self.members[place] - (place == self.own)
+            for place, copy in enumerate(self.copies)
+            if own and copy and copy[0] == own[0]
         }
         total = sum(others.values())
         if own is None or not total:

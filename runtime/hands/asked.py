@@ -107,8 +107,8 @@ def read_frequencies(
         E935 none above 0, the lowest above the highest, or nothing that ticks; those of `option_value`.
     """
     if listed is not None:
-        texts = [one.strip() for one in listed.split(",") if one.strip()]
-        values = [float(option_value("--frequencies", one, what="frequency", unit="Hz")) for one in texts]
+        texts = [part.strip() for part in listed.split(",") if part.strip()]
+        values = [float(option_value("--frequencies", text, what="frequency", unit="Hz")) for text in texts]
         return np.array(values)
     first = float(option_value("--from", low, what="frequency", unit="Hz"))
     last = min(HIGHEST, _fastest(system) / 2)
@@ -134,13 +134,15 @@ def _fastest(system: CompiledSystem) -> float:
 def _fastest_clock(system: CompiledSystem) -> tuple[Fraction, Fraction]:
     """Return the period and phase of the fastest clock that anything uses, in seconds."""
     timings = resolve(system).timings
-    used = {part.clock for kind in system.kinds for part in kind.clocks} | {one.clock for one in system.links}
-    clocks = [one for one in system.clocks if one.name in used]
+    used = {part.clock for kind in system.kinds for part in kind.clocks} | {
+        link.clock for link in system.links
+    }
+    clocks = [clock for clock in system.clocks if clock.name in used]
     if not clocks:
         what = "the scene has nothing that ticks, and what is felt is told of samples and held forces"
         hint = "a coupler with a clock, as SampledSpringDamper"
         raise ApcError(Mistake("E935", Place(system.origin.topology), what, hint=hint))
-    clock = min(clocks, key=lambda one: timings[one.period])
+    clock = min(clocks, key=lambda clock: timings[clock.period])
     return timings[clock.period], timings[clock.phase]
 
 

@@ -195,7 +195,7 @@ def feel(
         answers = responses(system, prepared, port, other)
         s = np.asarray(2j * np.pi * found, dtype=np.complex128)
         own, *aliases, across, error = answers.steady(s, ALIASES)
-        one = 1 / own[0]
+        values = 1 / own[0]
         alias = np.max([np.abs(value) for value, _ in aliases], axis=0) / np.abs(own[0])
         bounds = [
             1.01 * off / np.where(value == 0, np.inf, np.abs(value)) for value, off in (own, across, error)
@@ -207,11 +207,13 @@ def feel(
         h2 = _noise(system, answers) if steady and "h2" in beside else ()
     linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
     here, there = (
-        f"{answers.exchange.peer_name(one.peer)}.{device.part}"
-        for one, device in ((port, answers.device), (other, answers.other))
+        f"{answers.exchange.peer_name(item.peer)}.{device.part}"
+        for item, device in ((port, answers.device), (other, answers.other))
     )
-    directions = [one for one in named if one.partition(".")[0] == named[0].partition(".")[0]]
-    others = f"along one direction; along others: {', '.join(f'--at {one}' for one in directions[1:])}"
+    directions = [text for text in named if text.partition(".")[0] == named[0].partition(".")[0]]
+    others = (
+        f"along one direction; along others: {', '.join(f'--at {direction}' for direction in directions[1:])}"
+    )
     notes = {
         others: len(directions) > 1,
         "of the map: the scene is unstable": verdict.stable is False,
@@ -226,7 +228,7 @@ def feel(
         between="" if there == here else there,
         copy=answers.copy,
         frequency_hz=found,
-        impedance=one,
+        impedance=values,
         transmitted_admittance=across[0],
         error_per_force=error[0],
         alias=alias,

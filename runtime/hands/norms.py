@@ -239,5 +239,5 @@ def noise_variance(
     whole = RADII.add(
         around(seen[..., at.rest], moments[0], RADII), RADII.multiply(through, np.swapaxes(through, -1, -2))
     )
-    value, off = (float(np.trace(one)) / len(ticks) for one in (value_of(whole), radius_of(whole)))
+    value, off = (float(np.trace(matrix)) / len(ticks) for matrix in (value_of(whole), radius_of(whole)))
     return value, off + (len(ticks) + 4) * UNIT * value

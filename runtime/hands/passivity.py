@@ -112,9 +112,15 @@ class PassiveHands(Result):
     @property
     def worst(self) -> PassiveMode | None:
         """The mode that needs most damping."""
-        known = [one for one in self.modes if one.more is not None]
-        lost = [one for one in self.modes if one.more is None]
-        return lost[0] if lost else max(known, key=lambda one: one.more or 0.0) if known else None
+        known = [mode for mode in self.modes if mode.more is not None]
+        lost = [mode for mode in self.modes if mode.more is None]
+        return (
+            lost[0]
+            if lost
+            else max(known, key=lambda passive_mode: passive_mode.more or 0.0)
+            if known
+            else None
+        )
 
 
 @part("passive hands")
@@ -147,7 +153,9 @@ def passive_hands(
     if prepared is None or system is not of_scene:
         prepared = prepare(system)
     if along := _directions(system, prepared):
-        parts = {axis: passive_hands(one, certify=certify) for axis, one in along.items()}
+        parts = {
+            axis: passive_hands(compiled_system, certify=certify) for axis, compiled_system in along.items()
+        }
         return _together(parts, replaced_hands(of_scene))
     fixed = analyze(clamped(system, option=OPTION), certify=certify)
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
@@ -157,10 +165,10 @@ def passive_hands(
     linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
     stable: bool | None = None
     joined = not isinstance(loops, str) and all(loop.joined for loop in loops)
-    drawn = [one.passive is False and (joined or one.more is None) for one in modes]
+    drawn = [mode.passive is False and (joined or mode.more is None) for mode in modes]
     if isinstance(loops, str) or fixed.stable is False or any(drawn):
         stable = False
-    elif all(one.passive for one in modes) and fixed.stable:
+    elif all(mode.passive for mode in modes) and fixed.stable:
         stable = True
     verdict = {True: STABLE, False: UNSTABLE, None: UNDECIDED}[stable]
     of = ", of the linearization" if not linear else ""
@@ -211,13 +219,13 @@ def _directions(system: CompiledSystem, prepared: Prepared) -> dict[str, Compile
 
 def _together(parts: Mapping[str, PassiveHands], replaced: tuple[str, ...]) -> PassiveHands:
     """Return what is said of all directions together, which don't act on one another."""
-    verdicts = [one.stable for one in parts.values()]
+    verdicts = [part.stable for part in parts.values()]
     stable = False if False in verdicts else None if None in verdicts else True
-    deciding = next(one for one in parts.values() if one.stable is stable)
+    deciding = next(part for part in parts.values() if part.stable is stable)
     modes = tuple(
-        replace(mode, name=f"{mode.name}, {axis}") for axis, one in parts.items() for mode in one.modes
+        replace(mode, name=f"{mode.name}, {axis}") for axis, part in parts.items() for mode in part.modes
     )
-    joined = all(one.joined for one in parts.values())
+    joined = all(part.joined for part in parts.values())
     return replace(deciding, modes=modes, joined=joined, left_out=(*replaced, *deciding.left_out))
 
 
@@ -252,7 +260,7 @@ def passive_growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool 
         Whether bounds are asked for.
     """
     each = loop_growths(system, prepared, bounded=bounded)
-    radius, low, high = (max(getattr(one, name) for one in each) for name in ("radius", "low", "high"))
+    radius, low, high = (max(getattr(growth, name) for growth in each) for name in ("radius", "low", "high"))
     return Growth(radius, low, high, exact=True, proved=True)
 
 
@@ -267,8 +275,11 @@ def loop_growths(system: CompiledSystem, prepared: Prepared, *, bounded: bool = 
     of_scene, system = system, without_hands(system, OPTION)
     prepared = prepared if system is of_scene else prepare(system)
     if along := _directions(system, prepared):
-        parts = (loop_growths(one, prepare(one), bounded=bounded) for one in along.values())
-        return [one for part in parts for one in part]
+        parts = (
+            loop_growths(compiled_system, prepare(compiled_system), bounded=bounded)
+            for compiled_system in along.values()
+        )
+        return [growth for part in parts for growth in part]
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         loops = port_loops(system, prepared, option=OPTION)
         found, scale = [(-np.inf, -np.inf, -np.inf)], 1.0
@@ -277,7 +288,7 @@ def loop_growths(system: CompiledSystem, prepared: Prepared, *, bounded: bool = 
                 _bounds(loop)[:3] if bounded else (-np.inf if circulates(loop) else _least(loop)[0],) * 3
                 for loop in loops
             ]
-            scale = max(float(one) for loop in loops for one in loop.dampings) or 1.0
+            scale = max(float(damping) for loop in loops for damping in loop.dampings) or 1.0
     worst = min(found)
     if (
         bounded
@@ -286,14 +297,14 @@ def loop_growths(system: CompiledSystem, prepared: Prepared, *, bounded: bool = 
         and analyze(clamped(system, option=OPTION)).stable is False
     ):
         found.append((-np.inf, -np.inf, -np.inf))  # floats alone said so
-    return [_growth(scale, *one) for one in found]
+    return [_growth(scale, *item) for item in found]
 
 
 def _growth(scale: float, *spare: float) -> Growth:
     """Return e^{2 (n − b)/(n + b)}, b the largest damping and b − n what is spare, at least, at most."""
-    needed = [scale - one for one in spare]
-    logs = [np.sign(one) if np.isinf(one) else (one - scale) / (abs(one) + scale) for one in needed]
-    radius, high, low = (float(np.exp(2 * one)) for one in logs)
+    needed = [scale - value for value in spare]
+    logs = [np.sign(value) if np.isinf(value) else (value - scale) / (abs(value) + scale) for value in needed]
+    radius, high, low = (float(np.exp(2 * log)) for log in logs)
     if spare[1] >= 0:  # passive, if only just
         high = min(high, float(np.nextafter(1.0, 0.0)))
     return Growth(radius, low, high, exact=True, proved=True)
@@ -426,5 +437,5 @@ def frequency_of(loop: PortLoop, angle: float) -> float:
     turned = np.outer(found, middles) / loop.frame_s
     shares = np.sinc(np.outer(found, loop.seconds) / (2 * np.pi * loop.frame_s))
     fits = np.linalg.norm((np.exp(-1j * turned) * shares * moved) @ each.T, axis=1)
-    best = next(one for one, fit in zip(found, fits, strict=True) if fit >= max(fits) * (1 - ALIKE))
+    best = next(value for value, fit in zip(found, fits, strict=True) if fit >= max(fits) * (1 - ALIKE))
     return abs(best) / (2 * np.pi * loop.frame_s)

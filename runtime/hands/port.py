@@ -114,7 +114,10 @@ def port_loops(system: CompiledSystem, prepared: Prepared, *, option: str) -> tu
         nothing holds back.
     """
     groups, exchange = lifted_groups(system, prepared=prepared)
-    place, unit_of = Place(system.origin.topology), {one.name: one.unit for one in system.parameters}
+    place, unit_of = (
+        Place(system.origin.topology),
+        {parameter.name: parameter.unit for parameter in system.parameters},
+    )
     heard = {
         (receive.link, row)
         for group in groups
@@ -192,10 +195,10 @@ def _touched(group: PeerGroup, device: Device) -> _Touched:
     schedule = group.schedule
     at = _boundaries(group.exact, schedule, device)
     driven, readings = [], []
-    for one, inverse in ((group.site, float(device.inverse)), (group.exact, device.inverse)):
-        driven.append(_driven(one, device))
-        reading = np.zeros((1, sum(driven[-1].b.shape)), dtype=one.b.dtype)
-        reading[0, len(driven[-1].a) : -1] = -one.b[device.velocity] / inverse
+    for linear_site, inverse in ((group.site, float(device.inverse)), (group.exact, device.inverse)):
+        driven.append(_driven(linear_site, device))
+        reading = np.zeros((1, sum(driven[-1].b.shape)), dtype=linear_site.b.dtype)
+        reading[0, len(driven[-1].a) : -1] = -linear_site.b[device.velocity] / inverse
         readings.append(reading)
     (site, exact), full, ports = with_ports(driven, schedule, 1, at, readings, at)
     seconds = tuple(end * schedule.quantum for end in np.diff([*at, schedule.frame]).tolist())
@@ -244,7 +247,7 @@ def _loops(
     system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange, *, option: str
 ) -> tuple[tuple[Loop, ...], bool]:
     """Return loops that share no energy, and whether a site of them stands for as many peers as it counts."""
-    used = {one.way.link for group in groups for one in group.schedule.heard}
+    used = {heard.way.link for group in groups for heard in group.schedule.heard}
     if all(exchange.links[link].graph.shape in ORTHOGONAL for link in used):
         arranged = arrange(groups, exchange)
         if arranged.method == "modes":
@@ -276,13 +279,13 @@ def _port_loop(
     held = [number for number, site in enumerate(loop.sites) if id(site.schedule) in touched]
     sites = [touched[id(loop.sites[number].schedule)] for number in held]
     counts = [loop.sites[number].count if together else 1 for number in held]
-    lengths = [len(one.seconds) for one in sites]
+    lengths = [len(site.seconds) for site in sites]
     if (m := sum(lengths)) > MOST_INTERVALS:
         what = f"devices that differ are sampled and pushed over {m:,} intervals of a frame"
         hint = f"fewer peers that differ: {MOST_INTERVALS:,} intervals at most"
         raise ApcError(Mistake("E933", place, f"{option}: {what}", hint=hint))
     closed = close_loop(loop)
-    pairs = [(closed.offsets[number], one.ports) for number, one in zip(held, sites, strict=True)]
+    pairs = [(closed.offsets[number], site.ports) for number, site in zip(held, sites, strict=True)]
     into = np.concatenate([start + ports.drawn[:, 0] for start, ports in pairs])
     out = np.concatenate([start + ports.read[:, 0] for start, ports in pairs])
     rest = np.delete(
@@ -295,7 +298,7 @@ def _port_loop(
     # Of which site each interval is (m, k), and which came before it in a frame (m, m).
     whose = np.repeat(np.arange(len(sites)), lengths)
     of, sums = np.eye(len(sites))[whose], np.tril(whose[:, None] == whose, -1).astype(np.float64)
-    seconds = np.array([float(one) for site in sites for one in site.seconds])
+    seconds = np.array([float(second) for site in sites for second in site.seconds])
     starts = sums @ seconds
     whole, exact, multiply = with_radius(closed.matrix, closed.error), RADII.exact, RADII.multiply
     a, placed, felt = (
@@ -319,12 +322,12 @@ def _port_loop(
     first = np.argmax(of, axis=0)
     many = reciprocal(forces[:, first], counts)
     each = of @ many
-    felt, at_once, forces = (multiply(exact(np.diag(each)), one) for one in (felt, at_once, forces))
+    felt, at_once, forces = (multiply(exact(np.diag(each)), values) for values in (felt, at_once, forces))
     static = forces[:, first]
     b = RADII.subtract(multiply(placed, exact(sums)), multiply(aside, exact(of.T)))
     pole = multiply(multiply(exact(of), static), exact(of.T))
     half = multiply(RADII.add(pole, np.swapaxes(pole, -1, -2)), exact(np.eye(m) / 4))
-    dampings = np.array([float(one.damping) for one in sites])
+    dampings = np.array([float(site.damping) for site in sites])
     damping = np.diag(of @ dampings * each / seconds)
     units = exact(np.diag(np.sqrt(seconds / each)))
     weight = RADII.subtract(with_radius(damping, 8 * UNIT * damping), half)
@@ -338,7 +341,7 @@ def _port_loop(
         weight=multiply(multiply(units, weight), units),
         static=static,
         joined=bool((many == counts).all()),
-        dampings=tuple(one.damping for one in sites),
+        dampings=tuple(site.damping for site in sites),
         starts=starts,
         seconds=seconds,
         frame_s=closed.frame_s,

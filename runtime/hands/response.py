@@ -95,18 +95,18 @@ def open_site(group: PeerGroup, device: Device | None) -> tuple[PeerGroup, Site]
     at, seconds = _intervals(schedule)
     n_x, n_u = group.site.b.shape
     sites, readings = [], []
-    for one in (group.site, group.exact):
-        sites.append(with_holds(one, np.zeros((n_x, n_x + 1), dtype=one.b.dtype)))
+    for linear_site in (group.site, group.exact):
+        sites.append(with_holds(linear_site, np.zeros((n_x, n_x + 1), dtype=linear_site.b.dtype)))
         if device is not None:  # the last way in is what samples of its position are off by
-            for tick, plain in zip(sites[-1].ticks, one.ticks, strict=True):
+            for tick, plain in zip(sites[-1].ticks, linear_site.ticks, strict=True):
                 tick.u[:, -1] = plain.x[:, device.position]
-        seen = np.zeros((n_x + n_u, n_x + n_u + n_x + 1), dtype=one.b.dtype)
+        seen = np.zeros((n_x + n_u, n_x + n_u + n_x + 1), dtype=linear_site.b.dtype)
         seen[:, : n_x + n_u] += np.eye(n_x + n_u, dtype=np.int64)
         readings.append(seen)
     (site, exact), full, ports = with_ports(sites, schedule, n_x + 1, at, readings, at)
     check_packets(full)
     durations = step_durations(full)
-    found = discretize(group.exact.a, group.exact.b, [one * full.quantum for one in durations])
+    found = discretize(group.exact.a, group.exact.b, [duration * full.quantum for duration in durations])
     kicked = [_with_kicks(step, n_x) for step in found]
     lifted = composed_bounded(site, full, dict(zip(durations, kicked, strict=True)))
     charge = COEFFICIENT_ROUNDINGS * UNIT
@@ -121,8 +121,8 @@ def open_site(group: PeerGroup, device: Device | None) -> tuple[PeerGroup, Site]
         a=with_radius(group.site.a, charge * np.abs(group.site.a)),
         b=with_radius(group.site.b, charge * np.abs(group.site.b)),
         push=push,
-        seconds=tuple(one * schedule.quantum for one in seconds),
-        starts=tuple(one * schedule.quantum for one in at),
+        seconds=tuple(second * schedule.quantum for second in seconds),
+        starts=tuple(number * schedule.quantum for number in at),
         ports=ports,
     )
 
@@ -157,19 +157,19 @@ def pushed_loop(loop: Loop, sites: Mapping[int, Site]) -> Pushed:
     own = [sites[id(group.schedule)] for group in loop.sites]
     whole = with_radius(closed.matrix, closed.error)
     pairs = list(zip(closed.offsets, own, strict=True))
-    added = [start + place for start, one in pairs for place in one.ports.added]
+    added = [start + place for start, site in pairs for place in site.ports.added]
     rest = np.delete(np.arange(len(closed.matrix)), added)
     ways, numbered = [], []
     for listed in (
-        [start + one.ports.drawn for start, one in pairs],
-        [start + one.ports.read for start, one in pairs],
+        [start + site.ports.drawn for start, site in pairs],
+        [start + site.ports.read for start, site in pairs],
     ):
-        ways.append(np.concatenate([one.ravel() for one in listed]))
-        starts = np.cumsum([0, *(one.size for one in listed)])
+        ways.append(np.concatenate([places.ravel() for places in listed]))
+        starts = np.cumsum([0, *(places.size for places in listed)])
         numbered.append(
             tuple(
-                np.arange(start, start + one.size).reshape(one.shape)
-                for start, one in zip(starts, listed, strict=False)
+                np.arange(start, start + places.size).reshape(places.shape)
+                for start, places in zip(starts, listed, strict=False)
             )
         )
     into, out = ways

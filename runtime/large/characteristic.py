@@ -154,7 +154,9 @@ def refine(
     steps = np.full(len(points), np.inf)
     active = np.flatnonzero(np.isfinite(points))
     farthest = FARTHEST * float(np.abs(poles).max(initial=1.0))
-    out, known = (_whole(np.zeros(0, np.complex128) if one is None else one) for one in (poles, found))
+    out, known = (
+        _whole(np.zeros(0, np.complex128) if values is None else values) for values in (poles, found)
+    )
     with np.errstate(all="ignore"):
         for _ in range(STEPS):
             if not len(active):

@@ -62,11 +62,11 @@ def _weights(
         E801 a mean over nobody.
     """
     weights, senders = np.ones((2, len(population.schedule.heard)))
-    for line, one in enumerate(population.schedule.heard):
-        link = one.way.link
+    for line, heard in enumerate(population.schedule.heard):
+        link = heard.way.link
         senders[line] = sum(other.counts.sum() for other in listed if other.sends(link))
         senders[line] -= population.sends(link)
-        if one.way.operator == "mean":
+        if heard.way.operator == "mean":
             first, others = int(exchange.starts[population.group]), float(senders[line])
             check_mean(exchange, first, link, "mean", others > 0, Fraction(others))
             weights[line] = 1.0 / others
@@ -103,9 +103,9 @@ def of_populations(
     for role, population in zip(roles, listed, strict=True):
         schedule = population.schedule
         weight, senders = _weights(population, listed, exchange)
-        rows = np.array([sent_place[role, one] for one in schedule.sent], np.int64)
-        lines = np.array([heard_place[role, one] for one in schedule.heard], np.int64)
-        own = -weight * np.array([float(on_the_way(one.way, role, role)) for one in schedule.heard])
+        rows = np.array([sent_place[role, sent] for sent in schedule.sent], np.int64)
+        lines = np.array([heard_place[role, heard] for heard in schedule.heard], np.int64)
+        own = -weight * np.array([float(on_the_way(heard.way, role, role)) for heard in schedule.heard])
         alone = Sites(population.maps, population.counts, rows, lines)
         names = (*(state.name for state in population.jacobians.kind.states), *schedule.value_names)
         members.append(
@@ -151,7 +151,7 @@ def of_loop(
                 site=partial(_site_of, group),
             )
         )
-    transfer = transfer_of([one.sites for one in members], n_s, n_r)
+    transfer = transfer_of([member.sites for member in members], n_s, n_r)
     return characteristic_of(transfer, *_wires_of(groups, coupling, doubts)), tuple(members)
 
 

@@ -103,18 +103,18 @@ def solve_populations(listed: Sequence[Population], exchange: Exchange, *, rigid
 def _spectrum(solved: Sequence[_Solved], multiplicities: Sequence[int]) -> Spectrum:
     """Put the answers of independent systems together."""
     modes = sorted(
-        (mode for one in solved for mode in one.modes),
+        (mode for item in solved for mode in item.modes),
         key=lambda mode: (-mode.magnitude, mode.shape, mode.eigenvalue.real, -mode.eigenvalue.imag),
     )
-    low = max(one.zeros.low for one in solved)
-    high = max(one.zeros.high for one in solved)
-    radius = max(one.zeros.radius for one in solved)
-    rigid = sum(one.rigid * many for one, many in zip(solved, multiplicities, strict=True))
-    drifts = sum(one.drifts * many for one, many in zip(solved, multiplicities, strict=True))
-    inside = [False if one.zeros.low > 1 else True if one.zeros.high < 1 else None for one in solved]
+    low = max(item.zeros.low for item in solved)
+    high = max(item.zeros.high for item in solved)
+    radius = max(item.zeros.radius for item in solved)
+    rigid = sum(item.rigid * many for item, many in zip(solved, multiplicities, strict=True))
+    drifts = sum(item.drifts * many for item, many in zip(solved, multiplicities, strict=True))
+    inside = [False if item.zeros.low > 1 else True if item.zeros.high < 1 else None for item in solved]
     verdict, stable = judge(inside, rigid, drifts)
     notes = ["the largest modes only; that none is larger was counted by the argument principle"]
-    if not all(one.zeros.counted for one in solved):
+    if not all(item.zeros.counted for item in solved):
         notes = ["the largest modes found; the count that none is larger was had farther out only"]
     error = max(high - radius, radius - low, 0.0)
     return Spectrum(tuple(modes), radius, error, rigid, drifts, verdict, stable, "", tuple(notes))
@@ -163,10 +163,10 @@ def _delay_starts(function: Characteristic) -> Complexes:
 def _common_starts(members: Sequence[Member]) -> Complexes:
     """Return the eigenvalues of populations of copies of one peer, for some peers: all moving alike."""
     found = [np.zeros(0, np.complex128)]
-    for one in members:
-        few = np.unique(np.linspace(0, len(one.sites.counts) - 1, SAMPLES).astype(np.int64))
-        some = one.sites.maps.mapped(lambda block, few=few: block[few])
-        alike = hear_themselves(some, one.schedule, one.alike, 0 * one.alike)
+    for member in members:
+        few = np.unique(np.linspace(0, len(member.sites.counts) - 1, SAMPLES).astype(np.int64))
+        some = member.sites.maps.mapped(lambda block, few=few: block[few])
+        alike = hear_themselves(some, member.schedule, member.alike, 0 * member.alike)
         values = np.linalg.eigvals(value_of(alike.p)).astype(np.complex128).ravel()
         kept = (values.imag >= 0) & (np.abs(values) > LEAST_START) & (np.abs(values - 1) > SAME_START)
         found.append(values[kept])
@@ -177,13 +177,13 @@ def _own_mode(members: Sequence[Member], zero: Zero) -> Mode:
     """Describe an eigenvalue of one peer by itself: of equal peers moving apart, or of one nobody hears."""
     assert zero.site is not None
     which, row = zero.site
-    one, every = members[which], members[which].sites
+    item, every = members[which], members[which].sites
     alone = Sites(
         every.maps.mapped(lambda block: block[row : row + 1]),
         *(np.ones(1), np.arange(len(every.rows)), np.arange(len(every.lines))),
     )
-    member = replace(one, sites=alone, site=lambda _: one.site(row))
-    return _mode(None, [member], zero, f"{one.name} by itself", zero.multiplicity)
+    member = replace(item, sites=alone, site=lambda _: item.site(row))
+    return _mode(None, [member], zero, f"{item.name} by itself", zero.multiplicity)
 
 
 def _mode(
@@ -210,31 +210,31 @@ def _mode(
     """
     value = zero.value * (1 + (BESIDE_POLE if zero.site else BESIDE))
     random = np.random.default_rng(0)
-    moves = [_moves(one, value, random) for one in members]
-    n_s = 1 + max((int(row) for one in members for row in one.sites.rows), default=-1)
-    n_r = 1 + max((int(line) for one in members for line in one.sites.lines), default=-1)
+    moves = [_moves(member, value, random) for member in members]
+    n_s = 1 + max((int(row) for member in members for row in member.sites.rows), default=-1)
+    n_r = 1 + max((int(line) for member in members for line in member.sites.lines), default=-1)
     answer, hearing = np.zeros((n_s, n_r), np.complex128), np.zeros((n_r, n_s), np.complex128)
     if function is not None:
         answer, hearing = (part[0, 0] for part in parts_in(function, np.array([value]), np.zeros(1)))
     alone, weighed = np.zeros(n_s, np.complex128), np.zeros(n_r, np.complex128)
-    for one, move in zip(members, moves, strict=True):
-        alone[one.sites.rows] += one.sites.counts @ move.sends(move.right[..., 0])
-        weighed[one.sites.lines] += one.sites.counts @ (one.others * move.left[:, move.n_z :, 0])
+    for member, move in zip(members, moves, strict=True):
+        alone[member.sites.rows] += member.sites.counts @ move.sends(move.right[..., 0])
+        weighed[member.sites.lines] += member.sites.counts @ (member.others * move.left[:, move.n_z :, 0])
     sent = np.linalg.solve(np.eye(n_s) - answer @ hearing, alone)
     felt = np.linalg.solve((np.eye(n_r) - hearing @ answer).T, weighed).astype(np.complex128)
     heard, weight = hearing @ sent, felt @ hearing
     weights = {} if function is None else dict(zip(function.lags.tolist(), function.weights, strict=True))
     shares: dict[str, float] = {}
     most, turned = -1.0, (0.0, 1.0)
-    for one, move in zip(members, moves, strict=True):
-        sites, schedule, n_z = one.sites, one.schedule, move.n_z
+    for member, move in zip(members, moves, strict=True):
+        sites, schedule, n_z = member.sites, member.schedule, move.n_z
         right = move.right[..., 0] + move.right[..., 1:] @ heard[sites.lines]
         left = move.left[..., 0] + move.left[..., 1:] @ weight[sites.rows]
         z, r, w, mu = right[:, :n_z], right[:, n_z:], left[:, :n_z], left[:, n_z:]
-        prefix = f"{one.name}." if len(members) > 1 else ""
+        prefix = f"{member.name}." if len(members) > 1 else ""
         own = np.abs(w * z)
-        listed = dict(zip(one.z_names, sites.counts @ own, strict=True))
-        known = {lag: one.own[:, None] * picked for lag, picked in lines_of(schedule).items()}
+        listed = dict(zip(member.z_names, sites.counts @ own, strict=True))
+        known = {lag: member.own[:, None] * picked for lag, picked in lines_of(schedule).items()}
         packets = move.sends(right)
         for row, (name, depth) in enumerate(zip(schedule.sent_names, schedule.depths, strict=True)):
             by_others = _waiting(weights, value, felt[None], depth, sites.rows[row])
@@ -246,7 +246,7 @@ def _mode(
         peer = int(np.argmax(own.sum(axis=1)))
         if float(own[peer].sum()) > most:
             most = float(own[peer].sum())
-            turned = turned_by(one.site(peer), schedule, zero.value, z[peer], r[peer], w[peer])
+            turned = turned_by(member.site(peer), schedule, zero.value, z[peer], r[peer], w[peer])
     total = sum(shares.values()) or 1.0
     motion = Motion(*turned, tuple((name, share / total) for name, share in shares.items()))
     return Mode(zero.value, abs(zero.value), multiplicity, shape, zero.error, (motion,))
@@ -270,23 +270,23 @@ class _Moves:
         return np.asarray((self.sending @ moved[..., None])[..., 0])
 
 
-def _moves(one: Member, value: complex, random: np.random.Generator) -> _Moves:
+def _moves(member: Member, value: complex, random: np.random.Generator) -> _Moves:
     """Return how sites move at ζ, each hearing itself and pushed by its own v, a chunk at a time.
 
     (ζ − P) z = Q r + v and r = own N (S z + D r) + others τ, with N = Σ_l ζ^(−l) A_l. Any v will do that no
     symmetry of the scene is blind to.
     """
-    p, q, s, d = map(value_of, one.sites.maps.blocks)
+    p, q, s, d = map(value_of, member.sites.maps.blocks)
     n_z, n_r = q.shape[1:]
     k, n_s = s.shape[:2]
     loop = np.zeros((n_r, n_s), np.complex128)
-    for lag, picked in lines_of(one.schedule).items():
-        loop += value**-lag * one.own[:, None] * picked
+    for lag, picked in lines_of(member.schedule).items():
+        loop += value**-lag * member.own[:, None] * picked
     sending = np.concatenate([s, d], axis=-1)
     pushed = np.zeros((k, n_z + n_r, 1))
     pushed[:, :n_z] = random.uniform(0.5, 1.0, (k, n_z, 1))
     heard = np.zeros((k, n_z + n_r, n_r))
-    heard[:, n_z:] = np.diag(one.others)
+    heard[:, n_z:] = np.diag(member.others)
     driven = np.concatenate([pushed, heard], axis=-1)
     weighed = np.concatenate([pushed, sending.swapaxes(1, 2)], axis=-1)
     right = np.empty((k, n_z + n_r, 1 + n_r), np.complex128)

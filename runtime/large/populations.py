@@ -157,10 +157,10 @@ def hear_themselves(maps: FrameMap, schedule: Schedule, own: Floats, others: Flo
 def lines_of(schedule: Schedule) -> dict[int, Floats]:
     """Return which of its own packets each line of r hears if a site hears itself: by lag, (n_r, n_s)."""
     found: dict[int, Floats] = {}
-    for line, one in enumerate(schedule.heard):
-        if one.sent in schedule.sent:
-            picked = found.setdefault(one.lag, np.zeros((len(schedule.heard), len(schedule.sent))))
-            picked[line, schedule.sent.index(one.sent)] = 1.0
+    for line, heard in enumerate(schedule.heard):
+        if heard.sent in schedule.sent:
+            picked = found.setdefault(heard.lag, np.zeros((len(schedule.heard), len(schedule.sent))))
+            picked[line, schedule.sent.index(heard.sent)] = 1.0
     return found
 
 

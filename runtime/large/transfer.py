@@ -213,7 +213,7 @@ def _split(
     kept = terms.shape[2]
     terms = RADII.multiply(RADII.exact(counts[None]), terms.swapaxes(0, 1).reshape(2, sites, -1))
     u, w = _rank_one(change)
-    u, w, sent = (_last_as_one(one, large) for one in (u[:, None], w[:, None], _size(a)))
+    u, w, sent = (_last_as_one(values, large) for values in (u[:, None], w[:, None], _size(a)))
     heard = _last_as_one(_size(b).swapaxes(1, 2), large)
     circle = np.concatenate([u * w, counts[:, None, None] * sent * u, w * heard], axis=1).swapaxes(1, 2)
     error = _pole_errors(values, circle[:, :-1, 0], circle[:, -1, 0] * block / radius)
@@ -343,25 +343,29 @@ def add_fractions(
     """
     nearest = np.abs(points) - reach
     # A quotient rounds, a product, each sum over poles and that of all parts.
-    rounded = 4 * (8 + len(transfer.fractions) + max(one.poles.size for one in transfer.fractions)) * UNIT
-    for one in transfer.fractions:
-        for some in _pieces(one, len(points)):
-            inverse, radius = 1.0 / (points[some, None, None] - one.poles), reach[some, None, None]
-            found = np.zeros((len(inverse), 3, len(one.rows), len(one.lines)), np.complex128)
-            found[:, 0] = _by_poles(inverse, one.residues, found)
+    rounded = (
+        4 * (8 + len(transfer.fractions) + max(fraction.poles.size for fraction in transfer.fractions)) * UNIT
+    )
+    for fraction in transfer.fractions:
+        for some in _pieces(fraction, len(points)):
+            inverse, radius = 1.0 / (points[some, None, None] - fraction.poles), reach[some, None, None]
+            found = np.zeros((len(inverse), 3, len(fraction.rows), len(fraction.lines)), np.complex128)
+            found[:, 0] = _by_poles(inverse, fraction.residues, found)
             if bounded:
                 moved = radius * (far := np.abs(inverse))
                 with np.errstate(all="ignore"):
                     near = far / (1 - moved)  # 1/(|ζ − p| − ρ), negative where a pole is in the disc
                     near[near.min(axis=(1, 2), initial=0.0) < 0] = np.nan
-                found[:, 1] = _by_poles(near, one.errors, found) + _reaction(one, near, nearest[some])
+                found[:, 1] = _by_poles(near, fraction.errors, found) + _reaction(
+                    fraction, near, nearest[some]
+                )
                 moved *= moved
                 moved += rounded
                 moved *= near
-                found[:, 1] += _by_poles(moved, one.sizes, found)
+                found[:, 1] += _by_poles(moved, fraction.sizes, found)
             inverse *= inverse
-            found[:, 2] = -radius * _by_poles(inverse, one.residues, found)
-            total[some, :, one.rows[:, None], one.lines] += found
+            found[:, 2] = -radius * _by_poles(inverse, fraction.residues, found)
+            total[some, :, fraction.rows[:, None], fraction.lines] += found
     total[~(nearest >= transfer.innermost), 1] = np.nan
 
 
@@ -370,19 +374,19 @@ def _by_poles(inverse: Matrix, residues: Matrix, shape: Matrix) -> Matrix:
     return (inverse.reshape(len(inverse), -1) @ residues).reshape(len(inverse), *shape.shape[2:])
 
 
-def _reaction(one: _Fractions, near: Floats, nearest: Floats) -> Floats:
+def _reaction(fractions: _Fractions, near: Floats, nearest: Floats) -> Floats:
     """Return what the errors of P do at most (z, n_s, n_r), see `_split`, where |ζ| is at least `nearest`."""
-    n_s = len(one.rows)
-    summed = near.swapaxes(0, 1) @ one.circle[:, :-1]
-    summed += (one.block[:, None] / nearest)[..., None] * one.circle[:, -1:]
+    n_s = len(fractions.rows)
+    summed = near.swapaxes(0, 1) @ fractions.circle[:, :-1]
+    summed += (fractions.block[:, None] / nearest)[..., None] * fractions.circle[:, -1:]
     circle, sent, heard = summed[..., 0], summed[..., 1 : n_s + 1], summed[..., n_s + 1 :]
     with np.errstate(all="ignore"):
         sent = sent / np.where(circle < 1, 1 - circle, np.nan)[..., None]
     return np.asarray(sent.transpose(1, 2, 0) @ heard.swapaxes(0, 1))
 
 
-def _pieces(one: _Fractions, points: int) -> Iterator[slice]:
+def _pieces(fractions: _Fractions, points: int) -> Iterator[slice]:
     """Yield which points are answered together."""
-    most = max(1, ANSWERS // max(1, one.poles.size))
+    most = max(1, ANSWERS // max(1, fractions.poles.size))
     for start in range(0, points, most):
         yield slice(start, start + most)

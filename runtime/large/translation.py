@@ -85,7 +85,7 @@ def hold_for_all(loop: Loop, listed: Sequence[Population]) -> bool:
     for place, population in enumerate(listed):
         sites: list[LinearSite | None] = [group.exact for group in loop.sites]
         sites[place] = _any_peer(population)
-        known = [one for one in sites if one is not None]
+        known = [site for site in sites if site is not None]
         if len(known) < len(sites) or not stays_rigid(loop, known):
             return False
     return True

@@ -255,7 +255,7 @@ def find_zeros(
         return Zeros(0.0, float(np.inf), 0.0, (), False, not rigid)
     least = _least_radius(function, 1.0, ASIDE)
     rigid_radius = _rigid_radius(function, rigid, [least * WIDER**more for more in range(16)], 0.0)
-    exact = [one for one in _held_poles(function) if abs(one.value - 1) > rigid_radius]
+    exact = [zero for zero in _held_poles(function) if abs(zero.value - 1) > rigid_radius]
     poles = near_poles(function, TAKEN_OUT)
     close = near_poles(function, near) * (1 + 1e-7)
     zeros = _distinct(refine(function, np.concatenate([starts, close]), poles=poles), rigid_radius)
@@ -282,9 +282,9 @@ def find_zeros(
         more = _search(function, high, zeros, poles, rigid_radius)
         zeros = _distinct(np.concatenate([zeros, more]), rigid_radius)
     found = [Zero(zero, error_of(zero), 1) for zero in zeros[:listed].tolist()]
-    known = [one for one in (*found, *exact) if np.isfinite(one.error)]
-    every = sorted(known, key=lambda one: -abs(one.value))[:listed]
-    low = max([low, *(abs(one.value) - one.error for one in every)])
+    known = [zero for zero in (*found, *exact) if np.isfinite(zero.error)]
+    every = sorted(known, key=lambda zero: -abs(zero.value))[:listed]
+    low = max([low, *(abs(zero.value) - zero.error for zero in every)])
     if beyond or not high - low <= WIDEST * high:
         low, outer = bracket(function, low, high, rigid, rigid_radius)
         high = outer if beyond else min(high, outer)
@@ -298,7 +298,7 @@ def _largest(
     zeros: Complexes, exact: Sequence[Zero], error_of: Callable[[complex], float]
 ) -> tuple[float, float]:
     """Return the magnitude of the largest eigenvalue so far, and its error."""
-    largest = max(exact, key=lambda one: abs(one.value), default=None)
+    largest = max(exact, key=lambda zero: abs(zero.value), default=None)
     if len(zeros) and (largest is None or abs(zeros[0]) >= abs(largest.value)):
         return float(abs(zeros[0])), error_of(complex(zeros[0]))
     return (abs(largest.value), largest.error) if largest else (0.0, 0.0)
@@ -341,7 +341,7 @@ def _cancelled_poles(
     Of all the largest few.
     """
     found: list[Zero] = []
-    taken = [*zeros.tolist(), *(one.value for one in known)]
+    taken = [*zeros.tolist(), *(zero.value for zero in known)]
     poles = function.transfer.poles
     outside = (np.abs(poles.values) >= beyond * (1 - SAME)) & (poles.values.imag >= 0)
     outside &= np.abs(poles.values - 1) > rigid_radius
@@ -365,7 +365,7 @@ def _distinct(zeros: Complexes, rigid_radius: float) -> Complexes:
     zeros = zeros[np.argsort(-np.abs(zeros), kind="stable")]
     kept: list[complex] = []
     for zero in zeros.tolist():
-        near = (one for one in reversed(kept[-16:]) if abs(one - zero) <= SAME * abs(zero))
+        near = (value for value in reversed(kept[-16:]) if abs(value - zero) <= SAME * abs(zero))
         if next(near, None) is None:
             kept.append(zero)
     return np.array(kept, dtype=np.complex128)

@@ -99,7 +99,7 @@ class RunComparison(Result):
 
 def ticks_of(peer: PeerRun, frame: float) -> Ticks:
     """Return what is told of a peer's ticks; a frame lasts so many seconds."""
-    late, took = (_shares(one) for one in (peer.late, peer.took))
+    late, took = (_shares(values) for values in (peer.late, peer.took))
     return Ticks(
         peer=peer.name,
         ticks=len(peer.late),
@@ -171,7 +171,7 @@ class _AsSeen:
         self.frame = population.frame
         self.routes = population.hearing.routes
         for place, route in enumerate(self.routes):
-            rows = min(len(one.packets[place]) for one in run.peers if one.packets[place].size)
+            rows = min(len(peer.packets[place]) for peer in run.peers if peer.packets[place].size)
             packets = np.full((rows, len(route.pairs)), START, np.int64)
             missing = np.zeros(packets.shape, np.bool_)
             for peer in run.peers:
@@ -195,7 +195,9 @@ def _apart(run: Run, simulation: Simulation) -> dict[str, tuple[float, float]]:
     """Return how far the peers' signals are from the simulated ones, by unit."""
     player = Stepwise(simulation.population, lambda _: _AsSeen(run, simulation.population))
     whole = np.concatenate([block.values for block in blocks(simulation, player=player)])
-    simulated = {one.name: (one.unit, whole[:, column]) for column, one in enumerate(simulation.signals)}
+    simulated = {
+        signal.name: (signal.unit, whole[:, column]) for column, signal in enumerate(simulation.signals)
+    }
     found: dict[str, tuple[float, float]] = {}
     for peer in run.peers:
         for name, played in zip(peer.signals, peer.values[: len(whole)].T, strict=True):
@@ -207,7 +209,7 @@ def _apart(run: Run, simulation: Simulation) -> dict[str, tuple[float, float]]:
 
 
 def _ways(run: Run) -> tuple[WayRun, ...]:
-    system, peers = run.system, {one.number: one for one in run.peers}
+    system, peers = run.system, {peer.number: peer for peer in run.peers}
     timings = {timing.name: float(timing.value) for timing in system.timings}
     periods = {clock.name: timings[clock.period] for clock in system.clocks}
     found = []
@@ -231,7 +233,7 @@ def _ways(run: Run) -> tuple[WayRun, ...]:
 
 def _measured(system: CompiledSystem, link: Link, ways: Sequence[WayRun]) -> Measured:
     """Return what is said of the scene with a link as the worst of its ways was: most lost, then latest."""
-    worst = max(ways, key=lambda one: (one.came.lost.value, one.came.mean))
+    worst = max(ways, key=lambda way: (way.came.lost.value, way.came.mean))
     came, clocks = worst.came, {clock.name: clock.period for clock in system.clocks}
     tick = min(float(timing.value) for timing in system.timings if timing.name in clocks.values())
     median = dict(came.quantiles).get(0.5, came.mean)
@@ -241,7 +243,7 @@ def _measured(system: CompiledSystem, link: Link, ways: Sequence[WayRun]) -> Mea
     )
     period = next(float(timing.value) for timing in timings if timing.name == clocks[link.clock])
     worse = replace(traced(link, came.delays), delays=())
-    links = tuple(worse if one is link else one for one in system.links)
+    links = tuple(worse if item is link else item for item in system.links)
     measured = replace(system, timings=timings, links=links)
     late = came.longest > LATEST * period or came.packets > LONGEST
     network = None if late else judge_network(measured)

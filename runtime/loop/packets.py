@@ -185,8 +185,8 @@ class Post:
             if before is not None:
                 self.past.add(before)
             self.nonces[said.sender] = said.nonce
-            (low, one), (high, two) = sorted([(self.own, self.nonce), (said.sender, said.nonce)])
-            told = b"session" + OF_KEY.pack(low, one, high, two)
+            (low, number), (high, two) = sorted([(self.own, self.nonce), (said.sender, said.nonce)])
+            told = b"session" + OF_KEY.pack(low, number, high, two)
             self.keys[said.sender] = hmac.digest(self.secret, told, "sha256")
         return ""
 

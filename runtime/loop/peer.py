@@ -66,7 +66,7 @@ def live_scene(system: CompiledSystem) -> CompiledSystem:
     """Return a scene whose links take what the network does: each way's packets are heard as they come."""
     timings = {timing.name: timing.value for timing in system.timings}
     late = [
-        max(timings[one] for one in (link.delay, *(pair.delay for pair in link.delays)))
+        max(timings[text] for text in (link.delay, *(pair.delay for pair in link.delays)))
         for link in system.links
     ]
     given_up = [[float(max(Fraction(GIVEN_UP), TIMES * delay))] for delay in late]
@@ -136,12 +136,14 @@ class Loop:
         self.system, self.name = system, peer
         self.exchange = build_exchange(system, resolve(system).timings)
         self.own = number_of(self.exchange, peer, "--peer")
-        self.others = {number_of(self.exchange, one, "--to"): address for one, address in addresses.items()}
+        self.others = {number_of(self.exchange, text, "--to"): address for text, address in addresses.items()}
         settings = Settings(duration, jit=False, seed=seed)
         self.simulation = prepare(live_scene(system), settings, signals=[f"{peer}.*"], live=True)
         self.frame_ns = int(self.simulation.frame * self.simulation.quantum * NANO)
         self.frames = -(-int(duration * NANO) // self.frame_ns)
-        self.post = Post(self.own, digest, secret, {address: one for one, address in self.others.items()})
+        self.post = Post(
+            self.own, digest, secret, {address: number for number, address in self.others.items()}
+        )
         self.socket = listening
         self.socket.setblocking(False)
         self.begins = 0  # when the scene begins, by this host's clock; 0 while not known
@@ -161,8 +163,8 @@ class Loop:
 
     def _check_addresses(self) -> None:
         pairs = {tuple(pair) for route in self.player.routes for pair in route.pairs.tolist()}
-        needed = {one for pair in pairs if self.own in pair for one in pair} - {self.own}
-        unknown = [self.exchange.peer_name(one) for one in sorted(needed - set(self.others))][:4]
+        needed = {item for pair in pairs if self.own in pair for item in pair} - {self.own}
+        unknown = [self.exchange.peer_name(other) for other in sorted(needed - set(self.others))][:4]
         wrong = (
             (
                 not needed,
@@ -182,7 +184,7 @@ class Loop:
             (
                 bool(unknown),
                 f"{self.name} sends to or hears {', '.join(unknown)}, which have no address",
-                " ".join(f'--to "{one}=HOST:PORT"' for one in unknown),
+                " ".join(f'--to "{text}=HOST:PORT"' for text in unknown),
             ),
         )
         for is_wrong, what, hint in wrong:
@@ -229,7 +231,7 @@ class Loop:
 
     def _alone(self, patience: float) -> ApcError:
         missing = sorted(set(self.others) - set(self.post.nonces)) or sorted(self.others)[:1]
-        names = ", ".join(self.exchange.peer_name(one) for one in missing)
+        names = ", ".join(self.exchange.peer_name(number) for number in missing)
         dropped = self.post.dropped.items()
         told = "; ".join(f"{counted(count, 'datagram')} dropped: {DROPPED[why]}" for why, count in dropped)
         what = f"{names} did not say within {patience:g} s when the scene begins" + (told and f" ({told})")
@@ -323,11 +325,11 @@ class _OnePeer(Stepwise):
     def __init__(self, loop: Loop, device: DeviceFunction | None, *, emulate: bool) -> None:
         simulation, population = loop.simulation, loop.simulation.population
         self.loop, self.routes = loop, population.hearing.routes
-        self.member = next(g for g, one in enumerate(population.members) if loop.own in one.peers)
+        self.member = next(g for g, member in enumerate(population.members) if loop.own in member.peers)
         super().__init__(population, None, moving=(self.member,))
         self.quantum_ns = simulation.quantum * NANO
-        schedules = [one.program.schedule for one in population.members]
-        self.begin_at = [0, *(int(one * self.quantum_ns) for one in instants_within(schedules))]
+        schedules = [member.program.schedule for member in population.members]
+        self.begin_at = [0, *(int(number * self.quantum_ns) for number in instants_within(schedules))]
         self.links = [_OfLink(loop, place) for place in range(len(loop.system.links))]
         self.newest = [np.full(len(route.pairs), START, np.int64) for route in self.routes]
         self.mine = [np.flatnonzero(route.pairs[:, 1] == loop.own) for route in self.routes]
@@ -414,7 +416,7 @@ class _OnePeer(Stepwise):
         sent = member.program.schedule.sent
         slots = {(sent[row].link, sent[row].slot) for row in member.program.segments[index].sent}
         for name, slot in sorted(slots):
-            link = next(one for one in self.links if one.name == name)
+            link = next(link for link in self.links if link.name == name)
             count = number * link.slots + slot
             keys = [link.keys[channel, slot] for channel in link.channels_of(loop.own)]
             column = self.population.hearing.column_of[loop.own]
@@ -473,16 +475,16 @@ class _OfLink:
         population = loop.simulation.population
         self.place, self.name = place, loop.system.links[place].name
         link, timings = loop.system.links[place], resolve(loop.system).timings
-        clock = next(one for one in loop.system.clocks if one.name == link.clock)
-        self.phase, self.period = (timings[one] * NANO for one in (clock.phase, clock.period))
+        clock = next(clock for clock in loop.system.clocks if clock.name == link.clock)
+        self.phase, self.period = (timings[text] * NANO for text in (clock.phase, clock.period))
         self.newest = link.channel is None or link.channel.reorder == "newest"
         self.slots = int(loop.simulation.frame * loop.simulation.quantum * NANO / self.period)
         self.channels: dict[int, list[str]] = {}
         for member in population.members:
-            sent = sorted({one.channel for one in member.program.schedule.sent if one.link == self.name})
+            sent = sorted({sent.channel for sent in member.program.schedule.sent if sent.link == self.name})
             self.channels |= dict.fromkeys(member.peers.tolist(), sent)
         listed = enumerate(population.hearing.keys)
-        self.keys = {(one.channel, one.slot): row for row, one in listed if one.link == self.name}
+        self.keys = {(sent.channel, sent.slot): row for row, sent in listed if sent.link == self.name}
         self.receivers: set[int] = set()
         self.ways: dict[int, list[tuple[int, int]]] = {}
         for at, route in enumerate(population.hearing.routes):
@@ -550,11 +552,11 @@ def number_of(exchange: Exchange, name: str, option: str) -> int:
     ApcError
         E970 there is no such peer.
     """
-    every = [exchange.peer_name(one) for one in range(exchange.peers)]
+    every = [exchange.peer_name(index) for index in range(exchange.peers)]
     if name in every:
         return every.index(name)
     names = every[:4]
     expected = f"one of {', '.join(names)}{', …' if len(every) > 4 else ''}"
-    near = nearest(name, [f"{one}[1]" for one in exchange.groups]) or names[0]
+    near = nearest(name, [f"{group}[1]" for group in exchange.groups]) or names[0]
     hint = f'{option} "{near}{"=HOST:PORT" if option == "--to" else ""}"'
     raise ApcError(Mistake("E970", Place(option), "a peer", expected, cut(name) or "nothing", hint))

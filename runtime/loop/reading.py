@@ -69,7 +69,7 @@ def read_run(folder: Path) -> Run:
     names = tuple(f"{group.name}[{place + 1}]" for group in system.groups for place in range(group.count))
     simulation = prepare(live_scene(system), Settings(Fraction(1, 1000), jit=False))
     scene = _Scene(names, tuple(link.name for link in system.links), simulation)
-    peers = tuple(sorted((_read_peer(path, scene) for path in files), key=lambda one: one.number))
+    peers = tuple(sorted((_read_peer(path, scene) for path in files), key=lambda peer_run: peer_run.number))
     apart = "holds peers that did not play together: of other runs, of other scenes, or with another --set"
     refuse(len({(peer.digest, peer.session) for peer in peers}) > 1, apart)
     played = hashlib.sha256(archive.model).hexdigest()
@@ -121,7 +121,7 @@ def _check_words(peer: PeerRun, scene: _Scene) -> None:
     _want(0 <= peer.session < 1 << 64, "its session is no number of 64 bits")
     _want(0 <= peer.first < peer.frames <= LATEST, "it joins after the end")
     _want(peer.dropped.keys() <= DROPPED.keys(), "datagrams are dropped for no known reason")
-    sent = [(link, *one) for link, by_peer in peer.sent.items() for one in by_peer.items()]
+    sent = [(link, *pair) for link, by_peer in peer.sent.items() for pair in by_peer.items()]
     counts = [*peer.dropped.values(), *(count for *_, count in sent)]
     _want(all(0 <= count <= LATEST for count in counts), "a count is negative, or beyond all time")
     others = {*peer.offsets, *(other for _, other, _ in sent)}

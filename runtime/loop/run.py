@@ -114,7 +114,7 @@ def run_of(loop: Loop, digest: bytes, not_given: tuple[str, ...]) -> PeerRun:
     def seen(place: int, kind: type) -> tuple[NDArray[Any], ...]:
         ways = zip(player.seen, player.mine, strict=True)
         return tuple(
-            np.array([one[place] for one in ticks], kind).reshape(len(ticks), len(mine))
+            np.array([tick[place] for tick in ticks], kind).reshape(len(ticks), len(mine))
             for ticks, mine in ways
         )
 
@@ -132,7 +132,7 @@ def run_of(loop: Loop, digest: bytes, not_given: tuple[str, ...]) -> PeerRun:
         dropped=dict(loop.post.dropped),
         not_given=not_given,
         sent={link: dict(counts) for link, counts in player.sent.items()},
-        offsets={one: (trip / NANO, ahead / NANO) for one, (trip, ahead) in loop.offsets.items()},
+        offsets={number: (trip / NANO, ahead / NANO) for number, (trip, ahead) in loop.offsets.items()},
         time=np.asarray(instants[recorded] * float(simulation.quantum), np.float64),
         values=rows[recorded][:, simulation.order],
         late=log[:, 1] / NANO,
@@ -155,7 +155,7 @@ def check_folder(folder: Path, scene: Path) -> None:
         what = "is there already, and is no folder"
     elif folder.exists() and any(folder.iterdir()) and not (folder / SCENE).is_file():
         what = "is there already, and is no folder of a run"
-    elif any(same_file(folder / SCENE, one) for one in (scene, scene.parent / f"{scene.stem}.apc")):
+    elif any(same_file(folder / SCENE, path) for path in (scene, scene.parent / f"{scene.stem}.apc")):
         what = "holds the scene that is played, and is no folder of a run"
     else:
         check_target(folder / SCENE if folder.exists() else folder)
@@ -187,8 +187,8 @@ def write_run(folder: Path, system: CompiledSystem, peers: Sequence[PeerRun], *,
         with tempfile.TemporaryDirectory(prefix=f".{folder.name[:64]}.", dir=here) as temporary:
             ready = Path(temporary)
             store.save(system, ready / SCENE)
-            for one in peers:
-                _write_peer(ready, one, system)
+            for peer in peers:
+                _write_peer(ready, peer, system)
             folder.mkdir(exist_ok=True)
             written = {path.name for path in ready.iterdir()}
             for name in sorted(written, key=lambda name: name != SCENE):  # by which a run's folder is known
@@ -202,14 +202,16 @@ def write_run(folder: Path, system: CompiledSystem, peers: Sequence[PeerRun], *,
 
 def _write_peer(folder: Path, peer: PeerRun, system: CompiledSystem) -> None:
     """Write what a peer did, and a trace of every way that it heard. Raises OSError if it can't."""
-    words = msgspec.json.encode({one.name: getattr(peer, one.name) for one in fields(Words)})
+    words = msgspec.json.encode({field.name: getattr(peer, field.name) for field in fields(Words)})
     arrays = {name: getattr(peer, name) for name in ARRAYS}
     for name in OF_ROUTES:
-        arrays |= {f"{name}{at}": one for at, one in enumerate(getattr(peer, name))}
+        arrays |= {f"{name}{at}": item for at, item in enumerate(getattr(peer, name))}
     arrays["told"] = np.frombuffer(words, np.uint8)
     np.savez_compressed(folder / f"{file_name(peer.name)}.npz", **arrays)
     for link, sender in peer.ways:
-        rows = ("lost" if math.isinf(one) else f"{one * 1e3:.6f}" for one in delays_of(peer, link, sender))
+        rows = (
+            "lost" if math.isinf(value) else f"{value * 1e3:.6f}" for value in delays_of(peer, link, sender)
+        )
         text = "\n".join(["delay [ms]", *rows, ""])
         (folder / trace_name(system, link, sender, peer.number)).write_text(text, encoding="utf-8")
 

@@ -181,7 +181,7 @@ def play_all(system: CompiledSystem, how: Play) -> tuple[Part, ...]:
     if exchange.peers > MOST_PEERS:
         what = f"{exchange.peers:,} peers would be as many processes: at most {MOST_PEERS}"
         raise ApcError(Mistake("E975", Place(system.name), what, hint='apc play FILE --peer "user[1]" …'))
-    names = [exchange.peer_name(one) for one in range(exchange.peers)]
+    names = [exchange.peer_name(index) for index in range(exchange.peers)]
     sockets = {name: listen_at((LOOPBACK, 0)) for name in names}
     addresses = {name: listening.getsockname() for name, listening in sockets.items()}
     stop, end = multiprocessing.Pipe(duplex=False)
@@ -200,9 +200,9 @@ def play_all(system: CompiledSystem, how: Play) -> tuple[Part, ...]:
                 end.close()
                 patience = TO_END if patience is None else 0.0
                 continue
-            for one in done:
-                name, workers = running.pop(one)
-                parts.append(_part(one, workers))
+            for future in done:
+                name, workers = running.pop(future)
+                parts.append(_part(future, workers))
             if not done:
                 break
     silent = f"did not end within {TO_END:g} s of being told to, and was ended: what it played is lost"

@@ -71,7 +71,7 @@ def almost_sure(system: CompiledSystem, prepared: Prepared, *, seed: int = 0) ->
     held = held.relative()
     if all(chance.law.mean_loss in (0, 1) for chance in chances):
         return _without_chance(held, chances)
-    f, g, s, e = (value_of(one) for one in (held.f, held.g, held.s, held.e))
+    f, g, s, e = (value_of(values) for values in (held.f, held.g, held.s, held.e))
     n = len(f)
     luck = np.random.Generator(np.random.Philox(seed))
     # Everything lost, and what is heard on top of it.
@@ -115,7 +115,7 @@ def _without_chance(held: HeldLoop, chances: Sequence[Chance]) -> AlmostSure:
     matrix = RADII.add(held.f, RADII.multiply(held.g, rows))
     pairs, found = enclose_eigenvalues(value_of(matrix), radius_of(matrix))
     radius = float(np.abs(pairs.values).max(initial=0.0))
-    low, middle, high = (math.log(one) if one else -math.inf for one in (found.low, radius, found.high))
+    low, middle, high = (math.log(item) if item else -math.inf for item in (found.low, radius, found.high))
     return AlmostSure(middle, (min(low, middle), max(middle, high)))
 
 

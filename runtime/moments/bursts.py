@@ -123,7 +123,7 @@ def tagged_radius(of: Affine, order: int) -> float:
         How many tags there are at most.
     """
     tags = _tagged(of, min(order, len(of.arcs)))
-    start = np.stack([np.eye(len(of.mean)) * (not one) for one in tags.sets])
+    start = np.stack([np.eye(len(of.mean)) * (not pairs) for pairs in tags.sets])
     return largest(partial(_step, tags), tags.shortened(start))
 
 
@@ -143,7 +143,7 @@ def tagged_error(of: Affine, order: int, classes: Sequence[tuple[int, Peer]]) ->
     added[pushes, pushes] = of.scale[pushes] ** -2.0
     tags = _tagged(of, min(order, len(of.arcs)))
     step = partial(_step, tags)
-    lasting = settled(step, step(tags.shortened(np.stack([added * (not one) for one in tags.sets]))))
+    lasting = settled(step, step(tags.shortened(np.stack([added * (not pairs) for pairs in tags.sets]))))
     moments = (added + lasting[tags.entries[0]]) * np.outer(of.scale, of.scale)
     inner = relative_rows(relative_rows(moments, of.at).T, of.at)
     return largest_error(inner, of.at, of.offsets, classes)
@@ -200,9 +200,9 @@ def _tagged(of: Affine, order: int) -> _Tagged:
     """Find the sets of so many tags at most, and what each one's moments follow from."""
     layers: list[dict[Tags, None]] = [{(): None}]
     for _ in range(order):  # each larger set is a smaller one with an arc more
-        larger = ((*one, arc) for one in layers[-1] for arc in of.arcs if arc not in one)
+        larger = ((*layer, arc) for layer in layers[-1] for arc in of.arcs if arc not in layer)
         layers.append(dict.fromkeys(_named(tuple(sorted(tags)), of.peers)[0] for tags in larger))
-    sets = tuple(one for layer in layers for one in layer)
+    sets = tuple(pairs for layer in layers for pairs in layer)
     entries = _orbits(of, sets)
     kappa = (1 - 2 * of.chance) / np.sqrt(of.chance * (1 - of.chance))
 
@@ -211,12 +211,12 @@ def _tagged(of: Affine, order: int) -> _Tagged:
         found = []
         for factor, tags in terms:
             if arc in tags:
-                found += [(factor, tuple(one for one in tags if one != arc)), (factor * kappa, tags)]
+                found += [(factor, tuple(tag for tag in tags if tag != arc)), (factor * kappa, tags)]
             else:
                 found.append((factor, tuple(sorted((*tags, arc)))))
         return found
 
-    place = {one: number for number, one in enumerate(sets)}
+    place = {pairs: number for number, pairs in enumerate(sets)}
     number = {arc: c for c, arc in enumerate(of.arcs)}
     count = len(of.arcs)
     permutations: dict[tuple[int, ...], int] = {}
@@ -226,18 +226,18 @@ def _tagged(of: Affine, order: int) -> _Tagged:
     for s, tags in enumerate(sets):
         for c, arc in enumerate(of.arcs):
             once = times([(1.0, tags)], arc)
-            for factor, one in once:
-                if len(one) <= order:
-                    stands, peers = _named(one, of.peers)
+            for factor, pairs in once:
+                if len(pairs) <= order:
+                    stands, peers = _named(pairs, of.peers)
                     (own,) = _renamed((arc,), {peer: label for label, peer in enumerate(peers)})
                     first.append((factor, s * count + c, len(origin)))
                     origin.append(
                         (place[stands], number[own], permutations.setdefault(peers, len(permutations)))
                     )
             for d, other in enumerate(of.arcs):
-                for factor, one in times(once, other):
-                    if len(one) <= order:
-                        stands, peers = _named(one, of.peers)
+                for factor, pairs in times(once, other):
+                    if len(pairs) <= order:
+                        stands, peers = _named(pairs, of.peers)
                         label = {peer: name for name, peer in enumerate(peers)}
                         to = [number[label[g], label[h]] for g, h in (arc, other)]
                         source = (place[stands] * count + to[0]) * count + to[1]
@@ -275,7 +275,7 @@ def _orbits(of: Affine, sets: Sequence[Tags]) -> Integers:
             for chosen in itertools.permutations(touched)
             if _renamed(tags, label := dict(zip(touched, chosen, strict=True))) == tags
         ]
-        changes += [{one: other, other: one} for one, other in itertools.pairwise(rest)]
+        changes += [{number: other, other: number} for number, other in itertools.pairwise(rest)]
         for change in changes:
             to = _states(of, [change.get(peer, peer) for peer in range(of.peers)])
             moves.append(every[np.ix_(to, to)])
@@ -319,5 +319,5 @@ def _step(tags: _Tagged, numbers: Floats) -> Floats:
     crossed = enters @ (forms @ of.mean.T)
     moved = of.mean @ moments @ of.mean.T
     moved += sigma * (crossed + crossed.transpose(0, 2, 1)) + sigma**2 * (enters @ squares @ enters.T)
-    decays = np.array([of.last ** len(one) for one in tags.sets])
+    decays = np.array([of.last ** len(pairs) for pairs in tags.sets])
     return tags.shortened(decays[:, None, None] * moved)

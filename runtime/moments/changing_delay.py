@@ -85,10 +85,17 @@ def small_gain(system: CompiledSystem, delay: Free, low: Fraction, high: Fractio
         What stands in the way of a bound.
     """
     middle = apply(system, [Override(delay, (low + high) / 2)])
-    (link,) = (one for one in system.links if delay.name in (one.delay, *(pair.delay for pair in one.delays)))
-    if any(one.age or one.before for kind in system.kinds for clock in kind.clocks for one in clock.receives):
+    (link,) = (
+        link for link in system.links if delay.name in (link.delay, *(pair.delay for pair in link.delays))
+    )
+    if any(
+        receive.age or receive.before
+        for kind in system.kinds
+        for clock in kind.clocks
+        for receive in clock.receives
+    ):
         raise UnservedError("receivers ask how old packets are, or for the packet before")
-    links = tuple(replace(one, channel=HOLDING) if one is link else one for one in middle.links)
+    links = tuple(replace(item, channel=HOLDING) if item is link else item for item in middle.links)
     held = held_scene(unreliable := replace(middle, links=links), prepare(unreliable))
     loops = loops_at_right_angles(held.told.groups, held.told.exchange, MOST_STATES)
     if isinstance(loops, str):
@@ -116,7 +123,7 @@ def unstable_delays(
         trace = np.array([float(low)] * first + [float(high)] * then)
         channel = replace(HOLDING, trace=trace)
         links = tuple(
-            replace(one, channel=channel) if one.delay == delay.name else one for one in system.links
+            replace(link, channel=channel) if link.delay == delay.name else link for link in system.links
         )
         recorded = replace(system, links=links)
         if links != system.links and trace_radius(recorded, prepare(recorded)).low > 1:
@@ -134,8 +141,8 @@ def _heard(middle: CompiledSystem, delay: Free, low: Fraction, high: Fraction) -
         link, now = links[row.way.link], told.timings[row.way.delay]
         ends = (low, high) if row.way.delay == delay.name else (now, now)
         newest, number, oldest = (
-            heard_packets(link, one, times[link.clock], times[row.clock][row.tick], told)[0]
-            for one in (ends[0], now, ends[1])
+            heard_packets(link, number, times[link.clock], times[row.clock][row.tick], told)[0]
+            for number in (ends[0], now, ends[1])
         )
         numbers[row], spread[row] = number, math.hypot(newest - number, number - oldest)
     return _Heard(told, numbers, spread)
@@ -144,7 +151,7 @@ def _heard(middle: CompiledSystem, delay: Free, low: Fraction, high: Fraction) -
 def _gain(loop: Loop, heard: _Heard, ratios: Ratios, sizes: Sizes) -> float:
     """Return ‖d ← r √(a² + b²)‖∞ √J of a loop, proved from above."""
     rows = heard.told.of(loop)
-    slots = dict.fromkeys((one.link for site in loop.sites for one in site.schedule.sent), 1)
+    slots = dict.fromkeys((sent.link for site in loop.sites for sent in site.schedule.sent), 1)
     packets = [heard.middle[row] for listed in rows for row in listed]
     depth = dict.fromkeys(slots, max(1, -min(packets, default=0)))
     now = hearing_packets(loop, rows, iter(packets), depth, slots)
@@ -178,18 +185,18 @@ def _gain(loop: Loop, heard: _Heard, ratios: Ratios, sizes: Sizes) -> float:
     closed = close([site.lifted for site in now.sites], feedback, layout, numbers=RADII)
     before = np.zeros_like(closed.sent)
     senders = [
-        (h, row, one) for h, site in enumerate(now.sites) for row, one in enumerate(site.schedule.sent)
+        (h, row, sent) for h, site in enumerate(now.sites) for row, sent in enumerate(site.schedule.sent)
     ]
-    places = {(one.site, one.row, one.lag): place for one, place in layout.places.items()}
+    places = {(packet.site, packet.row, packet.lag): place for packet, place in layout.places.items()}
     for line, (h, row, _) in enumerate(senders):
         before[0, line, places[h, row, 1]] = 1.0
     change = RADII.subtract(closed.sent, before)
     combined: dict[tuple[int, str, str], Matrix] = {}
-    for line, (h, _, one) in enumerate(senders):
-        if any((row.way.link, row.channel) == (one.link, one.channel) for *_, row in used):
-            ratio = ratios.get((one.link, one.channel))
-            number = (h, one.link, one.channel if ratio is None else "")
-            by = float(ratio or 1) * size(h, one.link)
+    for line, (h, _, sent) in enumerate(senders):
+        if any((row.way.link, row.channel) == (sent.link, sent.channel) for *_, row in used):
+            ratio = ratios.get((sent.link, sent.channel))
+            number = (h, sent.link, sent.channel if ratio is None else "")
+            by = float(ratio or 1) * size(h, sent.link)
             weighing = combined.setdefault(number, np.zeros((2, len(senders))))
             weighing[:, line] = by, 8 * np.finfo(float).eps * abs(by)
     if not entering or not combined:

@@ -84,12 +84,18 @@ def hearing(
     kept = {link.name: 0 for link in system.links}
     schedules = build_schedules(system, timings, patterns, order=prepared.order, kept=kept)
     apart = {
-        (id(one), group.kind): standing_in(one, system.kinds[group.kind]) if stand_in else tick_by_tick(one)
-        for one, group in zip(schedules, system.groups, strict=True)
+        (id(schedule), group.kind): standing_in(schedule, system.kinds[group.kind])
+        if stand_in
+        else tick_by_tick(schedule)
+        for schedule, group in zip(schedules, system.groups, strict=True)
     }
-    by_tick = tuple(apart[id(one), group.kind] for one, group in zip(schedules, system.groups, strict=True))
-    rows = {id(own): one.selected for one, own in zip(schedules, by_tick, strict=True)}
-    moved = replace(system, timings=tuple(replace(one, value=timings[one.name]) for one in system.timings))
+    by_tick = tuple(
+        apart[id(schedule), group.kind] for schedule, group in zip(schedules, system.groups, strict=True)
+    )
+    rows = {id(own): schedule.selected for schedule, own in zip(schedules, by_tick, strict=True)}
+    moved = replace(
+        system, timings=tuple(replace(timing, value=timings[timing.name]) for timing in system.timings)
+    )
     groups, exchange = lifted_groups(moved, prepared=replace(prepared, schedules=by_tick, timings=timings))
     strictly = prepared.order.index("tick") < prepared.order.index("deliver")
     frame, quantum = schedules[0].frame_s, schedules[0].quantum
@@ -103,7 +109,7 @@ def own_value(row: Selected) -> Sent:
 
 def standing_in(schedule: Schedule, kind: Kind) -> Schedule:
     """Return `tick_by_tick` of a schedule, with what stands in for missed values sent at the ticks."""
-    partition = {one.link: place for place, one in enumerate(kind.sends)}
+    partition = {send.link: place for place, send in enumerate(kind.sends)}
     sent = list(schedule.sent)
     events: list[Event] = []
     for event in schedule.events:
@@ -123,7 +129,7 @@ def standing_in(schedule: Schedule, kind: Kind) -> Schedule:
         events=tuple(events),
         sent=tuple(sent),
         depths=(*schedule.depths, *[0] * more),
-        sent_names=(*schedule.sent_names, *[one.link for one in sent[len(schedule.sent) :]]),
+        sent_names=(*schedule.sent_names, *[item.link for item in sent[len(schedule.sent) :]]),
         sent_times=(*schedule.sent_times, *[0] * more),
         repeats=None,
     )
@@ -201,23 +207,23 @@ def moments_of(
     parts, drives = [], []
     for number, loop in enumerate(of.loops):
         only = of.only(number)
-        driving = [one for one in luck if only in (None, one.listened.site)]
-        listened = [one.listened if only is None else replace(one.listened, site=0) for one in driving]
+        driving = [item for item in luck if only in (None, item.listened.site)]
+        listened = [item.listened if only is None else replace(item.listened, site=0) for item in driving]
         mean, channels = mean_loop(loop, of.told.of(loop), memories, listened, of.standing[number], frames)
         classes = tuple(range(len(loop.sites))) if only is None else (only,)
         parts.append(
             Part(mean.matrix, only, mean.at, mean.offsets, tuple(_answers(mean.misses, luck, classes)))
         )
-        for one, channel in zip(driving, channels, strict=True):
-            receivers = of.loops[0].sites[one.listened.site].count
-            heard = of.loops[0].sites[one.sender].count - (one.sender == one.listened.site)
+        for item, channel in zip(driving, channels, strict=True):
+            receivers = of.loops[0].sites[item.listened.site].count
+            heard = of.loops[0].sites[item.sender].count - (item.sender == item.listened.site)
             # One channel drives the mean of all receivers by 1/n, and their differences by 1 − 1/n or −1/n.
             by = 1 / receivers
             share = heard * (by if only is None else 1 - by)
-            own = one, channel.own, by if only is None else -by
+            own = item, channel.own, by if only is None else -by
             answers = tuple(_answers(channel.misses, luck, classes, share, *own))
-            place = slice(one.places[0].start, one.places[-1].stop)
-            drives.append(Drive(channel.matrix, channel.into, one.units, place, answers, number, share))
+            place = slice(item.places[0].start, item.places[-1].stop)
+            drives.append(Drive(channel.matrix, channel.into, item.units, place, answers, number, share))
     return Moments(tuple(parts), tuple(drives), luck[-1].places[-1].stop if luck else 0)
 
 
@@ -265,14 +271,14 @@ def _luck(common: Loop, weights: Coupling, memories: Sequence[Remembered]) -> li
     """Return the luck of the channels left to chance, one of each kind."""
     kinds: list[_Luck] = []
     first = 0
-    for one in memories:
-        count, total = len(one.channels), sum(one.sizes)
-        starts = np.cumsum([0, *one.sizes])
+    for memory in memories:
+        count, total = len(memory.channels), sum(memory.sizes)
+        starts = np.cumsum([0, *memory.sizes])
         numbers = np.ones((count, count))  # all numbers of a packet are lost together
-        spreads = tuple(np.kron(numbers, one.memory.spread(slot)) for slot in range(one.memory.slots))
-        entries = tuple(np.array(np.triu_indices(count * size)) for size in one.sizes)
+        spreads = tuple(np.kron(numbers, memory.memory.spread(slot)) for slot in range(memory.memory.slots))
+        entries = tuple(np.array(np.triu_indices(count * size)) for size in memory.sizes)
         units = []
-        for start, size, listed in zip(starts, one.sizes, entries, strict=False):
+        for start, size, listed in zip(starts, memory.sizes, entries, strict=False):
             where = (np.arange(count)[:, None] * total + start + np.arange(size)).ravel()
             for a, b in where[listed].T:
                 unit = np.zeros((count * total, count * total))
@@ -283,12 +289,12 @@ def _luck(common: Loop, weights: Coupling, memories: Sequence[Remembered]) -> li
         for h, site in enumerate(common.sites):
             for g in range(len(common.sites)):
                 weighed = {
-                    way: rows[h][g] for way, rows in weights.items() if (way.link, way.delay) == one.route
+                    way: rows[h][g] for way, rows in weights.items() if (way.link, way.delay) == memory.route
                 }
                 if any(weighed.values()) and (g != h or site.count > 1):
                     ends = np.cumsum([first, *(listed.shape[1] for listed in entries)]).tolist()
                     places = tuple(map(slice, ends, ends[1:]))
-                    listened = Listened(h, one.route, weighed)
+                    listened = Listened(h, memory.route, weighed)
                     kinds.append(_Luck(g, listened, spreads, places, entries, np.array(units)))
                     first = ends[-1]
     return kinds
@@ -357,7 +363,7 @@ def remembered_of(
                 heard.setdefault((row.way.link, row.way.delay), []).append(row)
     links = {link.name: link for link in system.links}
     found = []
-    times = {one.name: instants(told, one) for one in system.clocks}
+    times = {clock.name: instants(told, clock) for clock in system.clocks}
     for route, listed in sorted(heard.items()):
         link, delay = links[route[0]], told.timings[route[1]]
         sent = times[link.clock]

@@ -88,7 +88,9 @@ def forced(system: CompiledSystem, told: Hearing, first: Fraction = Fraction(0))
     """
     unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
     direct = coupled_directly(system.kinds)
-    used = {part.clock for kind in system.kinds for part in kind.clocks} | {one.clock for one in system.links}
+    used = {part.clock for kind in system.kinds for part in kind.clocks} | {
+        link.clock for link in system.links
+    }
     fastest = min(
         (clock for clock in system.clocks if clock.name in used), key=lambda clock: told.timings[clock.period]
     )

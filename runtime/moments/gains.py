@@ -264,7 +264,7 @@ def _held_at_corners(matrix: Matrix, seed: Floats, numbers: Arithmetic) -> tuple
         left = numbers.subtract(guessed, around(matrix, guessed, numbers))
         for share in SHARES:
             spared = numbers.subtract(left, numbers.exact((1 - share) * seed))
-            if all(is_positive(one) for one in corners(spared[0])):
+            if all(is_positive(matrix) for matrix in corners(spared[0])):
                 return found[0], share
     return None
 
@@ -446,7 +446,10 @@ def _growth(loops: Sequence[Matrix]) -> float:
 def _square(loops: Sequence[Matrix]) -> tuple[float, float]:
     """Return bounds on what squares of the means grow by."""
     bounds = [enclose_eigenvalues(value_of(loop), radius_of(loop))[1] for loop in loops]
-    low, high = max((one.low for one in bounds), default=0.0), max((one.high for one in bounds), default=0.0)
+    low, high = (
+        max((enclosure.low for enclosure in bounds), default=0.0),
+        max((enclosure.high for enclosure in bounds), default=0.0),
+    )
     return low**2 * (1 - 2 * UNIT), high**2 * (1 + 2 * UNIT)
 
 

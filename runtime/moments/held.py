@@ -112,7 +112,7 @@ def held_scene(system: CompiledSystem, prepared: Prepared) -> HeldScene:
     if not lossy:
         raise UnservedError("every link is reliable")
     for link in lossy:
-        period = at.timings[next(one.period for one in system.clocks if one.name == link.clock)]
+        period = at.timings[next(clock.period for clock in system.clocks if clock.name == link.clock)]
         if why := _unheld(link, period, at.schedules):
             raise UnservedError(why)
     different = {
@@ -144,7 +144,7 @@ def _unheld(link: Link, period: Fraction, schedules: Sequence[Schedule]) -> str:
         # A schedule leaves out packets that others supersede, which are heard where those are lost.
         if period < schedule.frame_s:
             return f"{link.name} sends more than one packet in a frame of {float(schedule.frame_s):g} s"
-        used = {one.way.operator for one in schedule.heard if one.way.link == link.name}
+        used = {heard.way.operator for heard in schedule.heard if heard.way.link == link.name}
         if not used <= {"mean", "sum"}:
             return f"more than means and sums are taken over {link.name}"
     return ""
@@ -155,9 +155,9 @@ def lossy_rows(group: PeerGroup, lossy: frozenset[str]) -> list[tuple[int, Heard
     q, d = value_of(group.lifted.q), value_of(group.lifted.d)
     counts = np.abs(q).sum(axis=0) + np.abs(d).sum(axis=0)
     return [
-        (line, one)
-        for line, one in enumerate(group.schedule.heard)
-        if one.way.link in lossy and counts[line] != 0
+        (line, heard)
+        for line, heard in enumerate(group.schedule.heard)
+        if heard.way.link in lossy and counts[line] != 0
     ]
 
 
@@ -171,14 +171,14 @@ def ears_of(loop: Loop, lossy: frozenset[str], receivers: Iterable[int]) -> list
     receivers
         The sites that hear.
     """
-    rows = [(g, line, one) for g in receivers for line, one in lossy_rows(loop.sites[g], lossy)]
+    rows = [(g, line, heard) for g in receivers for line, heard in lossy_rows(loop.sites[g], lossy)]
     found = []
     for h, sender in enumerate(loop.sites):
         for row, sent in enumerate(sender.schedule.sent):
             weights = {
-                (g, line): loop.coupling[one.way][g][h]
-                for g, line, one in rows
-                if one.sent == sent and (loop.coupling[one.way][g][h] or loop.doubts.get(one.way))
+                (g, line): loop.coupling[heard.way][g][h]
+                for g, line, heard in rows
+                if heard.sent == sent and (loop.coupling[heard.way][g][h] or loop.doubts.get(heard.way))
             }
             if weights:
                 found.append(Ear(weights, h, row))

@@ -174,49 +174,51 @@ def with_memory(group: PeerGroup, remembered: Sequence[Remembered], frame: Frame
     frame
         Its map, where it is not the group's: over a cell, say.
     """
-    plain, row_of = frame or group.lifted, {one: row for row, one in enumerate(group.schedule.sent)}
+    plain, row_of = frame or group.lifted, {sent: row for row, sent in enumerate(group.schedule.sent)}
     numbers = [
-        (one, channel)
-        for one in remembered
-        for channel in one.channels
-        if Sent(one.route[0], channel, 0) in row_of
+        (item, channel)
+        for item in remembered
+        for channel in item.channels
+        if Sent(item.route[0], channel, 0) in row_of
     ]
-    counts = [one.memory.count for one, _ in numbers]
+    counts = [remembered.memory.count for remembered, _ in numbers]
     firsts, n_m, n_s = np.cumsum([0, *counts]), sum(counts), len(row_of)
 
     def over_all(block: Matrix, place: int) -> Matrix:
         """Return rows over one number's kept values and packets as rows over those of all."""
-        one, channel = numbers[place]
+        remembered, channel = numbers[place]
         found = np.zeros((len(block), block.shape[-2], n_m + n_s))
-        found[..., firsts[place] : firsts[place + 1]] = block[..., : one.memory.count]
-        for slot in range(one.memory.slots):
-            found[..., n_m + row_of[Sent(one.route[0], channel, slot)]] = block[..., one.memory.count + slot]
+        found[..., firsts[place] : firsts[place + 1]] = block[..., : remembered.memory.count]
+        for slot in range(remembered.memory.slots):
+            found[..., n_m + row_of[Sent(remembered.route[0], channel, slot)]] = block[
+                ..., remembered.memory.count + slot
+            ]
         return found
 
     rows, kept = list[Matrix](), list[Matrix]()
     values: dict[tuple[Route, str, int], int] = {}
     misses: dict[tuple[Route, int], slice] = {}
     count = 0
-    for place, (one, channel) in enumerate(numbers):
-        whole = over_all(one.after, place)
-        values |= {(one.route, channel, value): count + value for value in range(len(one.memory.old))}
+    for place, (item, channel) in enumerate(numbers):
+        whole = over_all(item.after, place)
+        values |= {(item.route, channel, value): count + value for value in range(len(item.memory.old))}
         rows.append(whole)
-        kept.append(whole[:, one.memory.kept])
+        kept.append(whole[:, item.memory.kept])
         count += whole.shape[-2]
-    for one in dict.fromkeys(one for one, _ in numbers):
-        for slot in range(one.memory.slots):
+    for item in dict.fromkeys(remembered for remembered, _ in numbers):
+        for slot in range(item.memory.slots):
             start = count
             for place, (other, _) in enumerate(numbers):
-                if other is not one:
+                if other is not item:
                     continue
-                rows.append(over_all(one.misses[slot], place))
+                rows.append(over_all(item.misses[slot], place))
                 count += rows[-1].shape[-2]
-            misses[one.route, slot] = slice(start, count)
+            misses[item.route, slot] = slice(start, count)
     plainly = np.zeros((2, n_s, n_m + n_s))
     plainly[0, :, n_m:] = np.eye(n_s)
     rows, kept = [*rows, plainly], [*kept, np.zeros((2, 0, n_m + n_s))]
     listed, keeping = (
-        np.concatenate([over_as_many(one, plain.p) for one in some], axis=-2) for some in (rows, kept)
+        np.concatenate([over_as_many(values, plain.p) for values in some], axis=-2) for some in (rows, kept)
     )
     n_z, multiply = plain.p.shape[-1], arithmetic_of(plain.p).multiply
     p = np.zeros((len(plain.p), n_z + n_m, n_z + n_m))
@@ -226,7 +228,7 @@ def with_memory(group: PeerGroup, remembered: Sequence[Remembered], frame: Frame
     q = np.concatenate([plain.q, multiply(keeping[..., n_m:], plain.d)], axis=-2)
     s = np.concatenate([multiply(listed[..., n_m:], plain.s), listed[..., :n_m]], axis=-1)
     d = multiply(listed[..., n_m:], plain.d)
-    sent: dict[Sent, int] = {one: count + row for one, row in row_of.items()}
+    sent: dict[Sent, int] = {sent: count + row for sent, row in row_of.items()}
     return Site(FrameMap(p, q, s, d), values, misses, sent)
 
 
@@ -256,33 +258,33 @@ def mean_loop(
         The sites' maps by name, where they are not the loop's: over a cell of m parameters (2 + m, …), as
         then are all matrices.
     """
-    of_route = {one.route: one for one in remembered}
+    of_route = {item.route: item for item in remembered}
     sites = [with_memory(group, remembered, frames[group.name] if frames else None) for group in loop.sites]
-    offsets = np.cumsum([0] + [one.states for one in sites]).tolist()
-    starts = np.cumsum([0] + [one.map.s.shape[-2] for one in sites]).tolist()
+    offsets = np.cumsum([0] + [site.states for site in sites]).tolist()
+    starts = np.cumsum([0] + [site.map.s.shape[-2] for site in sites]).tolist()
     layout = StateLayout(tuple(offsets[:-1]), ("",) * offsets[-1], {})
-    values = [of_route[one.route].memorized(of_route[one.route].after) for one in listened]
-    firsts = np.cumsum([offsets[-1]] + [one.shape[-1] for one in values]).tolist()
+    values = [of_route[item.route].memorized(of_route[item.route].after) for item in listened]
+    firsts = np.cumsum([offsets[-1]] + [value.shape[-1] for value in values]).tolist()
     feedback, like, numbers = list[Feedback](), sites[0].map.p, arithmetic_of(sites[0].map.p)
     for g, rows in enumerate(heard):
         now, before = (np.zeros((len(like), len(rows), many)) for many in (starts[-1], firsts[-1]))
         for line, row in enumerate(rows):
-            one = of_route.get((row.way.link, row.way.delay))
-            if one is None or row.gap or row.channel not in one.channels:
+            item = of_route.get((row.way.link, row.way.delay))
+            if item is None or row.gap or row.channel not in item.channels:
                 continue  # what is missed is held, and nothing stands in for it
-            value = one.memory.heard[row.clock, row.tick]
+            value = item.memory.heard[row.clock, row.tick]
             for h, weight in enumerate(loop.coupling[row.way][g]):
                 if weight:
-                    place = starts[h] + sites[h].values[one.route, row.channel, value]
+                    place = starts[h] + sites[h].values[item.route, row.channel, value]
                     now[:2, line, place] = bounded_weight(weight, loop.doubts.get(row.way, 0.0))
-            place = one.channels.index(row.channel) * len(one.memory.old) + value
+            place = item.channels.index(row.channel) * len(item.memory.old) + value
             for channel, own, first in zip(listened, values, firsts, strict=False):
-                if channel.site == g and channel.route == one.route and channel.weights.get(row.way):
+                if channel.site == g and channel.route == item.route and channel.weights.get(row.way):
                     by = np.array(bounded_weight(channel.weights[row.way], 0.0)).reshape(2, 1, 1)
                     weighed = entrywise(own[:, place, None], by)
                     before[:, line, first : first + own.shape[-1]] = over_as_many(weighed, like)[:, 0]
         feedback.append(Feedback(now, before))
-    closed = close([one.map for one in sites], feedback, layout, numbers=numbers)
+    closed = close([site.map for site in sites], feedback, layout, numbers=numbers)
     at = relative_coordinates(standing_state(closed.matrix[..., : offsets[-1]], standing, loop, offsets))
     rest, n = at.rest, len(at.rest)
     moved = relative_rows(closed.matrix, with_doubt(at, numbers), numbers)
@@ -296,16 +298,18 @@ def mean_loop(
 
     channels = []
     for listen, own, first, last in zip(listened, values, firsts, firsts[1:], strict=False):
-        one = of_route[listen.route]
+        item = of_route[listen.route]
         kept = [
-            number * len(one.memory.old) + e for number in range(len(one.channels)) for e in one.memory.kept
+            number * len(item.memory.old) + e
+            for number in range(len(item.channels))
+            for e in item.memory.kept
         ]
         columns = np.concatenate([rest, np.arange(first, last)])
         states = n + len(kept)
         matrix = np.zeros((len(like), states, len(columns)))
         matrix[:, :n] = moved[..., columns]
         matrix[:, n:, n:] = over_as_many(own[:, kept], like)
-        memorized = [over_as_many(one.memorized(miss), like) for miss in one.misses]
+        memorized = [over_as_many(item.memorized(miss), like) for miss in item.misses]
         within = [np.concatenate([np.zeros((*miss.shape[:-1], n)), miss], axis=-1) for miss in memorized]
         channels.append(Channel(matrix[..., :states], matrix[..., states:], missed(columns), tuple(within)))
     return MeanLoop(moved[..., rest], at, tuple(offsets), missed(rest)), channels
@@ -334,7 +338,7 @@ def standing_state(matrix: Matrix, standing: Floats, loop: Loop, offsets: Sequen
     numbers = arithmetic_of(matrix)
     for finest in FINEST:
         basis[rest] = [
-            [float(Fraction(one).limit_denominator(finest)) for one in row] for row in held.tolist()
+            [float(Fraction(item).limit_denominator(finest)) for item in row] for row in held.tolist()
         ]
         off = hull(numbers.subtract(numbers.multiply(matrix, numbers.exact(basis)), numbers.exact(basis)))
         if (np.abs(value_of(off)) <= radius_of(off)).all():

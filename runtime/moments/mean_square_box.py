@@ -106,7 +106,7 @@ def prove_box(system: CompiledSystem, ranges: Sequence[Range], *, cells: int | N
 def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question:
     """Leave parameters open, and see how wide each may be about the middle of the box."""
     numbers = channel_numbers(system)
-    own = tuple(place for place, one in enumerate(ranges) if one.free.name not in numbers)
+    own = tuple(place for place, interval in enumerate(ranges) if interval.free.name not in numbers)
     prepared = prepare(system)
 
     def lifted(changed: CompiledSystem) -> Any:
@@ -115,17 +115,17 @@ def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question:
 
     # Inside the box, as a link may lose nothing at an end of it; and moved along each range, as chances that
     # add up to 1 somewhere, by chance, are those of bursts beside it.
-    inside = [one.low + (one.high - one.low) / 3 for one in ranges]
+    inside = [interval.low + (interval.high - interval.low) / 3 for interval in ranges]
     _refuse(_changed(system, ranges, inside), prepared, ranges[0])
-    for place, one in enumerate(ranges):
-        point = [*inside[:place], one.high - (one.high - one.low) / 3, *inside[place + 1 :]]
-        _refuse(_changed(system, ranges, point), prepared, one)
+    for place, interval in enumerate(ranges):
+        point = [*inside[:place], interval.high - (interval.high - interval.low) / 3, *inside[place + 1 :]]
+        _refuse(_changed(system, ranges, point), prepared, interval)
     opened = open_sites(system, [ranges[place] for place in own], prepared, lifted)
     told = hearing(opened.at, prepared)
     sites = [opened.sites[group.name] for group in told.groups]
     frames = open_frames(sites, [group.schedule for group in told.groups])
     whole = tuple((ranges[place].low, ranges[place].high) for place in own)
-    maps = [one.mapped(lambda block: hull(block)[0]) for one in frames_over(frames, [whole])]
+    maps = [frame_map.mapped(lambda block: hull(block)[0]) for frame_map in frames_over(frames, [whole])]
     lifted_wide = [group.with_lifted(frame) for group, frame in zip(told.groups, maps, strict=True)]
     wide = peer_classes(replace(told, groups=tuple(lifted_wide)))[0][0]
     memories = remembered_of(opened.at, told, wide)
@@ -138,7 +138,7 @@ def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question:
     return _Question(system, prepared, tuple(ranges), own, classes, frames, places, wide, memories)
 
 
-def _refuse(system: CompiledSystem, prepared: Prepared, one: Range) -> None:
+def _refuse(system: CompiledSystem, prepared: Prepared, interval: Range) -> None:
     """Refuse a network that a box is not proved over, and a range that is more than a share lost."""
     what = ""
     for link, law in unreliable(system):
@@ -151,12 +151,12 @@ def _refuse(system: CompiledSystem, prepared: Prepared, one: Range) -> None:
             what = f"losses of {link.name} with on_loss: zero"
     losses = [link.channel.loss for link in system.links if link.channel and link.channel.loss]
     shares = {name for loss in losses for name in (loss.p, loss.r, loss.one_minus_h, loss.one_minus_k)}
-    if one.free.name in channel_numbers(system) - shares:
-        what = f"values of {one.free.label}, on which other numbers of a link depend"
+    if interval.free.name in channel_numbers(system) - shares:
+        what = f"values of {interval.free.label}, on which other numbers of a link depend"
     why = "" if what else growth(system, prepared, bounded=False).why
     if what or why:
         told = f"no box is proved in mean square over {what}" if what else f"no box is proved: {why}"
-        hint = f"apc critical {one.free.label} --in mean-square"
+        hint = f"apc critical {interval.free.label} --in mean-square"
         raise ApcError(Mistake("E898", PLACE, told, hint=hint))
 
 
@@ -179,12 +179,12 @@ def _is_unstable(asked: _Question, point: Sequence[Fraction]) -> bool:
 
 def _looked(asked: _Question, cells: Sequence[Cell]) -> Iterator[Looked]:
     """Look at cells, their frames lifted many at a time, until one is found unstable."""
-    widths = np.array([float(one.high - one.low) for one in asked.ranges])
+    widths = np.array([float(interval.high - interval.low) for interval in asked.ranges])
     for start in range(0, len(cells), TOGETHER):
         some = cells[start : start + TOGETHER]
         maps = frames_over(asked.frames, [tuple(cell[place] for place in asked.own) for cell in some])
         for place, cell in enumerate(some):
-            lifted = [one.mapped(partial(_of_cell, place, len(cell))) for one in maps]
+            lifted = [frame_map.mapped(partial(_of_cell, place, len(cell))) for frame_map in maps]
             proved, sound = _proved(asked, cell, lifted)
             reach = np.array([float(high - low) for low, high in cell]) / widths
             yield Looked(None if proved else reach, not sound and _is_unstable(asked, middle(cell)), WORK)
@@ -192,13 +192,13 @@ def _looked(asked: _Question, cells: Sequence[Cell]) -> Iterator[Looked]:
 
 def _of_cell(place: int, count: int, block: Matrix) -> Matrix:
     """Return the matrix of one cell (2 + m, n, n'), of as many parameters, from those of all."""
-    one = block[min(place, len(block) - 1)]
-    return within(one, count - len(one) + 2)
+    item = block[min(place, len(block) - 1)]
+    return within(item, count - len(item) + 2)
 
 
 def _proved(asked: _Question, cell: Cell, lifted: Sequence[FrameMap]) -> tuple[bool, bool]:
     """Say whether second moments die out, proved all over a cell, and in floats in its middle."""
-    if not all(np.isfinite(block).all() for one in lifted for block in one.blocks):
+    if not all(np.isfinite(block).all() for frame_map in lifted for block in frame_map.blocks):
         return False, False
     frames = {name: lifted[which] for name, which in asked.places.items()}
     of = moments_of(asked.classes, _memories(asked, cell), frames)

@@ -168,8 +168,8 @@ def memory_of(
     """
     assert law.trace is None, "recorded delays leave nothing to chance"
     ahead = math.ceil(max(Fraction(law.longest), delay) / frame) + 2
-    unit = math.lcm(*(one.denominator for one in (frame, *sent, *ticks.values())))
-    length, starts = int(frame * unit), [int(one * unit) for one in reversed(sent)]
+    unit = math.lcm(*(number.denominator for number in (frame, *sent, *ticks.values())))
+    length, starts = int(frame * unit), [int(number * unit) for number in reversed(sent)]
     chance: dict[int, float] = {}
 
     def described(time: int) -> tuple[float, ...]:
@@ -183,7 +183,7 @@ def memory_of(
                 found.append(chance[elapsed])
         return tuple(found)
 
-    slots, instants = len(sent), sorted({int(one * unit) for one in ticks.values()})
+    slots, instants = len(sent), sorted({int(tick * unit) for tick in ticks.values()})
     keys: dict[tuple[float, ...], int] = {}
     of_time: dict[int, int] = {}
     later: list[int] = []
@@ -200,7 +200,7 @@ def memory_of(
     known = {listed[place][: len(listed[place]) - slots]: number for number, place in enumerate(kept)}
     old = [known[key[slots:]] for key in listed]
     chances = np.array([key[:slots][::-1] for key in listed])
-    doubt, *moves = (one / (1 - law.mean_loss) if one else 0.0 for one in lost)
+    doubt, *moves = (value / (1 - law.mean_loss) if value else 0.0 for value in lost)
     return Memory(
         old=np.array(old, np.intp),
         chances=chances,

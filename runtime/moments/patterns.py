@@ -98,7 +98,9 @@ def stand_in_patterns(system: CompiledSystem, told: Hearing) -> Patterns:
     """
     loop = dense_loop(told.groups, told.exchange)
     receivers, offsets, law = receivers_of(system, told, [loop], loop.coupling)
-    channels = [(h, g) for h, one in enumerate(receivers) for g in np.flatnonzero(one.heard.any(axis=0))]
+    channels = [
+        (h, g) for h, receiver in enumerate(receivers) for g in np.flatnonzero(receiver.heard.any(axis=0))
+    ]
     if len(channels) > MOST_CHANNELS:
         what = f"bursts of values that stand in on {len(channels)} ways"
         raise UnservedError(f"{what}: {MOST_CHANNELS} are the most that are followed")
@@ -107,14 +109,14 @@ def stand_in_patterns(system: CompiledSystem, told: Hearing) -> Patterns:
         heard = np.zeros((len(receivers),) * 2)
         for (h, g), bit in zip(channels, bits, strict=True):
             heard[h, g] = 1 - bit
-        for h, one in enumerate(receivers):
+        for h, receiver in enumerate(receivers):
             rows = slice(offsets[h], offsets[h + 1])
-            node = int(np.argmin(np.abs(one.heard - heard[h]).sum(axis=1)))
-            varies = one.varies[node, 0]
+            node = int(np.argmin(np.abs(receiver.heard - heard[h]).sum(axis=1)))
+            varies = receiver.varies[node, 0]
             size = len(varies)
-            means = [value_of(share) for share in one.shares]
+            means = [value_of(share) for share in receiver.shares]
             matrix[rows] = np.concatenate(means, axis=-1) + varies[:, size:]
-            matrix[rows, rows] += value_of(one.mean) + varies[:, :size] - means[h]
+            matrix[rows, rows] += value_of(receiver.mean) + varies[:, :size] - means[h]
     known = np.stack([matrices[0], np.full_like(matrices[0], STANDING)])
     at = relative_coordinates(standing_state(known, standing_motions(loop), loop, offsets))
     return _balanced(matrices, (law,) * len(channels), at, tuple(offsets))
@@ -261,6 +263,6 @@ def _chances(laws: Sequence[ChannelLaw]) -> Floats:
     """Return how likely packets are lost as pattern b says in state s (k, k)."""
     found = np.ones((1, 1))
     for law in laws:
-        one = np.array([[1 - law.one_minus_k, law.one_minus_k], [1 - law.one_minus_h, law.one_minus_h]])
-        found = np.kron(one, found)
+        values = np.array([[1 - law.one_minus_k, law.one_minus_k], [1 - law.one_minus_h, law.one_minus_h]])
+        found = np.kron(values, found)
     return found

@@ -124,15 +124,15 @@ def receivers_of(
     remembered = remembered_of(system, told, common, perfect=True)
     if len(remembered) != 1:
         raise UnservedError("values that stand in beside what is heard over other links")
-    (one,) = remembered
-    link = next(link for link in system.links if link.name == one.route[0])
-    law = channel_law(system, link, told.timings[one.route[1]])
+    (item,) = remembered
+    link = next(link for link in system.links if link.name == item.route[0])
+    law = channel_law(system, link, told.timings[item.route[1]])
     counts = [site.count for site in common.sites]
     sites = [with_memory(group, remembered) for group in common.sites]
-    heard_now = sorted(set(one.memory.heard.values()))
+    heard_now = sorted(set(item.memory.heard.values()))
     values = []
     for site in sites:
-        places = [site.values[one.route, name, value] for name in one.channels for value in heard_now]
+        places = [site.values[item.route, name, value] for name in item.channels for value in heard_now]
         assert not site.map.d[:, places].any(), (
             "what is heard was sent after hearing something in the same frame"
         )
@@ -158,7 +158,7 @@ def receivers_of(
         weight = np.array(
             [math.prod(listed) for listed in itertools.product(*(shares for _, shares in nodes))]
         )
-        receivers.append(_receiver(sites[h], rows, one, values, own, others, heard, weight))
+        receivers.append(_receiver(sites[h], rows, item, values, own, others, heard, weight))
     offsets = np.cumsum([0] + [site.states for site in sites]).tolist()
     return receivers, offsets, law
 
@@ -166,7 +166,7 @@ def receivers_of(
 def _receiver(
     site: Site,
     rows: Sequence[Selected],
-    one: Remembered,
+    remembered: Remembered,
     values: Sequence[Matrix],
     weights: Mapping[Way, Sequence[Fraction]],
     others: Sequence[int],
@@ -179,7 +179,7 @@ def _receiver(
     ----------
     site, rows
         The peer, and what each row of its r hears.
-    one
+    remembered
         What is heard of each sender.
     values
         What ticks hear of each class's peers, over their states.
@@ -190,14 +190,14 @@ def _receiver(
     heard, weight
         The ways of hearing so many of each class (m, K), and their probabilities (m,).
     """
-    heard_now = sorted(set(one.memory.heard.values()))
+    heard_now = sorted(set(remembered.memory.heard.values()))
     plain = site.map
     own_places = sorted({site.sent[own_value(row)] for row in rows if row.gap})
     m, n_r = len(heard), len(rows)
     gap = np.zeros((m, 2, n_r, len(own_places)))
     from_class = [np.zeros((2, n_r, rows_of.shape[-2])) for rows_of in values]
     for line, row in enumerate(rows):
-        if (row.way.link, row.way.delay) != one.route or row.channel not in one.channels:
+        if (row.way.link, row.way.delay) != remembered.route or row.channel not in remembered.channels:
             continue
         if row.gap:
             missed = sum(float(weights[row.way][g]) * (others[g] - heard[:, g]) for g in range(len(others)))
@@ -212,8 +212,8 @@ def _receiver(
                 )
             )
             continue
-        value = heard_now.index(one.memory.heard[row.clock, row.tick])
-        value += one.channels.index(row.channel) * len(heard_now)
+        value = heard_now.index(remembered.memory.heard[row.clock, row.tick])
+        value += remembered.channels.index(row.channel) * len(heard_now)
         for g, block in enumerate(from_class):
             own = float(weights[row.way][g])
             block[0, line, value], block[1, line, value] = own, UNIT * abs(own)
@@ -255,16 +255,16 @@ def _closed(
     common, n = loops[0], offsets[-1]
     states = [slice(*ends) for ends in itertools.pairwise(offsets)]
     whole = np.zeros((2, n, n))
-    for h, one in enumerate(receivers):
+    for h, receiver in enumerate(receivers):
         for g, count in enumerate(counts):
-            block = entrywise(one.shares[g], number_of(float(count - (g == h)), RADII))
-            whole[:, states[h], states[g]] = RADII.add(one.mean, block) if h == g else block
+            block = entrywise(receiver.shares[g], number_of(float(count - (g == h)), RADII))
+            whole[:, states[h], states[g]] = RADII.add(receiver.mean, block) if h == g else block
     loops_of: list[tuple[int | None, Matrix]] = [(None, whole)]
     names = [site.name for site in common.sites]
     for loop in loops[1:]:
         h = names.index(loop.sites[0].name)
         loops_of.append((h, RADII.subtract(receivers[h].mean, receivers[h].shares[h])))
-    listed = [np.array(np.triu_indices(one.stop - one.start)) for one in states]
+    listed = [np.array(np.triu_indices(state.stop - state.start)) for state in states]
     ends = np.cumsum([0, *(entries.shape[1] for entries in listed)]).tolist()
     places = list(map(slice, ends, ends[1:]))
     parts, drives = [], []
@@ -311,20 +311,20 @@ def _forms(
     only
         The class whose peers' differences the loop holds, None for the loop of all.
     """
-    one = receivers[h]
-    size = one.mean.shape[-1]
-    itself, others = one.varies[..., :size], one.varies[..., size:]
+    receiver = receivers[h]
+    size = receiver.mean.shape[-1]
+    itself, others = receiver.varies[..., :size], receiver.varies[..., size:]
     if only is None:
         forms = others.copy()
         forms[..., states[h]] = RADII.add(others[..., states[h]], itself)
-        return forms, one.weight
+        return forms, receiver.weight
     # Two peers of a class of n differ from its mean by amounts of covariance −1/(n − 1).
     n = counts[only]
     forms = others[..., states[only]]
-    listed = [(RADII.add(forms, itself) if h == only else forms, -one.weight / (n - 1))]
+    listed = [(RADII.add(forms, itself) if h == only else forms, -receiver.weight / (n - 1))]
     if h == only:
-        listed.append((itself, one.weight * n / (n - 1)))
-    missed = float(one.weight @ (n - (h == only) - one.heard[:, only]))
-    listed.append((one.per_peer[only], one.weight * one.heard[:, only] * n / (n - 1)))
-    listed.append((one.shares[only][None], np.array([missed * n / (n - 1)])))
+        listed.append((itself, receiver.weight * n / (n - 1)))
+    missed = float(receiver.weight @ (n - (h == only) - receiver.heard[:, only]))
+    listed.append((receiver.per_peer[only], receiver.weight * receiver.heard[:, only] * n / (n - 1)))
+    listed.append((receiver.shares[only][None], np.array([missed * n / (n - 1)])))
     return np.concatenate([forms for forms, _ in listed]), np.concatenate([weights for _, weights in listed])

@@ -197,7 +197,7 @@ def _radius(matrix: Floats) -> float:
 def _scaled(matrix: Balls, near: float) -> tuple[Balls, int]:
     """Return a matrix over the power of two that a number is near to, and its exponent."""
     exponent = math.frexp(near)[1] if 0 < near < math.inf else 0
-    value, radius = (np.ldexp(one, -exponent) for one in (value_of(matrix), radius_of(matrix)))
+    value, radius = (np.ldexp(item, -exponent) for item in (value_of(matrix), radius_of(matrix)))
     return with_radius(value, radius), exponent
 
 
@@ -221,7 +221,7 @@ def hearing_packets(
     """
     sites = []
     for site, listed in zip(loop.sites, rows, strict=True):
-        depths = tuple(depth[one.link] for one in site.schedule.sent)
+        depths = tuple(depth[sent.link] for sent in site.schedule.sent)
         packets = tuple(_packet(row, next(numbers), slots) for row in listed)
         schedule: Schedule = replace(site.schedule, heard=packets, depths=depths)
         sites.append(replace(site, schedule=schedule))

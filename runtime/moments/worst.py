@@ -162,7 +162,7 @@ def trace_of_worst(system: CompiledSystem) -> CompiledSystem:
         raise ApcError(Mistake("E897", Place(system.origin.topology), what, hint="apc simulate"))
     seconds = {timing.name: float(timing.value) for timing in system.timings}
     for link in system.links:
-        delays = {seconds[link.delay], *(seconds[one.delay] for one in link.delays)}
+        delays = {seconds[link.delay], *(seconds[delay.delay] for delay in link.delays)}
         if link.channel is not None and len(delays) > 1:
             what = f"--trace-of worst gives all packets of {link.name} one delay, and they have several"
             raise ApcError(Mistake("E897", Place(system.origin.topology), what, hint="apc simulate"))
@@ -211,10 +211,10 @@ def _part(loop: Loop, lossy: frozenset[str], ratios: Ratios, sizes: Sizes) -> He
     outside: list[Ear] = []
     shares: list[float] = []
     for g, rows in enumerate(listened):
-        for way, sent in dict.fromkeys((one.way, one.sent) for _, one in rows):
+        for way, sent in dict.fromkeys((heard.way, heard.sent) for _, heard in rows):
             # Of several numbers that are heard as one, that which counts once is what the others add to.
             if ratios.get((sent.link, sent.channel), ONE) == ONE:
-                places = [line for line, one in rows if (one.way, one.sent) == (way, sent)]
+                places = [line for line, heard in rows if (heard.way, heard.sent) == (way, sent)]
                 outside.append(Ear(dict.fromkeys(((g, line) for line in places), ONE)))
                 shares.append(1 / size(g, sent.link))
     heard = held_loop(loop, [*ears, *outside], lossy).relative()
@@ -254,7 +254,7 @@ def ratios_of(sites: Sequence[PeerGroup], lossy: frozenset[str]) -> Ratios:
     for link in sorted(lossy):
         columns: dict[str, dict[tuple[int, int, int, Way], Fraction]] = {}
         for g, site in enumerate(sites):
-            used = {(one.way, one.sent.channel) for _, one in lossy_rows(site, frozenset([link]))}
+            used = {(heard.way, heard.sent.channel) for _, heard in lossy_rows(site, frozenset([link]))}
             for partition, tick in enumerate(site.exact.ticks):
                 for receive in range(tick.r.shape[1]):
                     for way, channel in site.schedule.ways(partition, receive):
@@ -294,7 +294,7 @@ def weight_of(loops: Sequence[Loop], lossy: frozenset[str]) -> tuple[float, Size
     sizes: dict[tuple[str, str], float] = {}
     for link in sorted(lossy):
         own = frozenset([link])
-        used = {one.way for loop in loops for site in loop.sites for _, one in lossy_rows(site, own)}
+        used = {heard.way for loop in loops for site in loop.sites for _, heard in lossy_rows(site, own)}
         for loop in loops if len(loops[0].sites) == 1 else loops[:1]:
             count = np.array([site.count for site in loop.sites], np.float64)
             blocks = [
@@ -318,7 +318,7 @@ def _units(weights: Floats) -> Floats:
     for matrix in (weights, weights.T):
         values, vectors = np.linalg.eig(matrix)
         found.append(np.abs(vectors[:, int(np.argmax(values.real))]))
-    if min(float(one.min() / one.max()) for one in found) < LEAST_UNIT:
+    if min(float(item.min() / item.max()) for item in found) < LEAST_UNIT:
         return np.ones(len(weights))
     units = np.sqrt(found[1] / found[0])
     return np.asarray(units / units.max())
@@ -333,7 +333,7 @@ def harmless(of: HeldParts) -> int | None:
         The modes of a scene.
     """
     nominal = [part.heard.frame(lost=False) for part in of.parts]
-    if any(enclose_eigenvalues(value_of(one), radius_of(one))[1].high >= 1 for one in nominal):
+    if any(enclose_eigenvalues(value_of(values), radius_of(values))[1].high >= 1 for values in nominal):
         return None
     gain = max(peak_gain(*map(value_of, part.off))[0] for part in of.parts) * of.weight
     if gain >= 2:
@@ -359,7 +359,7 @@ def _words() -> dict[int, list[tuple[int, ...]]]:
     tried: set[tuple[int, ...]] = set()
     for frames in range(1, FRAMES + 1):
         for lost in itertools.product((0, 1), repeat=frames - 1):
-            heard = [place for place, one in enumerate((*lost, 0)) if not one]
+            heard = [place for place, number in enumerate((*lost, 0)) if not number]
             tried.add(tuple(np.diff([-1, *heard]).tolist()))
     for count in range(1, GAPS + 1):
         tried |= set(itertools.product(range(1, LONGEST + 1), repeat=count))
@@ -373,7 +373,7 @@ def _words() -> dict[int, list[tuple[int, ...]]]:
 
 def _growths(part: HeldPart, words: Sequence[tuple[int, ...]]) -> Floats:
     """Return what words make of a mode per frame (words,), all channels losing the same packets."""
-    heard, lost = (value_of(part.heard.frame(lost=one)) for one in (False, True))
+    heard, lost = (value_of(part.heard.frame(lost=flag)) for flag in (False, True))
     gaps = [heard]
     for _ in range(max(map(max, words)) - 1):
         gaps.append(gaps[-1] @ lost)

@@ -123,7 +123,7 @@ def channel_law(system: CompiledSystem, link: Link, delay: Fraction) -> ChannelL
     )
 
 
-def deviates(distribution: str, one: Floats, two: Floats) -> Floats:
+def deviates(distribution: str, values: Floats, two: Floats) -> Floats:
     """Return what a jitter of 1 adds to a delay, drawn from a distribution.
 
     Parameters
@@ -131,17 +131,17 @@ def deviates(distribution: str, one: Floats, two: Floats) -> Floats:
     distribution
         "uniform": evenly from −1 to 1; "normal": of mean 0 and standard deviation 1; "pareto": netem's, from
         −2/3 to 4, many a little early and few very late, of mean −0.033 and standard deviation 0.821.
-    one, two
+    values, two
         Independent numbers (n,) from 0 to less than 1.
     """
     match distribution:
         case "uniform":
-            return 2 * one - 1
+            return 2 * values - 1
         case "normal":  # Box and Muller (1958)
-            normal = np.sqrt(-2 * np.log1p(-one)) * np.cos(2 * np.pi * two)
+            normal = np.sqrt(-2 * np.log1p(-values)) * np.cos(2 * np.pi * two)
             return np.asarray(normal, dtype=np.float64)
     assert distribution == "pareto", f"no such distribution: {distribution}"
-    tail = (1 - one) ** (-1 / PARETO_SHAPE)
+    tail = (1 - values) ** (-1 / PARETO_SHAPE)
     late = (tail - PARETO_SHAPE / (PARETO_SHAPE - 1)) * 4 / 3
     return np.asarray(np.minimum(late, PARETO_MOST), dtype=np.float64)
 

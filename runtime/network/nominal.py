@@ -54,21 +54,26 @@ def left_out(
         delay = _ms(resolve(system).timings[link.delay])
         notes.append(f"left out: {chance(link, law)}; here every packet takes the nominal {delay}")
     names = {free.name for free in varied}
-    for one in given_ranges(system):
-        if one.free.name not in names:
-            low, middle, high = (_ms(value) for value in (one.low, (one.low + one.high) / 2, one.high))
-            notes.append(f"left out: {one.free.label} from {low} to {high} but for its middle, {middle}")
+    for interval in given_ranges(system):
+        if interval.free.name not in names:
+            low, middle, high = (
+                _ms(value) for value in (interval.low, (interval.low + interval.high) / 2, interval.high)
+            )
+            notes.append(f"left out: {interval.free.label} from {low} to {high} but for its middle, {middle}")
     return tuple(notes)
 
 
 def refuse_range(system: CompiledSystem) -> None:
     """Refuse to play or write out a scene with a range in the place of a delay: ApcError E899."""
-    for one in given_ranges(system):
-        low, middle, high = (_ms(value) for value in (one.low, (one.low + one.high) / 2, one.high))
-        what = f"{one.free.label} is a range, {low} to {high}, of which this takes one"
-        hint = f'--set "{one.free.label}={middle}"'
+    for interval in given_ranges(system):
+        low, middle, high = (
+            _ms(value) for value in (interval.low, (interval.low + interval.high) / 2, interval.high)
+        )
+        what = f"{interval.free.label} is a range, {low} to {high}, of which this takes one"
+        hint = f'--set "{interval.free.label}={middle}"'
         told = (
-            re.search(rf":(\d+):(\d+): W275 {re.escape(one.free.label)} ", text) for text in system.warnings
+            re.search(rf":(\d+):(\d+): W275 {re.escape(interval.free.label)} ", text)
+            for text in system.warnings
         )
         line, column = next((map(int, found.groups()) for found in told if found), (0, 0))
         raise ApcError(Mistake("E899", Place(system.origin.topology, line, column), what, hint=hint))

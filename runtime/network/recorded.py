@@ -277,8 +277,8 @@ def _unit(distribution: str, evenly: Floats) -> Floats:
     return deviates(distribution, evenly, evenly)
 
 
-def _distance(one: Floats, other: Floats) -> float:
+def _distance(values: Floats, other: Floats) -> float:
     """Return Kolmogorov and Smirnov's distance of two sorted samples."""
-    where = np.concatenate([one, other])
-    shares = [np.searchsorted(sample, where, side="right") / len(sample) for sample in (one, other)]
+    where = np.concatenate([values, other])
+    shares = [np.searchsorted(sample, where, side="right") / len(sample) for sample in (values, other)]
     return float(np.abs(shares[0] - shares[1]).max())

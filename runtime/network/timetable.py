@@ -146,13 +146,16 @@ def luck_of(
     """
     link = exchange.links[route.link]
     assert link.channel is not None
-    grids = {one.name: (timings[one.phase] / quantum, timings[one.period] / quantum) for one in system.clocks}
+    grids = {
+        clock.name: (timings[clock.phase] / quantum, timings[clock.period] / quantum)
+        for clock in system.clocks
+    }
     groups, of_way = _groups(exchange, route.pairs)
     late = [timings[exchange.delay(link.name, *pair)] for pair in groups]
     luck = Luck(
         law=channel_law(system, link, timings[link.delay]),
-        delays=np.array([float(one) for one in late])[of_way],
-        nominal=np.array([int(one / quantum) for one in late], np.int64)[of_way],
+        delays=np.array([float(number) for number in late])[of_way],
+        nominal=np.array([int(number / quantum) for number in late], np.int64)[of_way],
         phase=int(grids[link.clock][0]),
         period=int(grids[link.clock][1]),
         tick_phase=int(grids[route.clock][0]),
@@ -374,7 +377,7 @@ def _routes_over(
     pairs, weights = exchange.arcs(link.name)
     order = np.lexsort((pairs[:, 0], pairs[:, 1]))  # receiver by receiver: what each hears stands together
     pairs, weights = pairs[order], weights[order]
-    sends = np.array([any(one.link == link.name for one in kind.sends) for kind in system.kinds])
+    sends = np.array([any(send.link == link.name for send in kind.sends) for kind in system.kinds])
     used = {}
     for clock in system.clocks:
         hears = np.array([_hears(kind, link.name, clock.name) for kind in system.kinds])
@@ -384,7 +387,7 @@ def _routes_over(
     groups = {pair for some, _ in used.values() for pair in _groups(exchange, some)[0]}
     delays = {timings[exchange.delay(link.name, *pair)] for pair in groups}
     longest = max((channel_law(system, link, delay).longest for delay in delays), default=0.0)
-    periods = {one.name: timings[one.period] for one in system.clocks}
+    periods = {clock.name: timings[clock.period] for clock in system.clocks}
     return [
         Route(
             link=link.name,
@@ -412,7 +415,7 @@ def _groups(exchange: Exchange, pairs: Integers) -> tuple[list[tuple[int, int]],
     groups = np.searchsorted(exchange.starts, pairs, side="right") - 1
     count = len(exchange.groups)
     found, of_pair = np.unique(groups[:, 0] * count + groups[:, 1], return_inverse=True)
-    return [divmod(one, count) for one in found.tolist()], of_pair
+    return [divmod(item, count) for item in found.tolist()], of_pair
 
 
 def _highest(ticks: Integers, ways: Integers, when: Integers, ranks: Integers, first: Integers) -> Integers:

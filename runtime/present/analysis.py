@@ -305,7 +305,7 @@ def _leading(mode: Mode) -> str:
 def needs_text(found: Needs) -> Lines:
     """Yield what a scene needs in one sentence."""
     several = len(found.sites) > 1
-    sites = "; ".join(f"{one.name}: {_site(one)}" if several else _site(one) for one in found.sites)
+    sites = "; ".join(f"{site.name}: {_site(site)}" if several else _site(site) for site in found.sites)
     whole = found.peers > 1 and sum(count for count, _ in found.systems) == 1
     noun = "determinant" if found.method == "determinant" else "system" if whole else "mode"
     systems = " and ".join(f"{counted(count, noun)} of {size}" for count, size in found.systems)
@@ -326,8 +326,8 @@ def _site(found: SiteNeeds) -> str:
 def box_proof_text(found: BoxProof) -> Lines:
     """Yield what was proved of a box."""
     where = [
-        f"  {one.free.label} = {quantity(value, one.unit, 12)}"
-        for one, value in zip(found.ranges, found.point, strict=False)  # a proved box has no point
+        f"  {interval.free.label} = {quantity(value, interval.unit, 12)}"
+        for interval, value in zip(found.ranges, found.point, strict=False)  # a proved box has no point
     ]
     cells = counted(found.cells, "cell")
     said = f"undecided, {100 * found.open_share:.3g} % of the box is left open ({cells})"
@@ -337,7 +337,7 @@ def box_proof_text(found: BoxProof) -> Lines:
     yield f"{found.topology}:"
     for text in (*found.left_out, said):
         yield from wrapped(text)
-    yield from (f"  {range_text(one)}" for one in found.ranges)
+    yield from (f"  {range_text(interval)}" for interval in found.ranges)
     if found.stable is False:
         yield f"proved {found.verdict} at"
         yield from where
@@ -353,7 +353,7 @@ def box_proof_text(found: BoxProof) -> Lines:
 
 def _changing(found: ChangingDelay, over: Range) -> str:
     """Return what is proved of a delay that changes from packet to packet, in a sentence."""
-    low, high = (quantity(float(one), over.unit, 9) for one in (over.low, over.high))
+    low, high = (quantity(float(number), over.unit, 9) for number in (over.low, over.high))
     said = [found.note or "open whether it stays stable"]
     if found.unstable is not None:
         said = [f"unstable if by turns {found.unstable[0]} packets take {low} and {found.unstable[1]} {high}"]
@@ -367,7 +367,7 @@ def _changing(found: ChangingDelay, over: Range) -> str:
 
 def range_text(found: Range) -> str:
     """Return a parameter and its range in words."""
-    low, high = (quantity(float(one), found.unit, 9) for one in (found.low, found.high))
+    low, high = (quantity(float(number), found.unit, 9) for number in (found.low, found.high))
     return f"{found.free.label} from {low} to {high}"
 
 
@@ -380,7 +380,7 @@ def box_proof_document(found: BoxProof) -> Plain:
     """Return what was proved of a box as plain data."""
     return {
         **picked(found, "topology", "left_out", "verdict", "stable", "cells", "open_share", "notes"),
-        "box": [range_document(one) for one in found.ranges],
+        "box": [range_document(interval) for interval in found.ranges],
         "unstable_at": list(found.point) if found.stable is False else None,
         "open_around": list(found.point) if found.stable is None and found.point else None,
         "changing": found.changing and picked(found.changing, "proved_to", "unstable", "note"),
@@ -463,21 +463,21 @@ def conventions_text(found: Conventions) -> Lines:
     elif found.flips:
         headline = "the verdict depends on the conventions"
     yield f"{found.topology}: {headline}\n"
-    for number, one in enumerate(found.outcomes, 1):
-        radius = radius_text(one.spectral_radius, one.spectral_radius_error, one.beyond)
-        yield f"  {number}  {one.verdict or 'not analysed'}"
-        yield f"     spectral radius {radius}" if one.verdict else f"     {one.refusal}"
-        yield from (f"     {departure}" for departure in one.departures or (DEFAULT,))
-        if one.start:
-            yield f"     heard before the first packet: {one.start}"
-        yield f"     {len(one.orders)} of {ORDERS} orders, such as {' < '.join(one.orders[0])}"
+    for number, outcome in enumerate(found.outcomes, 1):
+        radius = radius_text(outcome.spectral_radius, outcome.spectral_radius_error, outcome.beyond)
+        yield f"  {number}  {outcome.verdict or 'not analysed'}"
+        yield f"     spectral radius {radius}" if outcome.verdict else f"     {outcome.refusal}"
+        yield from (f"     {departure}" for departure in outcome.departures or (DEFAULT,))
+        if outcome.start:
+            yield f"     heard before the first packet: {outcome.start}"
+        yield f"     {len(outcome.orders)} of {ORDERS} orders, such as {' < '.join(outcome.orders[0])}"
     if found.repeated and not found.start_matters:
         yield "\n  What is heard before the first packet can't change the verdict."
 
 
 def conventions_document(found: Conventions) -> Plain:
     """Return what every convention leads to as plain data."""
-    outcomes = [_analysed(one, {}) for one in found.outcomes]
+    outcomes = [_analysed(outcome, {}) for outcome in found.outcomes]
     return record(found, {"flips": found.flips, "repeated": found.repeated, "outcomes": outcomes})
 
 
@@ -547,17 +547,17 @@ def locus_picture(found: Locus, ax: Any = None) -> Any:
     ax = _circle(ax)
     of = found.critical
     points = np.concatenate(found.eigenvalues)  # conjugates are among them
-    colours = np.repeat(found.values, [len(one) for one in found.eigenvalues])
+    colours = np.repeat(found.values, [len(eigenvalue) for eigenvalue in found.eigenvalues])
     drawn = ax.scatter(points.real, points.imag, c=colours, s=5, linewidths=0, cmap="viridis", zorder=3)
     ax.figure.colorbar(drawn, ax=ax, label=axis_label(of.parameter, of.unit))
     _mark(ax, found.now, "x", COLOURS[2], f"now, {quantity(of.present, of.unit)}")
-    for place, one in enumerate(of.crossings[:MOST_NAMED]):
-        if not found.values.size or not found.values[0] <= one.value <= found.values[-1]:
+    for place, crossing in enumerate(of.crossings[:MOST_NAMED]):
+        if not found.values.size or not found.values[0] <= crossing.value <= found.values[-1]:
             continue
-        nearest = found.eigenvalues[int(np.abs(found.values - one.value).argmin())]
+        nearest = found.eigenvalues[int(np.abs(found.values - crossing.value).argmin())]
         at = nearest[np.abs(np.abs(nearest) - 1).argmin()]
-        told = "" if np.isnan(one.frequency_hz) else f", {in_hertz(one.frequency_hz)}"
-        label = f"changes at {quantity(one.value, of.unit)}{told}"
+        told = "" if np.isnan(crossing.frequency_hz) else f", {in_hertz(crossing.frequency_hz)}"
+        label = f"changes at {quantity(crossing.value, of.unit)}{told}"
         _mark(ax, at / abs(at), MARKS[place], "none", label)
     _entitle(ax, [f"{of.topology}: eigenvalues of a frame of {1e3 * found.frame_s:g} ms, packets on time"])
     return ax
@@ -590,5 +590,5 @@ def _mark(ax: Any, values: Any, mark: str, colour: str, label: str) -> None:
 
 def _entitle(ax: Any, lines: Sequence[str]) -> None:
     ax.autoscale_view()
-    ax.set_title("\n".join(one for line in lines for one in textwrap.wrap(line, LETTERS)), fontsize=9)
+    ax.set_title("\n".join(text for line in lines for text in textwrap.wrap(line, LETTERS)), fontsize=9)
     legend_below(ax)

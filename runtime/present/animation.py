@@ -69,7 +69,7 @@ def save_animation(system: CompiledSystem, found: Trajectory, path: Path) -> Non
     figure, actors = draw_actors(system)
     columns = {signal.name: place for place, signal in enumerate(found.signals)}
     tracks = [MM * found.values[:, [columns[name] for name in actor.states]] for actor in actors]
-    turns = [heading(found.values[:, [columns[one] for one in actor.turning]]) for actor in actors]
+    turns = [heading(found.values[:, [columns[text] for text in actor.turning]]) for actor in actors]
     for actor, track in zip(actors, tracks, strict=True):
         widen(actor, track)
     if actors:
@@ -107,13 +107,13 @@ def _paint_what_stands(figure: Any, moving: Sequence[Any]) -> None:
     figure.set_dpi(DPI)
     figure.draw_without_rendering()  # which lays it out, with room for all
     figure.set_layout_engine("none")
-    for one in moving:
-        one.set_visible(False)
+    for item in moving:
+        item.set_visible(False)
     canvas = agg.FigureCanvasAgg(figure)
     canvas.draw()
     painted = np.array(canvas.buffer_rgba())
-    for one in [*figure.legends, *(child for ax in figure.axes for child in ax.get_children())]:
-        one.set_visible(False)
-    for one in moving:
-        one.set_visible(True)
+    for item in [*figure.legends, *(child for ax in figure.axes for child in ax.get_children())]:
+        item.set_visible(False)
+    for item in moving:
+        item.set_visible(True)
     figure.figimage(painted, zorder=-1)

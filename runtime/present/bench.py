@@ -37,8 +37,8 @@ def bench_text(found: Bench) -> Lines:
     """Yield a table a task, the methods sorted by time."""
     peers = counted(found.peers, "peer", ",")
     yield f"{found.topology}: {peers}\n"
-    for one in found.comparisons:
-        yield from _task(one)
+    for comparison in found.comparisons:
+        yield from _task(comparison)
         yield ""
     yield from notes(", ".join(f"{name} {value}" for name, value in found.machine.items() if value))
 
@@ -49,13 +49,22 @@ def _task(found: Comparison) -> Lines:
     yield ""
     if found.measured:
         rows = [("method", "median", "spread", "error", "bound", "")]
-        for one in found.measured:
-            spread = NOTHING if one.rounds < 2 else _time(one.spread)
-            marks = ("*" if one.front else " ") + (" chosen" if one.chosen else "")
-            rows.append((one.name, _time(one.seconds), spread, _size(one.error), _size(one.bound), marks))
+        for measured in found.measured:
+            spread = NOTHING if measured.rounds < 2 else _time(measured.spread)
+            marks = ("*" if measured.front else " ") + (" chosen" if measured.chosen else "")
+            rows.append(
+                (
+                    measured.name,
+                    _time(measured.seconds),
+                    spread,
+                    _size(measured.error),
+                    _size(measured.bound),
+                    marks,
+                )
+            )
         yield from table(rows, "<>>>><")
         yield ""
-        known = any(one.error is not None for one in found.measured)
+        known = any(measured.error is not None for measured in found.measured)
         told = [f"error and bound are {found.relative}", BETTER] if known else []
         reference = f"{'' if known else 'no '}reference: {found.reference}"
         yield from notes(_times(found), *told, _choice(found), reference, *found.notes)
@@ -64,7 +73,7 @@ def _task(found: Comparison) -> Lines:
 
 def _times(found: Comparison) -> str:
     """Say what the columns of times are."""
-    least, most = (pick(one.rounds for one in found.measured) for pick in (min, max))
+    least, most = (pick(measured.rounds for measured in found.measured) for pick in (min, max))
     runs = counted(most, "run") if least == most else f"{least} to {most} runs"
     columns = "median and spread (half the distance between the quartiles)"
     return f"{columns} are of {runs}: processor time of {found.timed}"
@@ -110,15 +119,15 @@ def scale_text(found: Scale) -> Lines:
     """Yield a line a number of peers."""
     from apc.benchmark.scale import REPEATS  # loaded where there is one, and else not needed
 
-    beside = {one.peers - one.count for one in found.rows} - {0}
+    beside = {row.peers - row.count for row in found.rows} - {0}
     others = "".join(f", beside {number:,} of other groups" for number in sorted(beside))
     yield from wrapped(f"{found.topology}: peers of group {found.group}{others}")
     yield ""
     rows = [("peers", "compile", "analyze", "memory", "error", "bound", "method")]
-    for one in found.rows:
-        memory = f"{one.memory / 2**20:.0f} MiB"
-        numbers = (_time(one.compile_s), _time(one.analyze_s), memory, _size(one.error), _size(one.bound))
-        rows.append((f"{one.count:,}", *numbers, one.method))
+    for row in found.rows:
+        memory = f"{row.memory / 2**20:.0f} MiB"
+        numbers = (_time(row.compile_s), _time(row.analyze_s), memory, _size(row.error), _size(row.bound))
+        rows.append((f"{row.count:,}", *numbers, row.method))
     yield from table(rows, ">>>>>><")
     yield ""
     times = f"processor time of compiling, and the median of {REPEATS} analyses"
@@ -151,8 +160,8 @@ def bench_picture(found: Bench) -> Any:
     """
     figure = new_figure((WIDTH * len(found.comparisons), HEIGHT))
     axes = figure.subplots(1, len(found.comparisons), squeeze=False)[0]
-    for ax, one in zip(axes, found.comparisons, strict=True):
-        _panel(ax, one)
+    for ax, comparison in zip(axes, found.comparisons, strict=True):
+        _panel(ax, comparison)
     figure.suptitle(f"{found.topology}: error against time", fontsize=11)
     return figure
 
@@ -161,7 +170,7 @@ def _panel(ax: Any, found: Comparison) -> None:
     ax.set_title(f"apc {found.task}", fontsize=10)
     ax.set_xlabel("median time [s]")
     ax.set_ylabel(f"error of the {found.quantity}", fontsize=9)
-    points = [one for one in found.measured if one.error is not None]
+    points = [measured for measured in found.measured if measured.error is not None]
     if not points:
         why = "no reference" if found.measured else found.reference
         ax.text(0.5, 0.5, why, transform=ax.transAxes, ha="center")
@@ -169,27 +178,27 @@ def _panel(ax: Any, found: Comparison) -> None:
     ax.set(xscale="log", yscale="log")
     ax.margins(0.1)
     ax.grid(linewidth=0.4, alpha=0.6)
-    front = [one for one in points if one.front]
-    steps = [[one.seconds for one in front], [_drawn(one) for one in front]]
+    front = [point for point in points if point.front]
+    steps = [[measured.seconds for measured in front], [_drawn(measured) for measured in front]]
     ax.step(*steps, where="post", color="0.4", linewidth=1, zorder=1, label="Pareto front")
-    for place, one in enumerate(points):
+    for place, point in enumerate(points):
         colour = COLOURS[place % len(COLOURS)]
         ax.errorbar(
-            one.seconds,
-            _drawn(one),
-            xerr=min(one.spread, 0.9 * one.seconds),
+            point.seconds,
+            _drawn(point),
+            xerr=min(point.spread, 0.9 * point.seconds),
             fmt=MARKS[place % len(MARKS)],
             color=colour,
-            markerfacecolor=colour if one.chosen else "white",
-            label=one.name + (" (default)" if one.chosen else ""),
+            markerfacecolor=colour if point.chosen else "white",
+            label=point.name + (" (default)" if point.chosen else ""),
         )
     if max(map(_drawn, points)) < SAME:
         ax.axhline(SAME, color="0.4", linewidth=0.8, linestyle=":", label="below are roundings")
     legend_below(ax, -0.16, fontsize=7)
 
 
-def _drawn(one: Measured) -> float:
-    return max(one.error or 0.0, LEAST)
+def _drawn(measured: Measured) -> float:
+    return max(measured.error or 0.0, LEAST)
 
 
 def _time(seconds: float) -> str:

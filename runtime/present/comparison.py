@@ -88,14 +88,16 @@ def comparison_text(found: Comparison) -> Lines:
     yield counted(len(schemes), "scheme") + " side by side" * (len(schemes) > 1)
     yield from notes(*_meant(found), *found.left_out, *(f"note: {text}" for text in found.notes))
     tables: list[tuple[tuple[str, ...], Iterable[tuple[str, ...]]]] = [
-        (("",), [(f"{one.topology}, {counted(one.peers, 'peer', ',d')}",) for one in schemes]),
-        (("verdict", "spectral radius a frame"), [_verdict(one, feet) for one in schemes]),
+        (("",), [(f"{scheme.topology}, {counted(scheme.peers, 'peer', ',d')}",) for scheme in schemes]),
+        (("verdict", "spectral radius a frame"), [_verdict(scheme, feet) for scheme in schemes]),
     ]
-    if any(one.linearized for one in schemes):
-        tables.append((("in time", "played"), [_in_time(one, feet) for one in schemes]))
+    if any(scheme.linearized for scheme in schemes):
+        tables.append((("in time", "played"), [_in_time(scheme, feet) for scheme in schemes]))
     for key, heading in VARIED:
-        tables.append(((heading, "of"), [_varied(one, key, feet) for one in schemes]))
-    tables.append((("felt at 1 Hz", "at 10 Hz", "of the hand at"), [_felt(one, feet) for one in schemes]))
+        tables.append(((heading, "of"), [_varied(scheme, key, feet) for scheme in schemes]))
+    tables.append(
+        (("felt at 1 Hz", "at 10 Hz", "of the hand at"), [_felt(scheme, feet) for scheme in schemes])
+    )
     tables.append((("work a tick", "a peer sends at most", "all send"), map(_costs, schemes)))
     for headings, cells in tables:
         rows = [("", *headings), *((str(place), *row) for place, row in enumerate(cells, 1))]
@@ -113,8 +115,8 @@ def _marked(cell: str, texts: Iterable[str], feet: dict[str, int]) -> str:
     return " ".join([cell, *marks])
 
 
-def _costs(one: Scheme) -> tuple[str, ...]:
-    effort = one.effort
+def _costs(scheme: Scheme) -> tuple[str, ...]:
+    effort = scheme.effort
     clock = f" of {effort.clock}" if effort.clock else ""
     sent = (f"{number:,.6g} a second" for number in (effort.sent, effort.sent_by_all))
     return f"{counted(effort.operations, 'operation', ',d')}{clock}", *sent
@@ -122,52 +124,52 @@ def _costs(one: Scheme) -> tuple[str, ...]:
 
 def _meant(found: Comparison) -> Iterator[str]:
     """Yield what stable means, where it is not that motions die out."""
-    if any(one.passive for one in found.schemes):
+    if any(scheme.passive for scheme in found.schemes):
         yield MEANT["passive"]
-    elif any(reached(one, f"{key}.criterion") in MEANT for one in found.schemes for key, _ in VARIED):
+    elif any(reached(scheme, f"{key}.criterion") in MEANT for scheme in found.schemes for key, _ in VARIED):
         yield f"of a link that is, or becomes, unreliable: {MEANT['mean-square']}"
 
 
-def _why(one: Scheme, key: str) -> tuple[str, ...]:
-    return tuple(text for name, text in one.missing if name == key)
+def _why(scheme: Scheme, key: str) -> tuple[str, ...]:
+    return tuple(text for name, text in scheme.missing if name == key)
 
 
-def _verdict(one: Scheme, feet: dict[str, int]) -> tuple[str, str]:
-    if one.analysis is None:
-        return one.verdict, _marked(NONE, [one.refused], feet)
-    told = list(_why(one, "verdict"))
-    if one.network is not None and one.network.mean_square_radius is not None:
-        root, error = math.sqrt(one.network.mean_square_radius), one.network.error or 0.0
+def _verdict(scheme: Scheme, feet: dict[str, int]) -> tuple[str, str]:
+    if scheme.analysis is None:
+        return scheme.verdict, _marked(NONE, [scheme.refused], feet)
+    told = list(_why(scheme, "verdict"))
+    if scheme.network is not None and scheme.network.mean_square_radius is not None:
+        root, error = math.sqrt(scheme.network.mean_square_radius), scheme.network.error or 0.0
         grown = radius_text(root, error / (2 * root) if root else error)
         told.append(
             "the radius is that with every packet on time; "
             f"mean squares are multiplied by {grown} squared a frame"
         )
-    if one.passive is not None:
+    if scheme.passive is not None:
         told.append("the radius is that with free hands")
-    verdict = one.verdict + (", linearized" if one.analysis.linearized else "")
-    found = one.analysis
+    verdict = scheme.verdict + (", linearized" if scheme.analysis.linearized else "")
+    found = scheme.analysis
     radius = radius_text(found.spectral_radius, found.spectral_radius_error, found.beyond)
     return verdict, _marked(radius, told, feet)
 
 
-def _in_time(one: Scheme, feet: dict[str, int]) -> tuple[str, str]:
+def _in_time(scheme: Scheme, feet: dict[str, int]) -> tuple[str, str]:
     """Return the verdict of a simulation, where that of an analysis is of a linearization."""
-    if one.analysis is None:
+    if scheme.analysis is None:
         return NONE, NONE
-    if not one.linearized:
+    if not scheme.linearized:
         return "as its verdict says: it is linear", ""
-    if one.played is None:
-        return _marked(NONE, _why(one, "played"), feet), NONE
-    summary = one.played.summary
+    if scheme.played is None:
+        return _marked(NONE, _why(scheme, "played"), feet), NONE
+    summary = scheme.played.summary
     at = {"settles": summary.settled, "diverges": summary.stopped_at}.get(summary.verdict)
     return f"{summary.verdict}{'' if at is None else f' at {at:.3g} s'}", f"{summary.end:g} s"
 
 
-def _varied(one: Scheme, key: str, feet: dict[str, int]) -> tuple[str, str]:
-    found: Critical | None = getattr(one, key)
+def _varied(scheme: Scheme, key: str, feet: dict[str, int]) -> tuple[str, str]:
+    found: Critical | None = getattr(scheme, key)
     if found is None:
-        return _marked(NONE, _why(one, key), feet), NONE
+        return _marked(NONE, _why(scheme, key), feet), NONE
     told = []
     if len(found.crossings) > 1:
         told.append(f"{counted(len(found.crossings), 'crossing')} in all: apc critical {found.parameter}")
@@ -188,28 +190,30 @@ def _reach(found: Critical) -> str:
     return value if found.stable_side == "below" else f"{value}, stable above it"
 
 
-def _felt(one: Scheme, feet: dict[str, int]) -> tuple[str, str, str]:
-    if one.feel is None:
-        return _marked(NONE, _why(one, "feel"), feet), NONE, NONE
+def _felt(scheme: Scheme, feet: dict[str, int]) -> tuple[str, str, str]:
+    if scheme.feel is None:
+        return _marked(NONE, _why(scheme, "feel"), feet), NONE, NONE
     cells = []
-    for value, bound in zip(one.feel.impedance.tolist(), one.feel.bound.tolist(), strict=True):
+    for value, bound in zip(scheme.feel.impedance.tolist(), scheme.feel.bound.tolist(), strict=True):
         size = known_digits(abs(value), abs(value) * bound, DIGITS)
         cells.append(f"{size} N*s/m, {np.degrees(np.angle(value)):.2f}°")
-    return cells[0], cells[1], one.feel.at
+    return cells[0], cells[1], scheme.feel.at
 
 
 def comparison_document(found: Comparison) -> Plain:
     """Return the same as plain data, in SI: each part as the JSON of its command."""
-    return {"schemes": [_document(one) for one in found.schemes], "notes": list(found.notes)}
+    return {"schemes": [_document(scheme) for scheme in found.schemes], "notes": list(found.notes)}
 
 
-def _document(one: Scheme) -> Plain:
-    return record(one, {**picked(one, "verdict", "stable", "left_out"), "missing": dict(one.missing)})
+def _document(scheme: Scheme) -> Plain:
+    return record(
+        scheme, {**picked(scheme, "verdict", "stable", "left_out"), "missing": dict(scheme.missing)}
+    )
 
 
 def comparison_rows(found: Comparison) -> Tabled:
     """Return the columns of a table of schemes, a row a scheme, and what was left out."""
-    left_out = {one.topology: list(one.left_out) for one in found.schemes}
+    left_out = {scheme.topology: list(scheme.left_out) for scheme in found.schemes}
     columns = [column for column, _ in COLUMNS]
     return columns, map(_row, found.schemes), {"left_out": left_out, "notes": list(found.notes)}
 
@@ -250,10 +254,10 @@ COLUMNS: list[tuple[Column, str]] = [
 ]
 
 
-def _row(one: Scheme) -> Row:
+def _row(scheme: Scheme) -> Row:
     """Return a row of the table."""
-    missing = "; ".join(f"{key}: {text}" for key, text in one.missing) or one.refused or None
-    cells = (reached(one, path) for _, path in COLUMNS if path)
+    missing = "; ".join(f"{key}: {text}" for key, text in scheme.missing) or scheme.refused or None
+    cells = (reached(scheme, path) for _, path in COLUMNS if path)
     return *(
         float(cell) if isinstance(cell, float) else None if cell == "" else cell for cell in cells
     ), missing
@@ -277,14 +281,16 @@ def comparison_picture(found: Comparison) -> Any:
         E875 matplotlib is not installed.
     """
     schemes = found.schemes
-    panels = [(title, [_number(reached(one, path)) for one in schemes]) for title, path in NUMBERS]
+    panels = [(title, [_number(reached(scheme, path)) for scheme in schemes]) for title, path in NUMBERS]
     reaches = [
-        (title, [_reach_bar(getattr(one, key), scale) for one in schemes]) for title, key, scale in REACHES
+        (title, [_reach_bar(getattr(scheme, key), scale) for scheme in schemes])
+        for title, key, scale in REACHES
     ]
     panels[2:2] = reaches
     rows = -(-len(panels) // ABREAST)
     names = [
-        "\n".join(textwrap.wrap(f"{place}  {one.topology}", LABEL)) for place, one in enumerate(schemes, 1)
+        "\n".join(textwrap.wrap(f"{place}  {scheme.topology}", LABEL))
+        for place, scheme in enumerate(schemes, 1)
     ]
     size = (PANEL * ABREAST + 1.4, (0.9 + BAR * 1.25 * len(names)) * rows + 0.5)
     figure = new_figure(size)
@@ -294,8 +300,8 @@ def comparison_picture(found: Comparison) -> Any:
     axes[0].set_yticks(range(len(names)), names, fontsize=8)
     axes[0].invert_yaxis()
     axes[0].axvline(BOUNDARY, color="0.4", linewidth=0.8, linestyle=(0, (3, 2)))
-    for place, one in enumerate(schemes):
-        axes[0].annotate(_judged(one), (0, place), (4, 0), **LETTERS)
+    for place, scheme in enumerate(schemes):
+        axes[0].annotate(_judged(scheme), (0, place), (4, 0), **LETTERS)
     lines = [line for text in (*found.left_out, *found.notes) for line in textwrap.wrap(text, 110)]
     figure.suptitle("\n".join(lines), fontsize=8.5)
     return figure
@@ -333,10 +339,10 @@ def _draw(ax: Any, title: str, bars: Sequence[_Bar]) -> None:
     ax.locator_params(axis="x", nbins=4)
 
 
-def _judged(one: Scheme) -> str:
+def _judged(scheme: Scheme) -> str:
     """Say of a scheme that it is not stable, and what one does that isn't linear."""
-    if one.analysis is None:
-        return one.verdict
-    said = [] if one.stable else ["unstable" if one.stable is False else "undecided"]
-    said += [] if one.played is None else [f"{one.played.summary.verdict} in time"]
+    if scheme.analysis is None:
+        return scheme.verdict
+    said = [] if scheme.stable else ["unstable" if scheme.stable is False else "undecided"]
+    said += [] if scheme.played is None else [f"{scheme.played.summary.verdict} in time"]
     return ", ".join(said)

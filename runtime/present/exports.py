@@ -65,14 +65,18 @@ def code_text(found: Code) -> Lines:
     """Yield what a peer's code takes and gives."""
     peer = found.code
     period = float(peer.schedule.frame_s) / len(peer.instants) * 1e3
-    every = f"every {period:.6g} ms" if len({one.move for one in peer.instants}) == 1 else "at its instants"
+    every = (
+        f"every {period:.6g} ms"
+        if len({instant.move for instant in peer.instants}) == 1
+        else "at its instants"
+    )
     yield f"{found.topology}: {peer.name} in C99, {peer.identifier}_tick {every}\n"
     for what, names in (
         ("measures", [f"{peer.kind.states[i].name} [{peer.kind.states[i].unit}]" for i in peer.measured]),
         ("hears", [f"{sender.name} over {line.link}" for line in peer.lines for sender in line.senders]),
-        ("puts out", [f"{one.name} [N]" for one in peer.forces.values()]),
+        ("puts out", [f"{force.name} [N]" for force in peer.forces.values()]),
         ("sends", [f"{name} over {line.link}" for line in peer.sending for name in line.channels]),
-        ("moves itself", [one.name for i, one in enumerate(peer.kind.states) if i not in peer.outside]),
+        ("moves itself", [state.name for i, state in enumerate(peer.kind.states) if i not in peer.outside]),
     ):
         yield from notes(f"{what} {listed(names)}")
     yield ""
@@ -84,18 +88,22 @@ def code_document(found: Code) -> Plain:
     from apc.exports.c_text import source
 
     peer = found.code
-    starts = accumulate((peer.moves[one.move].quanta for one in peer.instants), initial=0)
+    starts = accumulate((peer.moves[instant.move].quanta for instant in peer.instants), initial=0)
     return {
         **picked(found, "topology", "method"),
         "peer": peer.name,
         "name": peer.identifier,
         "measured": [peer.kind.states[place].name for place in peer.measured],
         "heard": [
-            {"link": line.link, "from": [one.name for one in line.senders], "channels": list(line.channels)}
+            {
+                "link": line.link,
+                "from": [sender.name for sender in line.senders],
+                "channels": list(line.channels),
+            }
             for line in peer.lines
             if line.senders
         ],
-        "forces": [one.name for one in peer.forces.values()],
+        "forces": [force.name for force in peer.forces.values()],
         "sent": [picked(line, "link", "channels") for line in peer.sending],
         "instants_s": [float(start * peer.schedule.quantum) for start in [*starts][:-1]],
         "source": source(peer, f"{peer.identifier}.h"),
@@ -107,9 +115,11 @@ def unit_text(found: Unit) -> Lines:
     what = found.peer or counted(len(found.scene.peers), "peer")
     yield f"{found.system.name}: {what} for co-simulation, FMI 2.0\n"
     variables = found.scene.variables
-    fixed = [one.name for one in variables if one.role == "parameter"]
-    yield from _numbered("input", [one.name for one in variables if one.given])
-    yield from _numbered("output", [one.name for one in variables if one.role in ("output", "state")])
+    fixed = [variable.name for variable in variables if variable.role == "parameter"]
+    yield from _numbered("input", [variable.name for variable in variables if variable.given])
+    yield from _numbered(
+        "output", [variable.name for variable in variables if variable.role in ("output", "state")]
+    )
     if fixed:
         yield from _numbered("parameter", fixed)
     told = f"steps of {found.step * 1e3:.6g} ms show every tick of the fastest clock, values before the tick"
@@ -122,8 +132,12 @@ def unit_text(found: Unit) -> Lines:
 def unit_document(found: Unit) -> Plain:
     """Return an FMU as plain data."""
     variables = [
-        {**picked(one, "name", "unit"), "input": one.given, "parameter": one.role == "parameter"}
-        for one in found.scene.variables
+        {
+            **picked(variable, "name", "unit"),
+            "input": variable.given,
+            "parameter": variable.role == "parameter",
+        }
+        for variable in found.scene.variables
     ]
     return {
         "topology": found.system.name,

@@ -77,7 +77,7 @@ def record(value: Any, instead: Mapping[str, Any] | None = None) -> Plain:
     instead
         What is taken in the place of fields, or after them; `...` leaves a field out.
     """
-    shown = [one.name for one in fields(value) if one.repr]  # there are as many modes as states
+    shown = [field.name for field in fields(value) if field.repr]  # there are as many modes as states
     other = instead or {}
     kept = {name: other[name] if name in other else getattr(value, name) for name in [*shown, *other]}
     plain: Plain = document(kept)

@@ -99,15 +99,15 @@ def _places(boxes: Sequence[Box], edges: Sequence[Edge]) -> _Places:
         hands = [key for key in by_key if key in joined and by_key[key].role == "hand"]
         # A layer comes in any order: boxes keep that of the scene.
         layers = map(set, networkx.bfs_layers(graph, hands or [box.key]))
-        columns = [[one for one in boxes if one.key in layer] for layer in layers]
-        heights = [sum(_height(one) + BETWEEN for one in column) - BETWEEN for column in columns]
+        columns = [[box for box in boxes if box.key in layer] for layer in layers]
+        heights = [sum(_height(box) + BETWEEN for box in column) - BETWEEN for column in columns]
         left = 0.0
         for column, height in zip(columns, heights, strict=True):
-            width = max(_width(line, SIZE) for one in column for line in one.lines) + 2 * PAD
+            width = max(_width(line, SIZE) for box in column for line in box.lines) + 2 * PAD
             top = below + (max(heights) - height) / 2
-            for one in column:
-                found[one.key] = left, top, width, _height(one)
-                top += _height(one) + BETWEEN
+            for item in column:
+                found[item.key] = left, top, width, _height(item)
+                top += _height(item) + BETWEEN
             left += width + GAP
         below += max(heights) + 2 * BETWEEN
     return found
@@ -157,7 +157,7 @@ def _draw_peers(ax: Any, scene: Scene, link: SceneLink, colours: dict[str, str])
     else:
         graph = networkx.DiGraph(pair for pair in link.graph.arcs.tolist() if max(pair) < number)
         graph.add_nodes_from(range(number))
-    shells = [one for one in ([*range(star)], [*range(star, number)]) if one]
+    shells = [indices for indices in ([*range(star)], [*range(star, number)]) if indices]
     look = {"node_size": 40, "edge_color": FAINT, "width": 0.7, "with_labels": False}
     places = networkx.shell_layout(graph, shells)
     networkx.draw_networkx(graph, places, ax=ax, nodelist=range(number), node_color=fills, **look)

@@ -96,27 +96,27 @@ def _worst(found: PassiveHands, worst: PassiveMode) -> str:
     )
 
 
-def _mode(one: PassiveMode) -> tuple[str, ...]:
-    name = one.name + (f" × {one.multiplicity:,}" if one.multiplicity > 1 else "")
-    damping = "they differ" if one.damping is None else f"{one.damping:.6g} N*s/m"
-    verdict = {True: "passive", False: "not passive", None: "undecided"}[one.passive]
-    if one.more is None:
+def _mode(passive_mode: PassiveMode) -> tuple[str, ...]:
+    name = passive_mode.name + (f" × {passive_mode.multiplicity:,}" if passive_mode.multiplicity > 1 else "")
+    damping = "they differ" if passive_mode.damping is None else f"{passive_mode.damping:.6g} N*s/m"
+    verdict = {True: "passive", False: "not passive", None: "undecided"}[passive_mode.passive]
+    if passive_mode.more is None:
         needed, verdict = "none is enough", "not passive"
-    elif one.needed is None:
-        needed = f"{one.more:+.6g} N*s/m"
-    elif one.error is None or not np.isfinite(one.error):
-        needed = f"about {one.needed:.2g} N*s/m"
+    elif passive_mode.needed is None:
+        needed = f"{passive_mode.more:+.6g} N*s/m"
+    elif passive_mode.error is None or not np.isfinite(passive_mode.error):
+        needed = f"about {passive_mode.needed:.2g} N*s/m"
     else:
-        needed = f"{known_digits(one.needed, one.error, DIGITS)} N*s/m"
-    at = "" if one.frequency_hz is None else f"{one.frequency_hz:.5g} Hz"
-    size = abs(one.stiffness or 0.0)
-    stiffness = "" if one.stiffness is None else f"{size if size > 1e-6 else 0:.5g} N/m"
+        needed = f"{known_digits(passive_mode.needed, passive_mode.error, DIGITS)} N*s/m"
+    at = "" if passive_mode.frequency_hz is None else f"{passive_mode.frequency_hz:.5g} Hz"
+    size = abs(passive_mode.stiffness or 0.0)
+    stiffness = "" if passive_mode.stiffness is None else f"{size if size > 1e-6 else 0:.5g} N/m"
     return name, damping, needed, at, stiffness, verdict
 
 
 def passive_document(found: PassiveHands) -> Plain:
     """Return the same as plain data."""
-    modes = [{**document(one), "damping_needed": document(one.needed)} for one in found.modes]
+    modes = [{**document(mode), "damping_needed": document(mode.needed)} for mode in found.modes]
     return {"hands": "passive", **record(found, {"modes": modes})}
 
 
@@ -148,16 +148,16 @@ def feel_text(found: Feel) -> Lines:
     yield from sentences("; ".join(told))
     if found.hinf and found.stable is not False:
         yield "\n  Largest gain at any frequency (H∞), forces of any course:"
-        yield from table([_extreme(one) for one in found.hinf])
-    for one in found.h2:  # of a sample that is off by a mm, a µm is what a mm is of 1 N
+        yield from table([_extreme(extremes) for extremes in found.hinf])
+    for noise in found.h2:  # of a sample that is off by a mm, a µm is what a mm is of 1 N
         what, small = ("1 N rms of every hand", "m")
-        if one.source != "hands":
+        if noise.source != "hands":
             what, small = "1 mm rms of every device's samples", "µ"
         values = [
             f"{quantity} {measured(value * 1e3, off * 1e3, unit)}"
             for quantity, value, off, unit in (
-                ("copies apart", one.error_m, one.errors[0], f"{small}m"),
-                ("velocity", one.velocity_m_s, one.errors[1], f"{small}m/s"),
+                ("copies apart", noise.error_m, noise.errors[0], f"{small}m"),
+                ("velocity", noise.velocity_m_s, noise.errors[1], f"{small}m/s"),
             )
             if value is not None and off is not None
         ]
@@ -181,32 +181,32 @@ def _curves(found: Feel) -> list[tuple[NDArray[np.complex128], Floats, float, bo
 def _rows_shown(found: Feel) -> Iterator[tuple[str, ...]]:
     """Yield some lines of the table, the first and the last among them."""
     count = len(found.frequency_hz)
-    for place in sorted({round(one) for one in np.linspace(0, count - 1, min(SHOWN, count))}):
+    for place in sorted({round(value) for value in np.linspace(0, count - 1, min(SHOWN, count))}):
         sizes = [
             (float(abs(values[place]) * scale), bound[place]) for values, bound, scale, *_ in _curves(found)
         ]
-        size, arrives, apart = (known_digits(one, one * float(bound), DIGITS) for one, bound in sizes)
+        size, arrives, apart = (known_digits(value, value * float(bound), DIGITS) for value, bound in sizes)
         phase = f"{np.degrees(np.angle(found.impedance[place])):.2f}"
         others = (arrives if found.between else "", apart if found.copy else "")
         yield (f"{found.frequency_hz[place]:.5g}", size, phase, *others, f"{found.alias[place]:.1e}")
 
 
-def _extreme(one: Extremes) -> tuple[str, str]:
+def _extreme(extremes: Extremes) -> tuple[str, str]:
     """Return a norm and what it is of."""
-    peak = one.sampled_data
-    what, unit = ("velocity", "m/s/N") if one.of == "velocity" else ("copies apart", "m/N")
+    peak = extremes.sampled_data
+    what, unit = ("velocity", "m/s/N") if extremes.of == "velocity" else ("copies apart", "m/N")
     size = "without end: it drifts"
     if np.isfinite(peak.norm):
         norm = measured(peak.norm, peak.error + 1e-11 * peak.norm, unit)
         size = f"{norm} at {peak.frequency_hz:.5g} Hz"
-    return f"{one.mode}, {what}", size
+    return f"{extremes.mode}, {what}", size
 
 
 def feel_document(found: Feel) -> Plain:
     """Return the same as plain data, in SI; complex numbers as pairs."""
     instead = {
-        "hinf": {f"{one.mode} {one.of}": one for one in found.hinf},
-        "h2": {one.source: one for one in found.h2},
+        "hinf": {f"{extremes.mode} {extremes.of}": extremes for extremes in found.hinf},
+        "h2": {noise.source: noise for noise in found.h2},
     }
     return record(found, instead)
 

@@ -42,34 +42,35 @@ def run_comparison_text(found: RunComparison) -> Lines:
     yield from ticks_text(found.ticks)
     yield ""
     yield from _ways_text(found.ways)
-    for one in found.measured:
+    for measured in found.measured:
         yield ""
-        yield from _measured_text(one)
+        yield from _measured_text(measured)
 
 
 def ticks_text(ticks: Sequence[Ticks]) -> Lines:
     """Yield how late ticks were, a row a peer."""
     for what, shares in (("late by", "late"), ("took", "took")):
         rows: list[tuple[str, ...]] = [("instants", *HEADINGS, what)]
-        rows += [(f"{one.ticks:,}", *map(_ms, getattr(one, shares)), one.peer) for one in ticks]
+        rows += [(f"{tick.ticks:,}", *map(_ms, getattr(tick, shares)), tick.peer) for tick in ticks]
         yield from table(rows, ">>>>><")
-    for one in ticks:
-        said = [f"not given: {why}" for why in one.not_given]
-        said += [f"joined at {one.joined:.4g} s"] if one.joined else []
-        said += ["stopped before the end"] if one.stopped else []
+    for tick in ticks:
+        said = [f"not given: {why}" for why in tick.not_given]
+        said += [f"joined at {tick.joined:.4g} s"] if tick.joined else []
+        said += ["stopped before the end"] if tick.stopped else []
         said += [
-            f"{counted(count, 'datagram', ',')} dropped: {DROPPED[why]}" for why, count in one.dropped.items()
+            f"{counted(count, 'datagram', ',')} dropped: {DROPPED[why]}"
+            for why, count in tick.dropped.items()
         ]
         if said:
-            yield from notes(f"{one.peer}: {'; '.join(said)}")
+            yield from notes(f"{tick.peer}: {'; '.join(said)}")
 
 
 def _ways_text(ways: Iterable[WayRun]) -> Lines:
     rows = [("packets", "lost", "half within", "all within", "way")]
-    for one in ways:
-        came = one.came
+    for way in ways:
+        came = way.came
         middle = dict(came.quantiles).get(0.5, came.mean)
-        name = f"{one.link} {one.sender} to {one.receiver}: {one.trace}"
+        name = f"{way.link} {way.sender} to {way.receiver}: {way.trace}"
         rows.append((f"{came.packets:,}", f"{came.lost.count:,}", _ms(middle), _ms(came.longest), name))
     return table(rows, ">>>><")
 
@@ -78,12 +79,14 @@ def _ms(seconds: float) -> str:
     return f"{1e3 * seconds:.3f} ms"
 
 
-def _measured_text(one: Measured) -> Lines:
-    after = f"with {one.link} heard after {1e3 * one.delay:.6g} ms, as most of {one.way} was"
-    verdict = f"{one.analysis.verdict}, spectral radius {one.analysis.spectral_radius:.6f} per frame"
+def _measured_text(measured: Measured) -> Lines:
+    after = f"with {measured.link} heard after {1e3 * measured.delay:.6g} ms, as most of {measured.way} was"
+    verdict = (
+        f"{measured.analysis.verdict}, spectral radius {measured.analysis.spectral_radius:.6f} per frame"
+    )
     judged = "not judged packet by packet, of which there are many: the link's trace: FILE asks for that"
-    if one.network is not None:
-        judged = f"and with every packet of that way as it came: {one.network.verdict}"
+    if measured.network is not None:
+        judged = f"and with every packet of that way as it came: {measured.network.verdict}"
     return notes(f"analyze says, {after}: {verdict}", judged)
 
 
@@ -91,11 +94,11 @@ def run_comparison_document(found: RunComparison) -> dict[str, Any]:
     """Return a run beside its scene as plain data; times in seconds."""
     measured = [
         {
-            **record(one, {"analysis": ..., "network": one.network and one.network.verdict}),
-            "verdict": one.analysis.verdict,
-            "spectral_radius": one.analysis.spectral_radius,
+            **record(measured, {"analysis": ..., "network": measured.network and measured.network.verdict}),
+            "verdict": measured.analysis.verdict,
+            "spectral_radius": measured.analysis.spectral_radius,
         }
-        for one in found.measured
+        for measured in found.measured
     ]
-    ways = [record(one, {"came": recording_document(one.came)}) for one in found.ways]
+    ways = [record(way, {"came": recording_document(way.came)}) for way in found.ways]
     return record(found, {"ways": ways, "measured": measured})

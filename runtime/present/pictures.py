@@ -163,7 +163,7 @@ def table_of(found: Result) -> pandas.DataFrame:
     `NAME_rows` in the result's module gives its columns, its rows, and what a file says of how it was made.
     """
     columns, rows, _ = found._shown("rows")
-    return need("pandas", "data").DataFrame(list(rows), columns=[one.heading for one in columns])
+    return need("pandas", "data").DataFrame(list(rows), columns=[column.heading for column in columns])
 
 
 def html_of(found: Any) -> str:

@@ -50,7 +50,7 @@ class Arrays(Writer):
     def __init__(self, path: Path, columns: Sequence[Column], about: tuple[str, str]) -> None:
         super().__init__(path, columns, about)
         self.blocks: list[Floats] = []
-        longest = max(len(one.name) + len(one.unit) for one in columns)
+        longest = max(len(column.name) + len(column.unit) for column in columns)
         self.end = ENDS + 2 * LABEL * len(columns) + LETTER * (2 * longest * len(columns) + len(about[1]))
 
     def write(self, cells: Sequence[Any], count: int) -> None:
@@ -62,7 +62,7 @@ class Arrays(Writer):
     def finish(self) -> None:
         """Write all variables."""
         time, values = np.hsplit(np.concatenate(self.blocks), [1])
-        names, units = ([getattr(one, which) for one in self.columns[1:]] for which in ("name", "unit"))
+        names, units = ([getattr(column, which) for column in self.columns[1:]] for which in ("name", "unit"))
         self.save(
             {"time": time, "values": values, "names": names, "units": units, self.about[0]: self.about[1]}
         )
@@ -116,7 +116,7 @@ class Recording:
         self._until = 0.0  # seconds, the last row's time
         self._files: dict[Path, str] = {}  # temporary, and what its name adds to that of the file
         about = provenance_json(provenance_of(simulation))
-        columns = [Column("time", "s"), *(Column(one.name, one.unit) for one in simulation.signals)]
+        columns = [Column("time", "s"), *(Column(signal.name, signal.unit) for signal in simulation.signals)]
         try:
             make = FORMATS[check_suffix(path, SUFFIXES, "--out")]
             self._writer = make(self._temporary(""), columns, (PROVENANCE, about))

@@ -34,8 +34,8 @@ MOST_CURVES = 12
 def region_text(found: Region) -> Lines:
     """Yield what `apc region` prints of one region."""
     axes = [
-        (letter, one.free.label, span(float(one.low), float(one.high), one.unit))
-        for letter, one in (("x", found.x), ("y", found.y))
+        (letter, interval.free.label, span(float(interval.low), float(interval.high), interval.unit))
+        for letter, interval in (("x", found.x), ("y", found.y))
     ]
     off, percent = found.stable_area_error, 100 / float(found.rectangle.width.prod())
     share = known_digits(percent * found.stable_area, percent * off, 4)
@@ -53,7 +53,7 @@ def region_text(found: Region) -> Lines:
         if left > 0:
             yield f"  and {left} more (--json lists all)"
     if coarse := found.coarse:
-        most, many = max(one.error for one in coarse), counted(len(coarse), "curve")
+        most, many = max(curve.error for curve in coarse), counted(len(coarse), "curve")
         yield ""
         yield from sentences(
             f"{many} could not be followed to {found.tolerance:.0e} of a coordinate, but to {most:.0e}"
@@ -79,7 +79,7 @@ def _words(found: Region) -> str:
 
 
 def _row(found: Region, curve: Curve) -> tuple[str, ...]:
-    low, high = (f"{one:.4g}" for one in curve.frequency_hz)
+    low, high = (f"{value:.4g}" for value in curve.frequency_hz)
     frequency = "–" if low == "nan" else low if low == high else f"{low} to {high}"
     end = "closed" if curve.closed else _point(found, curve, -1)
     return f"{curve.mode:.11}", frequency, _point(found, curve, 0), end, f"{curve.error:.0e}"
@@ -89,7 +89,7 @@ def _point(found: Region, curve: Curve, place: int) -> str:
     """Return a point of a curve in the units of the axes; its error is relative to each coordinate."""
     by = [float(as_shown(float(axis.high), axis.unit)[0]) for axis in (found.x, found.y)]
     return "({}, {})".format(
-        *(known_digits(one, curve.error * abs(one), 6) for one in curve.points[place] * by)
+        *(known_digits(point, curve.error * abs(point), 6) for point in curve.points[place] * by)
     )
 
 
@@ -101,7 +101,7 @@ def region_document(found: Region) -> Plain:
         **picked(found, *names),
         "x": range_document(found.x),
         "y": range_document(found.y),
-        "coarse": [number for number, one in enumerate(found.curves) if one in found.coarse],
+        "coarse": [number for number, curve in enumerate(found.curves) if curve in found.coarse],
         "boundary": [{**picked(curve, *each), "stable_side": "left"} for curve in found.curves],
         "area_unit": _product(found.x.unit, found.y.unit),
         "finest_cell": found.finest,
@@ -131,15 +131,15 @@ def panels_document(found: Panels) -> Plain:
     """Return what `apc region --json` prints: the region itself if it is alone, else the panels."""
     if found.alone is not None:
         return found.alone.to_dict()
-    return {"normalized": found.normalized, "panels": [_panel_document(one) for one in found.panels]}
+    return {"normalized": found.normalized, "panels": [_panel_document(panel) for panel in found.panels]}
 
 
 def _panel_document(panel: Panel) -> Plain:
     return {
         "panel": panel.title,
         "regions": [
-            {**one.to_dict(), "y_multiplied_by": gain}
-            for one, gain in zip(panel.regions, panel.gains, strict=True)
+            {**region.to_dict(), "y_multiplied_by": gain}
+            for region, gain in zip(panel.regions, panel.gains, strict=True)
         ],
         "overlays": [{"label": label, "points": points.tolist()} for label, points in panel.overlays],
     }
@@ -147,13 +147,13 @@ def _panel_document(panel: Panel) -> Plain:
 
 def panels_rows(found: Panels) -> Tabled:
     """Return the columns of a table of boundary points, a row a point, and how they were made."""
-    regions = [(one, panel.title) for panel in found.panels for one in panel.regions]
+    regions = [(region, panel.title) for panel in found.panels for region in panel.regions]
     made = {
-        "axes": [range_document(one) for one in (regions[0][0].x, regions[0][0].y)],
-        "left_out": {one.topology: list(one.left_out) for one, _ in regions},
-        "origin": {one.topology: dict(one.system.origin.digests) for one, _ in regions},
+        "axes": [range_document(interval) for interval in (regions[0][0].x, regions[0][0].y)],
+        "left_out": {region.topology: list(region.left_out) for region, _ in regions},
+        "origin": {region.topology: dict(region.system.origin.digests) for region, _ in regions},
     }
-    rows = (row for one, title in regions for row in _rows(one, title))
+    rows = (row for region, title in regions for row in _rows(region, title))
     return _columns(regions[0][0]), rows, made
 
 
@@ -164,7 +164,10 @@ def region_rows(found: Region) -> Tabled:
 
 def _columns(found: Region) -> list[Column]:
     """Return the columns of a table of boundary points."""
-    x, y = (Column(one.free.label, "" if one.unit == "1" else one.unit) for one in (found.x, found.y))
+    x, y = (
+        Column(interval.free.label, "" if interval.unit == "1" else interval.unit)
+        for interval in (found.x, found.y)
+    )
     words = (Column("panel", kind="text"), Column("topology", kind="text"))
     curve = (Column("curve", kind="count"), Column("mode", kind="text"))
     return [*words, *curve, x, y, Column("error")]

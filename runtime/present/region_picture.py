@@ -104,7 +104,9 @@ def draw_panel(ax: Any, title: str, panel: Panel) -> None:
     ax.set(xlim=(float(x.low), float(x.high)), ylim=(float(y.low) * gains[0], float(y.high) * gains[0]))
     ax.set(xlabel=axis_label(x.free.label, x.unit), ylabel=axis_label(y.free.label, y.unit))
     ax.tick_params(direction="in", top=True, right=True)
-    meant = [MEANT[one.criterion].removesuffix(" as it is") for one in regions if one.criterion in MEANT]
+    meant = [
+        MEANT[region.criterion].removesuffix(" as it is") for region in regions if region.criterion in MEANT
+    ]
     said = []
     drawn: list[tuple[str, Floats]] = []
     for place, (region, gain) in enumerate(zip(regions, gains, strict=True)):
@@ -123,8 +125,8 @@ def draw_panel(ax: Any, title: str, panel: Panel) -> None:
             said.append(f"{label}: no boundary here")
         line = OVERLAY_LINES[place % len(OVERLAY_LINES)]
         ax.plot(*np.reshape(points, (-1, 2)).T, color="0.35", linestyle=line, linewidth=1.1, label=label)
-    hatched = [STABLE] if any(one.corner or one.curves for one in regions) else []
-    left_out = [note for one in regions for note in one.left_out]
+    hatched = [STABLE] if any(region.corner or region.curves for region in regions) else []
+    left_out = [note for region in regions for note in region.left_out]
     texts = dict.fromkeys([title, *meant, *said, *hatched, *left_out])
     ax.set_title("\n".join(line for text in texts for line in textwrap.wrap(text, 48)), fontsize=8.5)
 
@@ -135,7 +137,8 @@ def _draw(ax: Any, found: Region, gain: int, place: int, curves: Sequence[Floats
     patches = need("matplotlib.patches", "plot")
     colour = COLOURS[place % len(COLOURS)]
     outlines = [
-        path(np.concatenate([one, one[:1]]) * [1, gain], closed=True) for one in stable_outlines(found)
+        path(np.concatenate([values, values[:1]]) * [1, gain], closed=True)
+        for values in stable_outlines(found)
     ]
     if outlines:
         look = {"facecolor": "none", "edgecolor": colour, "alpha": HATCH, "linewidth": 0}
@@ -158,7 +161,9 @@ def _are_one(these: Floats, those: Floats) -> bool:
     """Return whether two sets of points nowhere differ by more than `SAME`."""
     from scipy.spatial import cKDTree
 
-    return all(cKDTree(one).query(other)[0].max() <= SAME for one, other in ((these, those), (those, these)))
+    return all(
+        cKDTree(values).query(other)[0].max() <= SAME for values, other in ((these, those), (those, these))
+    )
 
 
 def drawn_points(found: Region, number: int) -> Floats:
@@ -179,11 +184,11 @@ def stable_outlines(found: Region) -> list[Floats]:
     """
     rectangle = found.rectangle
     curves = [rectangle.points(drawn_points(found, number)) for number in range(len(found.curves))]
-    rings = [np.concatenate([one, _along_edge(one[-1], one[0])]) for one in curves]
-    wound = sum(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2 for x, y in (one.T for one in rings))
+    rings = [np.concatenate([curve, _along_edge(curve[-1], curve[0])]) for curve in curves]
+    wound = sum(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2 for x, y in (ring.T for ring in rings))
     turns = round(wound - found.stable_area / float(rectangle.width.prod()))
     rings += [CORNERS[::-1] if turns > 0 else CORNERS] * abs(turns)
-    return [rectangle.values(one) for one in rings]
+    return [rectangle.values(ring) for ring in rings]
 
 
 def _along_edge(end: Floats, start: Floats) -> Floats:

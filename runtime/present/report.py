@@ -52,40 +52,40 @@ _KEPT = re.compile(r'<script type="application/json" id="apc-report">(.*?)</scri
 
 def report_text(found: Report) -> Lines:
     """Yield what is printed of a report: a line a section, and why those are empty that are."""
-    for one in found.scenes:
-        if one is not found.scenes[0]:
+    for scene in found.scenes:
+        if scene is not found.scenes[0]:
             yield ""
-        yield one.name
-        for section in one.sections:
+        yield scene.name
+        for section in scene.sections:
             yield from notes(f"{TITLES[section.key]}: {section.refused or f'as {section.command}'}")
 
 
 def report_document(found: Report) -> Plain:
     """Return a report as plain data: what is needed to compute it again, and all of its tables."""
     scenes = [
-        record(one, {"path": ..., "file": one.path.name, "sections": [*map(_kept, one.sections)]})
-        for one in found.scenes
+        record(scene, {"path": ..., "file": scene.path.name, "sections": [*map(_kept, scene.sections)]})
+        for scene in found.scenes
     ]
     return {"apc_report": 2, "versions": dict(found.versions), "scenes": scenes}
 
 
 def _kept(section: Section) -> Plain:
     """Return a section as plain data: of its results what is the same wherever it is computed anew."""
-    results = [_comparable(one.to_dict()) for one in section.results]
+    results = [_comparable(result.to_dict()) for result in section.results]
     return record(section, {"drawn": ..., "results": results})
 
 
 def _comparable(data: Any) -> Any:
     """Return plain data without what is told by `UNLIKE`, and without modes that are not told from zero."""
     if isinstance(data, dict):
-        return {key: _comparable(one) for key, one in data.items() if key not in UNLIKE}
-    return [_comparable(one) for one in data if not _is_dead(one)] if isinstance(data, list) else data
+        return {key: _comparable(item) for key, item in data.items() if key not in UNLIKE}
+    return [_comparable(item) for item in data if not _is_dead(item)] if isinstance(data, list) else data
 
 
-def _is_dead(one: Any) -> bool:
+def _is_dead(item: Any) -> bool:
     """Say whether plain data are of a mode that is not told from zero."""
-    mode = isinstance(one, dict) and "magnitude" in one
-    return mode and (one["error"] is None or one["magnitude"] <= one["error"])
+    mode = isinstance(item, dict) and "magnitude" in item
+    return mode and (item["error"] is None or item["magnitude"] <= item["error"])
 
 
 @part("page")
@@ -111,7 +111,7 @@ def check_report_path(path: Path) -> None:
 
 
 def _browser(path: Path) -> str:
-    found = next((one for name in BROWSERS if (one := shutil.which(name))), None)
+    found = next((text for name in BROWSERS if (text := shutil.which(name))), None)
     if found is None:
         hint = f"--out {path.with_suffix('.html')}, or install it, as by: apt install chromium"
         raise missing("Chromium is not installed, which prints a .pdf", hint)

@@ -89,11 +89,11 @@ def buzz_text(found: Buzz) -> Lines:
         ("frequency", in_hertz(known.frequency_hz) if known else "–", played),
     ]
     share = f"{known.in_contact:.1%}" if known else "–"
-    for one in found.contacts:
-        depth = "–" if one.predicted_depth_m is None else f"{one.predicted_depth_m * 1e3:.4g} mm"
+    for contact in found.contacts:
+        depth = "–" if contact.predicted_depth_m is None else f"{contact.predicted_depth_m * 1e3:.4g} mm"
         rows += [
-            (f"{one.name}: depth", depth, settles or f"{one.depth_m * 1e3:.4g} mm"),
-            (f"{one.name}: in contact", share, f"{one.in_contact:.1%}"),
+            (f"{contact.name}: depth", depth, settles or f"{contact.depth_m * 1e3:.4g} mm"),
+            (f"{contact.name}: in contact", share, f"{contact.in_contact:.1%}"),
         ]
     played_s = f"predicted beside {found.played_s:g} s played"
     yield from wrapped(f"{found.topology}: the buzz of its contacts, {played_s}")
@@ -105,7 +105,7 @@ def buzz_text(found: Buzz) -> Lines:
 def played_text(found: Played) -> Lines:
     """Yield what `apc simulate` prints: the summary, the method if it is not exact, the error if known."""
     summary = found.summary
-    units = {one.name: one.unit for one in summary.extents}
+    units = {extent.name: extent.unit for extent in summary.extents}
     swing = ""
     if summary.swing:
         name, size, rate = summary.swing
@@ -137,8 +137,8 @@ def _quantity(value: float, unit: str) -> str:
 def _method(provenance: Provenance) -> str:
     """Return the method with its tolerances, of each unit the smallest."""
     smallest: dict[str, float] = {}
-    for one in provenance.tolerances:
-        smallest[one.unit] = min(smallest.get(one.unit, one.absolute), one.absolute)
+    for tolerance in provenance.tolerances:
+        smallest[tolerance.unit] = min(smallest.get(tolerance.unit, tolerance.absolute), tolerance.absolute)
     absolute = ", ".join(f"{value:.1g} {unit}" for unit, value in smallest.items())
     return provenance.method + (f"; absolute tolerances from {absolute}" if absolute else "")
 
@@ -174,7 +174,9 @@ def played_document(found: Played) -> Plain:
         "work_J": dict(summary.work),
         "rows": summary.rows,
         "end_s": summary.end,
-        "signals": [record(one, {"settled": ..., "settled_s": one.settled}) for one in summary.extents],
+        "signals": [
+            record(extent, {"settled": ..., "settled_s": extent.settled}) for extent in summary.extents
+        ],
         "error_estimate": None if found.error is None else _error_document(found.error),
         "provenance": provenance_document(found.provenance),
     }
@@ -182,7 +184,8 @@ def played_document(found: Played) -> Plain:
 
 def _error_document(found: ErrorEstimate) -> Plain:
     signals = [
-        record(one, {"at": ..., "span": ..., "time_s": one.at, "range": one.span}) for one in found.signals
+        record(signal, {"at": ..., "span": ..., "time_s": signal.at, "range": signal.span})
+        for signal in found.signals
     ]
     return {"kind": found.kind, "compared_with": found.compared, "signals": signals}
 
@@ -192,7 +195,7 @@ def provenance_document(found: Provenance) -> Plain:
     instead = {
         "texts": ...,
         "sha256": found.texts,
-        "tolerances": {one.state: record(one, {"state": ...}) for one in found.tolerances},
+        "tolerances": {tolerance.state: record(tolerance, {"state": ...}) for tolerance in found.tolerances},
         "parameters": {name: {"value": value, "unit": unit} for name, value, unit in found.parameters},
         "timings": ...,
         "timings_s": dict(found.timings),
@@ -250,11 +253,11 @@ def played_picture(trajectory: Trajectory, ax: Any = None) -> Any:
     heights = [1.0] * len(panels) + [PATHS] * bool(paths)
     figure = new_figure((WIDTH, HEIGHT * sum(heights) + 0.6))
     axes = figure.subplots(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
-    for one, (unit, places) in zip(axes, panels.items(), strict=False):
-        _panel(one, trajectory, unit, places)
-        if one is not axes[0]:
-            one.sharex(axes[0])
-        one.tick_params(labelbottom=one is axes[len(panels) - 1])
+    for axis, (unit, places) in zip(axes, panels.items(), strict=False):
+        _panel(axis, trajectory, unit, places)
+        if axis is not axes[0]:
+            axis.sharex(axes[0])
+        axis.tick_params(labelbottom=axis is axes[len(panels) - 1])
     axes[len(panels) - 1].set_xlabel("time [s]")
     if paths:
         _draw_paths(axes[-1], trajectory, paths)
@@ -265,14 +268,14 @@ def played_picture(trajectory: Trajectory, ax: Any = None) -> Any:
 def _panels(signals: Sequence[Signal]) -> dict[str, list[int]]:
     """Return the signals' places by unit: first the known quantities, then the others as they come."""
     found: dict[str, list[int]] = {}
-    for place, one in enumerate(signals):
-        found.setdefault(one.unit, []).append(place)
+    for place, signal in enumerate(signals):
+        found.setdefault(signal.unit, []).append(place)
     return {unit: found[unit] for unit in dict.fromkeys([*QUANTITIES, *found]) if unit in found}
 
 
 def paths_of(signals: Sequence[Signal]) -> list[tuple[int, int]]:
     """Return which signals are the first two coordinates of one position."""
-    places = {one.name: place for place, one in enumerate(signals) if one.unit == "m"}
+    places = {signal.name: place for place, signal in enumerate(signals) if signal.unit == "m"}
     pairs = [
         (place, entry(whole_and_index(name)[0], 2)) for name, place in places.items() if name.endswith("[1]")
     ]
@@ -282,11 +285,11 @@ def paths_of(signals: Sequence[Signal]) -> list[tuple[int, int]]:
 def _draw_paths(ax: Any, trajectory: Trajectory, paths: Sequence[tuple[int, int]]) -> None:
     """Draw the paths of positions in their plane, each from its start, a dot."""
     signals, values = trajectory.signals, 1e3 * trajectory.values
-    for one, two in paths[:MOST_CURVES]:
-        colour, dashes = _style(signals, [first for first, _ in paths], one)
-        label, _ = whole_and_index(signals[one].name)
-        ax.plot(values[:, one], values[:, two], color=colour, linestyle=dashes, linewidth=1.0, label=label)
-        ax.plot(values[:1, one], values[:1, two], "o", color=colour, markersize=4)
+    for number, two in paths[:MOST_CURVES]:
+        colour, dashes = _style(signals, [first for first, _ in paths], number)
+        label, _ = whole_and_index(signals[number].name)
+        ax.plot(values[:, number], values[:, two], color=colour, linestyle=dashes, linewidth=1.0, label=label)
+        ax.plot(values[:1, number], values[:1, two], "o", color=colour, markersize=4)
     ax.set_aspect("equal", adjustable="datalim")
     ax.set(xlabel="x[1] [mm]", ylabel="path: x[2] [mm]")
     _finish(ax, len(paths))
@@ -298,11 +301,11 @@ def _panel(ax: Any, trajectory: Trajectory, unit: str, places: Sequence[int]) ->
     many = _are_many(signals)
     curves = _by_group(signals, places) if many else _identical(values, places)
     for columns in curves[:MOST_CURVES]:
-        one = signals[columns[0]]
+        signal = signals[columns[0]]
         names = ", ".join(signals[place].name for place in columns)
         label = f"{names}: identical" if len(columns) > 1 else names
         if many:
-            label = f"{one.group}.{one.local}: {counted(len(columns), 'peer')}"
+            label = f"{signal.group}.{signal.local}: {counted(len(columns), 'peer')}"
         colour, dashes = _style(signals, places, columns[0])
         look = {"color": colour, "linestyle": dashes, "linewidth": 0.4 if many else 1.0}
         first, *_ = ax.plot(trajectory.time, values[:, columns if many else columns[:1]], **look)
@@ -314,7 +317,7 @@ def _panel(ax: Any, trajectory: Trajectory, unit: str, places: Sequence[int]) ->
 
 def _are_many(signals: Sequence[Signal]) -> bool:
     """Return whether there are more peers than colours that are told apart at a glance."""
-    return len({(one.group, one.peer) for one in signals}) > MOST_COLOURS
+    return len({(signal.group, signal.peer) for signal in signals}) > MOST_COLOURS
 
 
 def _identical(values: Floats, places: Sequence[int]) -> list[list[int]]:
@@ -322,7 +325,7 @@ def _identical(values: Floats, places: Sequence[int]) -> list[list[int]]:
     found: list[list[int]] = []
     off = ROUNDING * float(np.ptp(values[:, places]))
     for place in places:
-        same = (one for one in found if np.abs(values[:, place] - values[:, one[0]]).max() <= off)
+        same = (numbers for numbers in found if np.abs(values[:, place] - values[:, numbers[0]]).max() <= off)
         if (curve := next(same, None)) is None:
             found.append(curve := [])
         curve.append(place)
@@ -340,11 +343,11 @@ def _by_group(signals: Sequence[Signal], places: Sequence[int]) -> list[list[int
 def _style(signals: Sequence[Signal], places: Sequence[int], place: int) -> tuple[Any, Any]:
     """Return a signal's colour, its peer's or where these are many its group's, and its dashes in a panel."""
     many = _are_many(signals)
-    owners = list(dict.fromkeys((one.group, 0 if many else one.peer) for one in signals))
+    owners = list(dict.fromkeys((signal.group, 0 if many else signal.peer) for signal in signals))
     quantities = list(dict.fromkeys(signals[other].local for other in places))
-    one = signals[place]
-    colour = colours_of(len(owners))[owners.index((one.group, 0 if many else one.peer))]
-    return colour, DASHES[quantities.index(one.local) % len(DASHES)]
+    signal = signals[place]
+    colour = colours_of(len(owners))[owners.index((signal.group, 0 if many else signal.peer))]
+    return colour, DASHES[quantities.index(signal.local) % len(DASHES)]
 
 
 def _finish(ax: Any, curves: int) -> None:
@@ -379,10 +382,17 @@ def ensemble_text(ensemble: Ensemble) -> Lines:
     yield ""
     rows: list[tuple[str, ...]] = [("", "mean", "± error", "5 %", "median", "95 %", "most")]
     for name, label in LABELS.items():
-        one = ensemble.statistics(name)
-        if one is not None:
-            error = f"± {one.standard_error:.1g}" if one.count > 1 else ""
-            rows.append((label, f"{one.mean:.3g}", error, *(f"{v:.3g}" for v in (*one.quantiles, one.high))))
+        statistics = ensemble.statistics(name)
+        if statistics is not None:
+            error = f"± {statistics.standard_error:.1g}" if statistics.count > 1 else ""
+            rows.append(
+                (
+                    label,
+                    f"{statistics.mean:.3g}",
+                    error,
+                    *(f"{v:.3g}" for v in (*statistics.quantiles, statistics.high)),
+                )
+            )
     yield from table(rows, "<>>>>>>")
     settled = ensemble.statistics("settled")
     if settled is not None and settled.count < n:
@@ -431,10 +441,12 @@ def ensemble_document(found: Ensemble) -> Plain:
         "verdicts": shares,
     }
     for name in LABELS:
-        instead[name] = one = found.statistics(name)
-        if one is not None:
-            quantiles = dict(zip(map(str, QUANTILES), one.quantiles, strict=True))
-            instead[name] = record(one, {"count": ..., "runs": one.count, "quantiles": quantiles})
+        instead[name] = statistics = found.statistics(name)
+        if statistics is not None:
+            quantiles = dict(zip(map(str, QUANTILES), statistics.quantiles, strict=True))
+            instead[name] = record(
+                statistics, {"count": ..., "runs": statistics.count, "quantiles": quantiles}
+            )
     return record(found, instead)
 
 
@@ -444,10 +456,10 @@ def _facts(found: Played, units: Mapping[str, str]) -> Iterator[tuple[str, str]]
     if summary.largest_force and (summary.largest_force[1] or summary.verdict != "rests"):
         name, size, at = summary.largest_force
         yield "largest force", f"{_quantity(size, 'N')}, {name} at {_quantity(at, 's')}"
-    for one in summary.broken[:MOST_LIMITS]:
-        most, beyond = (_quantity(value, one.unit) for value in (one.most, one.most - one.value))
-        when = f"{one.signal} from {_quantity(one.first_s, 's')} on: at most {most} at"
-        yield "beyond limit", f"{when} {_quantity(one.at_s, 's')}, beyond {one.limit} by {beyond}"
+    for broken in summary.broken[:MOST_LIMITS]:
+        most, beyond = (_quantity(value, broken.unit) for value in (broken.most, broken.most - broken.value))
+        when = f"{broken.signal} from {_quantity(broken.first_s, 's')} on: at most {most} at"
+        yield "beyond limit", f"{when} {_quantity(broken.at_s, 's')}, beyond {broken.limit} by {beyond}"
     if len(summary.broken) > MOST_LIMITS:
         yield "beyond limit", f"and {len(summary.broken) - MOST_LIMITS} more"
     if summary.overshoot:
@@ -456,8 +468,8 @@ def _facts(found: Played, units: Mapping[str, str]) -> Iterator[tuple[str, str]]
         if distance or summary.verdict != "rests":
             unit = next(unit for signal, unit in units.items() if signal.endswith(f".{name}"))
             yield "copies", f"{name} differs by {_quantity(distance, unit)} between peers at the end"
-    if any(one for _, one in summary.work):
-        done = ", ".join(f"{part} {_quantity(one, 'J')}" for part, one in summary.work)
+    if any(value for _, value in summary.work):
+        done = ", ".join(f"{part} {_quantity(value, 'J')}" for part, value in summary.work)
         yield "work put in", f"{done} by held forces"
     yield "recorded", f"{summary.rows} rows of {summary.signals} signals until {summary.end:g} s"
     if found.provenance.method != EXACT:

@@ -76,7 +76,7 @@ def draw_actors(system: CompiledSystem) -> tuple[Any, list[Actor]]:
     for row, (ax, view) in enumerate(zip(axes, views, strict=True)):
         for surface in view.surfaces:
             _draw_surface(ax, surface, row, view.bodies)
-        bodies = sorted(view.bodies, key=lambda one: -one.radius)
+        bodies = sorted(view.bodies, key=lambda body: -body.radius)
         for place, body in enumerate(bodies):
             size = max(LARGEST - 2 * place, 7)  # what is covered is seen around what covers it
             actors.append(_actor(ax, view.name, body, row, colours[body.name], size))
@@ -134,7 +134,7 @@ def _actor(ax: Any, peer: str, body: Body, row: int, colour: Any, size: int) -> 
         corner, sides = (-half, -HALF), (2 * half, 2 * HALF)
         shape = patches.Rectangle(corner, *sides, **look) if flat else patches.Circle((0, 0), half, **look)
         artists.append(ax.add_patch(shape))
-    turning = tuple(f"{peer}.{one}" for one in body.turning if not flat)
+    turning = tuple(f"{peer}.{text}" for text in body.turning if not flat)
     if turning:
         bar = {"markersize": BAR, "markeredgewidth": 3, "transform": shift + ax.transData, "zorder": 1.5}
         artists += ax.plot(0, 0, color=colour, marker=_bar(body.angle), **bar)

@@ -50,12 +50,12 @@ def tuning_text(found: Tuning) -> Lines:
     rows = [("gain", "value", "before rounding", "chosen from")]
     rows += [
         (
-            one.parameter,
-            quantity(float(one.value), one.unit, TYPED),
-            quantity(one.best, one.unit),
-            span(one.low, one.high, one.unit),
+            gain.parameter,
+            quantity(float(gain.value), gain.unit, TYPED),
+            quantity(gain.best, gain.unit),
+            span(gain.low, gain.high, gain.unit),
         )
-        for one in found.gains
+        for gain in found.gains
     ]
     yield from table(rows)
     if found.met or found.proofs:
@@ -72,9 +72,9 @@ def tuning_text(found: Tuning) -> Lines:
     yield from _proof_lines(found)
     if found.binding:
         yield "\n  what binds" if found.met else "\n  what is in the way"
-        for one in found.binding:
-            yield from _binding_lines(found, one)
-    elif any(one.parameter == found.aim and one.value in (one.low, one.high) for one in found.gains):
+        for binding in found.binding:
+            yield from _binding_lines(found, binding)
+    elif any(gain.parameter == found.aim and gain.value in (gain.low, gain.high) for gain in found.gains):
         yield f"\n  nothing binds {found.aim} but the end of its range"
 
 
@@ -84,7 +84,7 @@ def _sentence(found: Tuning) -> str:
     if found.decay != 1:
         stable = f"motions die out by {-20 * math.log10(found.decay):.6g} dB a second"
     stable += " and what is felt is as asked" if found.felt else ""
-    over = f" for {enumerated([range_text(one) for one in found.over])}" if found.over else ""
+    over = f" for {enumerated([range_text(interval) for interval in found.over])}" if found.over else ""
     if not found.met:
         return f"{found.topology}: no gains were found in these ranges with which {stable}{over}"
     proved = "proved" if found.proved else "not proved"
@@ -101,7 +101,7 @@ def _sentence(found: Tuning) -> str:
 
 def _is_felt(found: Tuning) -> bool:
     """Say whether the aim is what is felt, or a weighted sum."""
-    return found.aim not in (RADIUS, SETTLING, *(one.parameter for one in found.gains))
+    return found.aim not in (RADIUS, SETTLING, *(gain.parameter for gain in found.gains))
 
 
 def _margin(found: Tuning) -> str:
@@ -121,36 +121,38 @@ def _radius(found: Tuning) -> str:
 
 def _proof_lines(found: Tuning) -> Lines:
     """Yield what was proved, and of what it was not."""
-    proved = [one for one in found.proofs if one.proof.stable]
-    cells = sum(one.proof.cells for one in proved)
+    proved = [proof for proof in found.proofs if proof.proof.stable]
+    cells = sum(item.proof.cells for item in proved)
     if proved:
         told = counted(cells, "cell" if found.over else "analysis", ",d").replace("analysiss", "analyses")
         many = f"for each of {len(proved)} numbers of peers, " if proved[0].counts else ""
         yield from labelled(("proved", f"{many}{proved[0].proof.verdict} ({told})"))
     left: dict[str, list[str]] = {}
-    for one in found.proofs:
-        if not one.proof.stable:
-            open_share = 100 * one.proof.open_share
+    for proof in found.proofs:
+        if not proof.proof.stable:
+            open_share = 100 * proof.proof.open_share
             share = [f"{open_share:.3g} % of the box is left open"] if open_share else []
-            open_verdict = [] if one.proof.notes else [one.proof.verdict]
-            said = ", ".join([*open_verdict, *share, *one.proof.notes])
-            left.setdefault(said, []).append(", ".join(f"{label} {number}" for label, number in one.counts))
+            open_verdict = [] if proof.proof.notes else [proof.proof.verdict]
+            said = ", ".join([*open_verdict, *share, *proof.proof.notes])
+            left.setdefault(said, []).append(", ".join(f"{label} {number}" for label, number in proof.counts))
     for said, where in left.items():
         yield from labelled(("not proved", "; ".join(filter(None, [", ".join(filter(None, where)), said]))))
     if found.met and not found.proofs:
         yield from labelled(("not proved", "the time was up before any proof"))
 
 
-def _where(one: Binding) -> str:
-    return ", ".join(f"{label} {quantity(value, unit)}" for label, value, unit in one.where)
+def _where(binding: Binding) -> str:
+    return ", ".join(f"{label} {quantity(value, unit)}" for label, value, unit in binding.where)
 
 
-def _binding_lines(found: Tuning, one: Binding) -> Lines:
+def _binding_lines(found: Tuning, binding: Binding) -> Lines:
     other = "what is felt" if found.felt else found.aim if _is_felt(found) else "stability"
-    mode = f"{one.shape} mode" if one.shape else "" if math.isnan(one.frequency_hz) else other
-    mode += f" at {in_hertz(one.frequency_hz)}" if mode else ""
-    yield from wrapped(": ".join(filter(None, [_where(one), mode])) or other, "    ", "      ")
-    for label, value, unit, better in one.buys if found.met and found.aim not in (RADIUS, SETTLING) else ():
+    mode = f"{binding.shape} mode" if binding.shape else "" if math.isnan(binding.frequency_hz) else other
+    mode += f" at {in_hertz(binding.frequency_hz)}" if mode else ""
+    yield from wrapped(": ".join(filter(None, [_where(binding), mode])) or other, "    ", "      ")
+    for label, value, unit, better in (
+        binding.buys if found.met and found.aim not in (RADIUS, SETTLING) else ()
+    ):
         buys = quantity(better, found.unit, BUYS)
         text = f"1 % less of {label} = {quantity(value, unit)} buys {buys}"
         yield from wrapped(text, "      ", "        ")
@@ -174,8 +176,8 @@ def tuning_picture(found: Tuning, ax: Any = None) -> Any:
     two, moves = panels_of(found.scenes[0], len(found.ranges))
     panels = [*[_draw_gains] * two, *[_draw_struck] * moves]
     axes = [ax] if ax else new_figure((5.0 * len(panels), 4.4)).subplots(1, len(panels), squeeze=False)[0]
-    for draw, one in zip(panels, axes, strict=False):
-        draw(found, one)
+    for draw, axis in zip(panels, axes, strict=False):
+        draw(found, axis)
     return axes[0]
 
 
@@ -189,7 +191,7 @@ def _draw_gains(found: Tuning, ax: Any) -> None:
             regions.append(replace(region(scene, ranges, criterion=found.criterion), topology=name))
     more = "; what is asked beside stability is not drawn" if found.felt or found.decay < 1 else ""
     draw_panel(ax, f"{found.topology}{more}", Panel("", tuple(regions), (1,) * len(regions), ()))
-    (now, best) = np.array([(one.now, float(one.value)) for one in found.gains]).T
+    (now, best) = np.array([(gain.now, float(gain.value)) for gain in found.gains]).T
     ax.annotate("", best, now, arrowprops={"arrowstyle": "->", "color": "0.3"})
     whole: Plain = {"clip_on": False, "zorder": 5}  # where an end of a range is best, too
     ax.plot(*now, "o", color="0.3", label="now", **whole)
@@ -201,13 +203,13 @@ def _draw_struck(found: Tuning, ax: Any) -> None:
     """Draw where a struck device goes in the scene that limits gains most, now and with those found."""
     scene = found.scenes[0]
     for label, values in (
-        ("found", [one.value for one in found.gains]),
-        ("now", [Fraction(one.now) for one in found.gains]),
+        ("found", [gain.value for gain in found.gains]),
+        ("now", [Fraction(gain.now) for gain in found.gains]),
     ):
         changes = [Override(own.free, value) for own, value in zip(found.ranges, values, strict=True)]
         struck, name = strike(apply(scene, changes))
         played = simulate(struck, duration=WATCHED, signals=[f"{name}.*"], jit=False)
-        place = next(place for place, one in enumerate(played.signals) if one.unit == LENGTH)
+        place = next(place for place, signal in enumerate(played.signals) if signal.unit == LENGTH)
         ax.plot(played.time, 1000 * played.values[:, place], label=label, zorder=3 - len(ax.lines))
         if label == "found":
             low, high = ax.get_ylim()
@@ -234,11 +236,13 @@ def front_text(found: Front) -> Lines:
     # An end is no knee; beside a column of what is best there is no room for names.
     names = {} if apart else {found.knee: "knee", 0: "least felt", len(found.designs) - 1: best}
     rows = [(*heads, *names_of, "", "")]
-    for place, one in enumerate(found.designs):
-        gains = (quantity(value, unit, TYPED) for _, value, unit in one.gains)
-        proved = "" if one.proved else "not proved"
-        value = [quantity(one.value, found.unit, 4)] * apart
-        rows.append((quantity(one.felt, found.against_unit, 5), *value, *gains, names.get(place, ""), proved))
+    for place, design in enumerate(found.designs):
+        gains = (quantity(value, unit, TYPED) for _, value, unit in design.gains)
+        proved = "" if design.proved else "not proved"
+        value = [quantity(design.value, found.unit, 4)] * apart
+        rows.append(
+            (quantity(design.felt, found.against_unit, 5), *value, *gains, names.get(place, ""), proved)
+        )
     yield from table(rows)
     if apart:
         knee = quantity(found.designs[found.knee].felt, found.against_unit, 5)
@@ -248,7 +252,7 @@ def front_text(found: Front) -> Lines:
 def front_picture(found: Front, ax: Any = None) -> Any:
     """Draw the front, three designs named; return the matplotlib Axes."""
     ax = new_figure((5.2, 3.8)).subplots() if ax is None else ax
-    x, y = (np.array([getattr(one, name) for one in found.designs]) for name in ("felt", "value"))
+    x, y = (np.array([getattr(design, name) for design in found.designs]) for name in ("felt", "value"))
     ax.plot(x, y, "o-", markersize=4, color=COLOURS[0])
     ax.set(xlabel=f"{found.against} ({found.against_unit})", ylabel=f"{found.aim} ({found.unit})")
     ax.set_title(found.topology, fontsize=9)
@@ -264,8 +268,8 @@ def front_picture(found: Front, ax: Any = None) -> Any:
 def tuning_document(found: Tuning) -> Plain:
     """Return the gains, what is proved of them and what binds as plain data."""
     proofs = [
-        {"counts": dict(one.counts), "verdict": one.proof.verdict, "stable": one.proof.stable}
-        | {"cells": one.proof.cells, "open_share": one.proof.open_share}
-        for one in found.proofs
+        {"counts": dict(proof.counts), "verdict": proof.proof.verdict, "stable": proof.proof.stable}
+        | {"cells": proof.proof.cells, "open_share": proof.proof.open_share}
+        for proof in found.proofs
     ]
-    return record(found, {"over": [range_document(one) for one in found.over], "proofs": proofs})
+    return record(found, {"over": [range_document(interval) for interval in found.over], "proofs": proofs})

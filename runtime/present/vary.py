@@ -77,19 +77,19 @@ def critical_text(found: Critical) -> Lines:
     if found.counted:
         yield from _count_lines(found)
         return
-    for one in found.crossings:
-        yield f"  {uncertain(one.value, one.error, unit)}"
-        kind = "jump, " if one.kind == "jump" else ""
-        turns = "" if math.isnan(one.frequency_hz) else f", {in_hertz(one.frequency_hz)}"
-        yield f"    {kind}stable {one.stable_side} it{turns}, {one.proof}"
-        if one.error > ROUGH * abs(one.value):
+    for crossing in found.crossings:
+        yield f"  {uncertain(crossing.value, crossing.error, unit)}"
+        kind = "jump, " if crossing.kind == "jump" else ""
+        turns = "" if math.isnan(crossing.frequency_hz) else f", {in_hertz(crossing.frequency_hz)}"
+        yield f"    {kind}stable {crossing.stable_side} it{turns}, {crossing.proof}"
+        if crossing.error > ROUGH * abs(crossing.value):
             yield "    no narrower: within its error the bounds on growth leave the verdict open"
     if found.crossings:
         yield ""
     yield f"  scanned {_span(found.scanned, unit)}"
     yield f"  {counted(found.looked, 'value')} looked at: two crossings near to each other could hide"
     if found.left_open:
-        parts = ", ".join(_span(one, unit) for one in found.left_open[:SHOWN])
+        parts = ", ".join(_span(pair, unit) for pair in found.left_open[:SHOWN])
         rest = f" and {len(found.left_open) - SHOWN} more" if len(found.left_open) > SHOWN else ""
         yield from sentences(f"the verdict is left open {parts}{rest}")
     if not found.whole:
@@ -99,13 +99,15 @@ def critical_text(found: Critical) -> Lines:
 def _stable_ranges(found: Critical) -> str:
     """Return where a scene is stable in a sentence; nothing where no crossing was found."""
     ranges, begin = [], ""
-    for one in found.crossings:
+    for crossing in found.crossings:
         if found.counted:
-            value = f"{math.floor(one.boundary) + (one.stable_side == 'above'):,d}"
+            value = f"{math.floor(crossing.boundary) + (crossing.stable_side == 'above'):,d}"
         else:
-            by, shown = as_shown(one.value, found.unit)
-            value = with_unit(f"{_on_stable_side(one.value * by, one.error * by, one.stable_side):g}", shown)
-        if one.stable_side == "above":
+            by, shown = as_shown(crossing.value, found.unit)
+            value = with_unit(
+                f"{_on_stable_side(crossing.value * by, crossing.error * by, crossing.stable_side):g}", shown
+            )
+        if crossing.stable_side == "above":
             begin = value
             continue
         most = f"up to {value}" if found.counted else f"below {value}"
@@ -174,23 +176,23 @@ def margins_text(found: Margins) -> Lines:
     if not found.rows:
         yield from notes(f"margins {found.note}")
         return
-    width = max(len(one.parameter) for one in found.rows)
+    width = max(len(row.parameter) for row in found.rows)
     ends = []
-    for one in found.rows:
-        value, error = one.value or 0.0, one.error or 0.0
-        by, shown = as_shown(value, one.unit)
-        ends.append("" if one.value is None else with_unit(known_digits(value * by, error * by, 7), shown))
+    for row in found.rows:
+        value, error = row.value or 0.0, row.error or 0.0
+        by, shown = as_shown(value, row.unit)
+        ends.append("" if row.value is None else with_unit(known_digits(value * by, error * by, 7), shown))
     wide = max(16, *map(len, ends))
     yield f"  {'may grow':<{width}}  from           {'to':<{wide}} times  at"
-    for one, end in zip(found.rows, ends, strict=True):
-        times = "–" if one.factor is None else f"{one.factor:.4g}"
-        at = in_hertz(math.nan if one.frequency_hz is None else one.frequency_hz)
-        told = f"{end:<{wide}} {times:>5}  {at}{', jump' if one.kind == 'jump' else ''}"
-        if one.note:
-            told = f"not looked for: {one.note}"
-        elif one.value is None:
-            told = f"none found up to {quantity(one.scanned, one.unit, 5)}"
-        yield f"  {one.parameter:<{width}}  {quantity(one.present, one.unit, 5):<14} {told}"
+    for row, end in zip(found.rows, ends, strict=True):
+        times = "–" if row.factor is None else f"{row.factor:.4g}"
+        at = in_hertz(math.nan if row.frequency_hz is None else row.frequency_hz)
+        told = f"{end:<{wide}} {times:>5}  {at}{', jump' if row.kind == 'jump' else ''}"
+        if row.note:
+            told = f"not looked for: {row.note}"
+        elif row.value is None:
+            told = f"none found up to {quantity(row.scanned, row.unit, 5)}"
+        yield f"  {row.parameter:<{width}}  {quantity(row.present, row.unit, 5):<14} {told}"
     yield from notes(found.note)
 
 
@@ -235,7 +237,9 @@ def analyses_text(found: Analyses) -> Lines:
     yield from notes(*found.left_out)
     for name, values in zip(found.parameters, found.values, strict=True):
         yield f"  {name}: {values.min():g} … {values.max():g}"
-    yield from _verdict_lines(*(Counter(one.ravel().tolist()) for one in (found.verdict, found.message)))
+    yield from _verdict_lines(
+        *(Counter(values.ravel().tolist()) for values in (found.verdict, found.message))
+    )
 
 
 def analyses_document(found: Analyses) -> Plain:
@@ -281,7 +285,7 @@ def sweep_text(found: Sweep) -> Lines:
         ends = span(float(axis.values[0]), float(axis.values[-1]), axis.unit)
         yield f"  {axis.free.label}: {ends}, {counted(len(axis.values), 'value')}"
     yield from _verdict_lines(found.counts, found.messages)
-    yield from (f"  note: {one}" for one in found.notes)
+    yield from (f"  note: {note}" for note in found.notes)
 
 
 def sweep_document(found: Sweep) -> Plain:
@@ -303,26 +307,30 @@ def sweep_table(found: Sweep) -> pandas.DataFrame:
 def parameters_text(found: Parameters) -> Lines:
     """Yield a line a number: name, value, limits, and what it is."""
     yield f"{found.topology}: what may be set\n"
-    rows = [(one.name, _value(one), _limits(one), _told(one)) for one in found.rows]
+    rows = [(row.name, _value(row), _limits(row), _told(row)) for row in found.rows]
     yield from table([("name", "value", "limits", ""), *rows], later=6)
     yield ""
     yield from sentences(HOW)
 
 
-def _value(one: Settable) -> str:
-    if one.low == one.high:
-        return quantity(one.low, one.unit, 9)
-    return span(one.low, one.high, one.unit)
+def _value(settable: Settable) -> str:
+    if settable.low == settable.high:
+        return quantity(settable.low, settable.unit, 9)
+    return span(settable.low, settable.high, settable.unit)
 
 
-def _limits(one: Settable) -> str:
-    by, _ = as_shown(max(abs(one.low), abs(one.high)), one.unit)
-    low = "" if one.minimum is None else f"{'>' if one.open_minimum else '≥'} {one.minimum * by:.9g}"
-    high = "" if one.maximum is None else f"≤ {one.maximum * by:.9g}"
+def _limits(settable: Settable) -> str:
+    by, _ = as_shown(max(abs(settable.low), abs(settable.high)), settable.unit)
+    low = (
+        ""
+        if settable.minimum is None
+        else f"{'>' if settable.open_minimum else '≥'} {settable.minimum * by:.9g}"
+    )
+    high = "" if settable.maximum is None else f"≤ {settable.maximum * by:.9g}"
     return ", ".join(limit for limit in (low, high) if limit)
 
 
-def _told(one: Settable) -> str:
-    fixed = f"not to be set: {one.fixed}" if one.fixed else ""
-    follows = f"follows: {one.follows}" if one.follows else ""
-    return "; ".join(part for part in (one.about, follows, fixed) if part)
+def _told(settable: Settable) -> str:
+    fixed = f"not to be set: {settable.fixed}" if settable.fixed else ""
+    follows = f"follows: {settable.follows}" if settable.follows else ""
+    return "; ".join(part for part in (settable.about, follows, fixed) if part)

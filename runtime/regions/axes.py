@@ -66,7 +66,7 @@ def parse_axes(
         try:
             axis = parse_axis(system, name, f"{span}:2")
         except ApcError as error:
-            mistakes = [replace(one, place=Place(f"--{letter}")) for one in error.mistakes]
+            mistakes = [replace(mistake, place=Place(f"--{letter}")) for mistake in error.mistakes]
             raise ApcError(mistakes) from None
         _refuse_period(system, axis.free)
         low, high = axis.values[0], axis.values[-1]
@@ -78,10 +78,10 @@ def parse_axes(
         found.append(Range(axis.free, axis.unit, axis.values[0], axis.values[-1]))
     first, second = found
     if first.free.meets(second.free):
-        one, other = first.free.label, second.free.label
-        what = f"{one} is on both axes; a region has two parameters"
-        if one != other:
-            what = f"{one} and {other} are not apart: without a group it is that of all groups"
+        item, other = first.free.label, second.free.label
+        what = f"{item} is on both axes; a region has two parameters"
+        if item != other:
+            what = f"{item} and {other} are not apart: without a group it is that of all groups"
         raise ApcError(Mistake("E902", PLACE, what))
     return first, replace(second, low=second.low / scale, high=second.high / scale)
 

@@ -349,8 +349,8 @@ def _search(
     away = np.abs(np.arange(2 * reach - 1) - reach + 1)
     nearest = np.argmin(np.where(turns, away[:, None], reach), axis=0)
     found, every = turns.any(axis=0), np.arange(len(a))
-    stable, unstable = (places.reshape(2 * reach, -1, 2)[nearest + one, every] for one in (0, 1))
-    ends = np.stack([growth[nearest + one, every] for one in (0, 1)], axis=1)
+    stable, unstable = (places.reshape(2 * reach, -1, 2)[nearest + number, every] for number in (0, 1))
+    ends = np.stack([growth[nearest + number, every] for number in (0, 1)], axis=1)
     knots.error[a[~found]] = np.linalg.norm(chord[~found], axis=1)
     a, b = a[found], b[found]
     if not len(a):
@@ -375,7 +375,7 @@ def _arcs(deciding: Eigenvalues, knots: _Knots, closed: tuple[bool, ...]) -> tup
         pieces = np.split(order, np.flatnonzero(knots.last[order]) + 1)
         if comes_back and len(pieces) > 1:  # the first crossing is no corner
             pieces = [np.concatenate([pieces[-1], pieces[0][1:]]), *pieces[1:-1]]
-        for piece in itertools.chain.from_iterable(_between_jumps(knots, one) for one in pieces):
+        for piece in itertools.chain.from_iterable(_between_jumps(knots, piece) for piece in pieces):
             kept = _without_copies(knots.points[piece])
             if len(kept) > 1:
                 arcs.append(_arc(deciding, knots, piece[kept], chain))
@@ -556,7 +556,7 @@ def traced(
     arcs = trace(deciding, found, tolerance=tolerance, offset=offset)
     area, off = stable_area(arcs, found)
     for halving in range(1, MOST_HALVED + 1):
-        if off >= 1 or max((float(one.errors.max()) for one in arcs), default=0.0) <= LOST:
+        if off >= 1 or max((float(arc.errors.max()) for arc in arcs), default=0.0) <= LOST:
             break
         finer = survey(samples, cells=cells * 2**halving)
         again = trace(deciding, finer, tolerance=tolerance, offset=offset)

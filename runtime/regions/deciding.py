@@ -59,12 +59,12 @@ class Pairs:
 
 def join(parts: list[Pairs]) -> Pairs:
     """Return several lists of pairs as one."""
-    return Pairs(*(np.concatenate([getattr(one, name) for one in parts]) for name in Pairs.__slots__))
+    return Pairs(*(np.concatenate([getattr(part, name) for part in parts]) for name in Pairs.__slots__))
 
 
 def log_magnitudes(matrices: Sequence[Floats], count: int) -> Floats:
     """Return the logarithms of the `count` largest magnitudes of all systems (k, count), descending."""
-    found = np.hstack([np.abs(np.linalg.eigvals(one)) for one in matrices])
+    found = np.hstack([np.abs(np.linalg.eigvals(matrix)) for matrix in matrices])
     if not found.shape[1]:  # nothing moves
         found = np.zeros((len(found), 1))
     largest = -np.sort(-found, axis=1)[:, :count]
@@ -74,7 +74,7 @@ def log_magnitudes(matrices: Sequence[Floats], count: int) -> Floats:
 
 def largest(matrices: Sequence[Floats]) -> complex:
     """Return the eigenvalue of largest magnitude of all systems (1, n, n) at one point."""
-    values = np.concatenate([np.linalg.eigvals(one[0]) for one in matrices])
+    values = np.concatenate([np.linalg.eigvals(matrix[0]) for matrix in matrices])
     return complex(values[np.argmax(np.abs(values))])
 
 
@@ -97,8 +97,8 @@ class Eigenvalues:
         """Return the eigenvalue of largest magnitude at each point (k, 2), a hair inside the square."""
         points = just_inside(points)
         matrices = self.family.matrices(points)
-        values = [np.linalg.eigvals(one) for one in matrices]
-        best = np.stack([np.abs(one).max(axis=1) for one in values], axis=1)
+        values = [np.linalg.eigvals(matrix) for matrix in matrices]
+        best = np.stack([np.abs(value).max(axis=1) for value in values], axis=1)
         # Of systems that share an eigenvalue, one all along: rounding would have them take turns.
         system = np.argmax(best >= (1 - ALIKE) * best.max(axis=1, keepdims=True), axis=1)
         k, widest = len(points), max(self.family.sizes)

@@ -93,7 +93,7 @@ def _role(system: CompiledSystem, symbol: str, player: str) -> Free | float:
         what = f"{symbol}, the {MEANINGS[symbol]},"
         raise ApcError(Mistake("E204", _PLACE, what, UNITS[symbol], f"{name} in {unit}"))
     if free.group is None:
-        own = [one for one in system.groups if name in _own_names(one)]
+        own = [group for group in system.groups if name in _own_names(group)]
         if own:
             what = f"{name} differs between peers, and {symbol} is one number"
             raise ApcError(Mistake("E886", _PLACE, what, hint=f"{symbol}={own[0].name}.{name}"))
@@ -154,7 +154,7 @@ def overlay_points(system: CompiledSystem, overlay: Overlay, x: Range, y: Range)
             return []
         return [float(brentq(along, low, high, xtol=abs(high - low) * 1e-15, rtol=1e-14))]
 
-    ends_x, ends_y = ((float(one.low), float(one.high)) for one in (x, y))
+    ends_x, ends_y = ((float(interval.low), float(interval.high)) for interval in (x, y))
     across, up = (np.linspace(*ends, LINES).tolist() for ends in (ends_x, ends_y))
     rows = [(met, at) for at in up for met in crossings(partial(margin, at_y=at), *ends_x)]
     columns = [(at, met) for at in across for met in crossings(partial(margin, at), *ends_y)]

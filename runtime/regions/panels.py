@@ -153,7 +153,9 @@ def compare_regions(
             region(system, axes, cells=cells, criterion=criterion, told=told) for system, axes, _ in work
         )
         first, axes, gain = work[0]
-        lines = tuple((one.label, overlay_points(first, one, *axes) * [1.0, gain]) for one in laid)
+        lines = tuple(
+            (overlay.label, overlay_points(first, overlay, *axes) * [1.0, gain]) for overlay in laid
+        )
         found.append(Panel(title, regions, tuple(gain for _, _, gain in work), lines))
     return Panels(tuple(found), normalize)
 

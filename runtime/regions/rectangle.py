@@ -78,10 +78,10 @@ class DirectFamily:
         whole = self.evaluator.matrices(self.rectangle.values(points))
         if self.parts:
             return tuple(self._part(part, whole[part.system]) for part in self.parts)
-        driving = [components((one != 0).any(axis=0)) for one in whole]
+        driving = [components((values != 0).any(axis=0)) for values in whole]
         return tuple(
-            one[:, states[:, None], states]
-            for one, parts in zip(whole, driving, strict=True)
+            values[:, states[:, None], states]
+            for values, parts in zip(whole, driving, strict=True)
             for states in parts
         )
 
@@ -92,8 +92,8 @@ class DirectFamily:
         along = np.zeros_like(values)
         along[:count, 0], along[count:, 1] = self.rectangle.width
         matrix, slope = (
-            self._part(part, _sized(one, self.states[part.system]))
-            for one in self.evaluator.slopes(values, along)[part.system]
+            self._part(part, _sized(value, self.states[part.system]))
+            for value in self.evaluator.slopes(values, along)[part.system]
         )
         return matrix[:count], slope.reshape(2, count, *slope.shape[1:])
 
@@ -136,7 +136,7 @@ def family_over(source: MatrixSource, rectangle: Rectangle, errors: Errors, *, s
         themselves.
     """
     corners = rectangle.values(np.array([[0.1, 0.1], [0.1, 0.9], [0.9, 0.1], [0.9, 0.9]]))
-    wrong = tuple(one.max(axis=0) for one in errors(corners))
+    wrong = tuple(values.max(axis=0) for values in errors(corners))
     parts: list[Part] = []
     for system, (error, matrix) in enumerate(zip(wrong, source.matrices(corners), strict=True)):
         driving = driving_parts(np.abs(matrix).max(axis=0) + error != 0) if split else []

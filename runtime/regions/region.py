@@ -179,7 +179,7 @@ class Region(Result):
     @property
     def coarse(self) -> tuple[Curve, ...]:
         """The smooth curves that could not be followed to the tolerance, as their errors say."""
-        return tuple(one for one in self.curves if one.smooth and not one.error <= self.tolerance)
+        return tuple(curve for curve in self.curves if curve.smooth and not curve.error <= self.tolerance)
 
     @property
     def rectangle(self) -> Rectangle:
@@ -276,18 +276,18 @@ def region(
     free = tuple(axis.free for axis in axes)
     meant = criterion_of(system, criterion, PLACE, free)
     tolerance = tolerance or (TOLERANCE_OF_GROWTH if meant in BY_GROWTH else TOLERANCE)
-    for one in free:
+    for item in free:
         if meant == NOMINAL:
-            refuse_channel_number(system, one, PLACE, instead=f"--in {MEAN_SQUARE}")
+            refuse_channel_number(system, item, PLACE, instead=f"--in {MEAN_SQUARE}")
         else:
-            refuse_time(system, one, PLACE, meant)
+            refuse_time(system, item, PLACE, meant)
     rectangle = rectangle_of(*axes)
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         prepared = prepared or prepare(system)
         used = [prepared.jacobians[group.kind] for group in system.groups]
         affine = all(site.affine for site in used)
-        times = [place for place, one in enumerate(free) if reaches_time(system, one)]
-        counts = [place for place, one in enumerate(free) if reaches_count(system, one)]
+        times = [place for place, item in enumerate(free) if reaches_time(system, item)]
+        counts = [place for place, item in enumerate(free) if reaches_count(system, item)]
         if counts:
             _check_count(axes[counts[0]], len(counts) == 2, bool(times), meant, affine=affine)
         times += counts
@@ -348,7 +348,7 @@ def _check_count(axis: Range, both: bool, timed: bool, meant: str, *, affine: bo
         f"what is stable {BY_GROWTH.get(meant, '')}": meant in BY_GROWTH,
         "a scene that is not linear": not affine,
     }
-    why = next((one for one, applies in reasons.items() if applies), "")
+    why = next((text for text, applies in reasons.items() if applies), "")
     if why:
         what = f"{axis.free.label} is a number of peers: no steps are drawn for {why}"
         raise ApcError(Mistake("E903", PLACE, what, hint=f"apc critical {axis.free.label}"))
@@ -377,8 +377,8 @@ def _plane(
     if meant in BY_GROWTH:
         growth = GrowthEvaluator(system, free, prepared, PLACE, meant)
         # One point's bounds are enough, and dear.
-        errors = tuple(one[0] for one in growth.errors(rectangle.values(np.array([[0.5, 0.5]]))))
-        parts = tuple(Part(place, np.arange(len(one))) for place, one in enumerate(errors))
+        errors = tuple(values[0] for values in growth.errors(rectangle.values(np.array([[0.5, 0.5]]))))
+        parts = tuple(Part(place, np.arange(len(error))) for place, error in enumerate(errors))
         family = DirectFamily(growth, rectangle, parts, tuple(map(len, errors)), errors)
         # What hands can draw is known as the damping needed, which jumps.
         return _Plane(family, None, meant == PASSIVE, HALVINGS)
@@ -423,8 +423,8 @@ def _samples(plane: _Plane, points: Floats) -> Floats:
     """Return the logarithms of the largest magnitudes, or raise what is wrong with a point."""
     source, rectangle = plane.family.evaluator, plane.family.rectangle
     matrices = plane.family.matrices(points)
-    for one in matrices:
-        wrong = np.flatnonzero(~np.isfinite(one).all(axis=(1, 2)))
+    for matrix in matrices:
+        wrong = np.flatnonzero(~np.isfinite(matrix).all(axis=(1, 2)))
         if len(wrong):
             value = rectangle.values(points[wrong[:1]])[0].tolist()
             overrides = overrides_at(source.system, source.free, value)

@@ -119,7 +119,7 @@ def trace_strips(
             return None
         strips.append(strip)
     whole = PointEvaluator(system, (delay.free, other.free), prepared)
-    arcs = [list(one.arcs) for one in strips]
+    arcs = [list(strip.arcs) for strip in strips]
     rectangle = rectangle_of(delay, other)
     edges = []
     for place in range(1, len(strips)):
@@ -130,12 +130,12 @@ def trace_strips(
         return mode_near(whole.closed_at(value), complex(arc.values[0])).shape
 
     listed = _joined([arc for own in arcs for arc in own] + edges, mode_of)
-    widest = max(one.end - one.start for one in strips)
+    widest = max(strip.end - strip.start for strip in strips)
     cell = (widest / cells, 1 / cells)
     return Striped(
         arcs=tuple(replace(_swapped(arc) if axis else arc, chain=n) for n, arc in enumerate(listed)),
-        area=sum((one.end - one.start) * one.area for one in strips),
-        off=sum((one.end - one.start) * one.off for one in strips),
+        area=sum((strip.end - strip.start) * strip.area for strip in strips),
+        off=sum((strip.end - strip.start) * strip.off for strip in strips),
         corner=strips[0].stable[0],
         cell=cell[::-1] if axis else cell,
         finest=2.0**-HALVINGS,
@@ -154,7 +154,9 @@ def _strips(
     """Yield the strips in order; None for one that can't be had in closed form."""
     if reaches_count(system, delay.free):
         for piece in count_pieces(system, delay, PLACE):
-            ends = [float((one - delay.low) / (delay.high - delay.low)) for one in (piece.low, piece.high)]
+            ends = [
+                float((number - delay.low) / (delay.high - delay.low)) for number in (piece.low, piece.high)
+            ]
             yield _standing(piece, other, ends, prepared)
         return
     # What is too much is so before any strip is looked at.
@@ -165,7 +167,7 @@ def _strips(
     for piece in delay_pieces(system, delay.free, delay.low, prepared, place=PLACE, high=delay.high):
         high = min(piece.high, delay.high)
         tell(high)
-        ends = [float((one - delay.low) / (delay.high - delay.low)) for one in (piece.low, high)]
+        ends = [float((number - delay.low) / (delay.high - delay.low)) for number in (piece.low, high)]
         if piece.evaluator is None:
             yield _standing(piece, other, ends, prepared)
         else:
@@ -178,7 +180,7 @@ def _standing(piece: Piece, other: Range, ends: Sequence[float], prepared: Prepa
     family = evaluator_of_many(piece.inside, [free], PLACE, prepared=prepared)
     line = MatrixLine(family, np.array([parameter_of(piece.inside, free).value]), 0, low, high)
     found = search(line)
-    if not found.stable or any(one.proof == ESTIMATE for one in found.edges):
+    if not found.stable or any(edge.proof == ESTIMATE for edge in found.edges):
         return None
     arcs, heights = [], [0.0]
     for crossing in found.edges:
@@ -239,7 +241,12 @@ def _within(source: PointEvaluator, piece: Piece, rectangle: Rectangle) -> Direc
         """Return those of analyses at values, in the coordinates of the evaluator."""
         closed = [source.closed_at(value) for value in values.tolist()]
         return tuple(
-            np.stack([relative_bounded(one[k].matrix, one[k].error, wiring.relative)[1] for one in closed])
+            np.stack(
+                [
+                    relative_bounded(closed_systems[k].matrix, closed_systems[k].error, wiring.relative)[1]
+                    for closed_systems in closed
+                ]
+            )
             for k, wiring in enumerate(family.wirings)
         )
 
@@ -354,29 +361,29 @@ def _chained(listed: list[Arc]) -> list[Arc]:
     """Return straight arcs, those that follow one another as one."""
     found = []
     while listed:
-        one = listed.pop()
+        arc = listed.pop()
         for tail, head in ((-1, 0), (0, -1)):  # first what follows it, then what it follows
-            while not one.closed:
-                end = one.points[tail]
+            while not arc.closed:
+                end = arc.points[tail]
                 place = next(
                     (n for n, arc in enumerate(listed) if np.array_equal(arc.points[head], end)), None
                 )
                 if place is None:
                     break
                 other = listed.pop(place)
-                one = _after(one, other) if tail else _after(other, one)
-        found.append(one)
+                arc = _after(arc, other) if tail else _after(other, arc)
+        found.append(arc)
     return found
 
 
-def _after(one: Arc, other: Arc) -> Arc:
+def _after(arc: Arc, other: Arc) -> Arc:
     """Return two arcs as one."""
-    points = np.concatenate([one.points, other.points[1:]])
+    points = np.concatenate([arc.points, other.points[1:]])
     rest: dict[str, Any] = {
-        name: np.concatenate([getattr(one, name), getattr(other, name)])
+        name: np.concatenate([getattr(arc, name), getattr(other, name)])
         for name in ("handles", "errors", "knots", "values")
     }
-    return replace(one, points=points, **rest)
+    return replace(arc, points=points, **rest)
 
 
 def _swapped(arc: Arc) -> Arc:

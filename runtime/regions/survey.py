@@ -199,7 +199,7 @@ def _suspect(values: Floats) -> NDArray[np.bool_]:
     sinking = unstable & (top.min(axis=0) - first / 8 <= 0)
     for looked_at, sign, branches in ((rising, 1.0, slice(None)), (sinking, -1.0, slice(0, 1))):
         if looked_at.any():
-            four, own_x, own_y = (one[:, looked_at, branches] for one in (corners, x, y))
+            four, own_x, own_y = (values[:, looked_at, branches] for values in (corners, x, y))
             suspect[looked_at] = (_envelope(sign * four, own_x, own_y) >= 0).any(axis=(0, 1, 3))
     return suspect
 

@@ -154,9 +154,9 @@ def _scene(path: Path, system: CompiledSystem, settings: Sequence[str]) -> Scene
 
 def _why(error: ApcError) -> str:
     """Return the first mistake in words."""
-    one = error.mistakes[0]
-    wanted = f" wants {one.expected}, got {one.got}" if one.expected else ""
-    return f"{one.what}{wanted}"
+    mistake = error.mistakes[0]
+    wanted = f" wants {mistake.expected}, got {mistake.got}" if mistake.expected else ""
+    return f"{mistake.what}{wanted}"
 
 
 def _texts(system: CompiledSystem) -> Iterable[tuple[str, str]]:
@@ -170,7 +170,7 @@ def _texts(system: CompiledSystem) -> Iterable[tuple[str, str]]:
 
 
 def _compiled(system: CompiledSystem, call: str) -> Section:
-    told = [f"Warning: {one}" for one in system.warnings]
+    told = [f"Warning: {warning}" for warning in system.warnings]
     told += [f"left out: {name}, as {reason}" for name, reason in system.dropped]
     return Section("compiled", f"apc compile {call.split(' --set')[0]}", tuple(told), (needs(system),))
 
@@ -190,14 +190,14 @@ def _verdict(system: CompiledSystem, call: str) -> Section:
 
 
 def _limits(system: CompiledSystem, call: str) -> Section:
-    asked = [(axis, one.name, one.why) for axis, one in choose(system, ()).items()]
-    return _criticals(system, call, "limits", [one for one in asked if one[0] in (STIFFNESS, DELAY)])
+    asked = [(axis, choice.name, choice.why) for axis, choice in choose(system, ()).items()]
+    return _criticals(system, call, "limits", [item for item in asked if item[0] in (STIFFNESS, DELAY)])
 
 
 def _network(system: CompiledSystem, call: str) -> Section:
     loss = choose(system, ())[LOSS]
     channels = [link.channel for link in system.links if link.channel is not None]
-    jitters = [(JITTER, one.jitter, "") for one in channels if one.jitter is not None]
+    jitters = [(JITTER, channel.jitter, "") for channel in channels if channel.jitter is not None]
     return _criticals(system, call, "network", [(LOSS, loss.name, loss.why), *jitters], judge_network(system))
 
 
@@ -232,13 +232,13 @@ def _criticals(
 def _region(system: CompiledSystem, call: str) -> Section:
     asked: list[str | None] = [None, None]
     if len(system.region) < 2:
-        stiff = [one for one in coupler_parameters(system) if unit_of(system, one.name) in STIFFNESSES]
+        stiff = [free for free in coupler_parameters(system) if unit_of(system, free.name) in STIFFNESSES]
         if len(stiff) < 2:
             why = "the scene has fewer than two stiffnesses, and says no studies: region:"
             return Section("region", "", refused=why)
         asked = [
-            f"{one.label}=0 N/m:{FURTHER * parameter_of(system, one).value or 1000:g} N/m"
-            for one in stiff[:2]
+            f"{free.label}=0 N/m:{FURTHER * parameter_of(system, free).value or 1000:g} N/m"
+            for free in stiff[:2]
         ]
     unreliable = any(link.channel is not None for link in system.links)
     criterion = NOMINAL if unreliable else None
@@ -301,15 +301,17 @@ def differences(before: Any, now: Any) -> Iterator[str]:
 def _leaves(data: Any, name: str = "", known: float = 0.0) -> Iterator[tuple[str, tuple[Any, float]]]:
     """Yield what is no list or mapping by its place, and how far off it may be, which no error is itself."""
     if isinstance(data, Mapping):
-        errors = (one for key, one in data.items() if key.endswith("error") and isinstance(one, int | float))
+        errors = (
+            item for key, item in data.items() if key.endswith("error") and isinstance(item, int | float)
+        )
         known = sum(errors) or known
-        for key, one in data.items():
+        for key, item in data.items():
             if "error" not in key:
-                yield from _leaves(one, f"{name}.{key}" if name else key, known)
+                yield from _leaves(item, f"{name}.{key}" if name else key, known)
     elif isinstance(data, list):
-        sizes = [abs(one) for one in data if isinstance(one, int | float)]
-        for place, one in enumerate(data):
-            yield from _leaves(one, f"{name}[{place + 1}]", max(known, NOTHING * max(sizes, default=0.0)))
+        sizes = [abs(item) for item in data if isinstance(item, int | float)]
+        for place, item in enumerate(data):
+            yield from _leaves(item, f"{name}[{place + 1}]", max(known, NOTHING * max(sizes, default=0.0)))
     else:
         yield name, (data, known)
 

@@ -56,7 +56,7 @@ class ErrorEstimate:
     @property
     def worst(self) -> SignalError | None:
         """The signal with the largest error relative to its range."""
-        return max(self.signals, key=lambda one: one.relative, default=None)
+        return max(self.signals, key=lambda signal: signal.relative, default=None)
 
 
 class Comparison:
@@ -91,8 +91,8 @@ class Comparison:
         span = np.where(self.high >= self.low, self.high - self.low, 0.0)
         columns: Sequence[Any] = (self.error.tolist(), self.at.tolist(), span.tolist())
         found = (
-            SignalError(one.name, one.unit, *numbers)
-            for one, *numbers in zip(self.signals, *columns, strict=True)
+            SignalError(signal.name, signal.unit, *numbers)
+            for signal, *numbers in zip(self.signals, *columns, strict=True)
         )
         return ErrorEstimate(self.kind, self.compared, tuple(found))
 

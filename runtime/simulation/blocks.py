@@ -95,7 +95,7 @@ def unsolved(simulation: Simulation, frame: int) -> ApcError:
     if not simulation.tolerances:
         what = f"an equation has no solution, or a loop none that Newton's method finds, {at}"
         return ApcError(Mistake("E872", place, what))
-    states = ", ".join(one.state for one in simulation.tolerances[:MOST_NAMED])
+    states = ", ".join(tolerance.state for tolerance in simulation.tolerances[:MOST_NAMED])
     what = (
         f"the motion of {states} can't be integrated {at}: it grows without measure, an equation there has "
         "no value, or a force jumps to and fro without end"
@@ -118,7 +118,8 @@ def pushes(simulation: Simulation, first: int) -> list[Floats | None]:
         quanta = (numbers[:, None] * simulation.frame + begin).reshape(-1)
         starts = quanta * simulation.quantum.numerator / simulation.quantum.denominator
         own = [
-            impulses(one, starts, which)[:, program.rates.pushed].reshape(len(numbers), -1) for one in forces
+            impulses(force, starts, which)[:, program.rates.pushed].reshape(len(numbers), -1)
+            for force in forces
         ]
         found.append(np.ascontiguousarray(np.stack(own, axis=-1)))
     return found

@@ -150,13 +150,13 @@ def buzz(
     if not any(pushes for _, pushes in groups):
         raise _refused(system, "nothing touches")
     for _, pushes in groups:
-        for one in pushes:
-            if not one.one_sided:
-                raise _refused(system, f"{one.part} pulls, too, or is limited")
+        for push in pushes:
+            if not push.one_sided:
+                raise _refused(system, f"{push.part} pulls, too, or is limited")
     measured = _contacts(system, groups)
     predicted = predict(system, groups)
     seconds = _seconds(system, prepared, modes)
-    names = [one.name for one in measured] + [state for one in measured for state in one.states]
+    names = [item.name for item in measured] + [state for item in measured for state in item.states]
     played = simulate(system, duration=seconds, signals=tuple(dict.fromkeys(names)))
     found = _compare(system.name, predicted, played, measured)
     if all(link.channel is None for link in system.links):
@@ -171,7 +171,7 @@ def _seconds(system: CompiledSystem, prepared: Prepared, modes: ContactModes | N
     frame = float(prepared.schedules[0].frame_s)
     rate = abs(math.log(radius)) / frame if 0 < radius < math.inf else 0.0
     wanted = min(max(GROWTHS / rate if rate else math.inf, SHORTEST), LONGEST)
-    timings = {one.name: one.value for one in system.timings}
+    timings = {timing.name: timing.value for timing in system.timings}
     tick = min(float(timings[clock.period]) for clock in system.clocks)
     most = MOST_PLAYED * tick / system.peers
     if most < SHORTEST:
@@ -194,18 +194,18 @@ def _contacts(
     for group, pushes in groups:
         for peer in list(group.peers[:each]):
             name = exchange.peer_name(int(peer))
-            for one in pushes:
+            for push in pushes:
                 states = group.jacobians.kind.states
-                places = [k for k, state in enumerate(states) if state.unit == LENGTH and one.slopes[k]]
-                if one.slopes[one.states :].any() or not places:
-                    raise _refused(system, f"{one.part} follows more than positions and velocities")
-                stiffness = float(np.abs(one.slopes[places]).max())
+                places = [k for k, state in enumerate(states) if state.unit == LENGTH and push.slopes[k]]
+                if push.slopes[push.states :].any() or not places:
+                    raise _refused(system, f"{push.part} follows more than positions and velocities")
+                stiffness = float(np.abs(push.slopes[places]).max())
                 found.append(
                     _Measured(
-                        f"{name}.{one.part}",
+                        f"{name}.{push.part}",
                         tuple(f"{name}.{states[k].name}" for k in places),
-                        one.slopes[places] / stiffness,
-                        one.offset / stiffness,
+                        push.slopes[places] / stiffness,
+                        push.offset / stiffness,
                         stiffness,
                     )
                 )
@@ -221,30 +221,31 @@ def _compare(
     bounded = not played.summary.stopped
     time = played.time[first:]
     depths = [
-        one.offset + sum(f * played[state][first:] for f, state in zip(one.factors, one.states, strict=True))
-        for one in measured
+        item.offset
+        + sum(f * played[state][first:] for f, state in zip(item.factors, item.states, strict=True))
+        for item in measured
     ]
-    pushes = [played[one.name][first:] for one in measured]
+    pushes = [played[item.name][first:] for item in measured]
     window = np.hanning(len(time))
     loads = [float(push @ window / window.sum()) for push in pushes]
     contacts = tuple(
         ContactBuzz(
-            name=one.name,
+            name=item.name,
             load_n=load,
             depth_m=float(np.ptp(depth)),
             in_contact=float((push > 0).mean()),
-            predicted_depth_m=known.peak_to_peak * load / one.stiffness if known else None,
+            predicted_depth_m=known.peak_to_peak * load / item.stiffness if known else None,
         )
-        for one, load, depth, push in zip(measured, loads, depths, pushes, strict=True)
+        for item, load, depth, push in zip(measured, loads, depths, pushes, strict=True)
     )
-    swing = max(depths, key=lambda one: float(np.ptp(one)))
+    swing = max(depths, key=lambda depth: float(np.ptp(depth)))
     halves = [float(np.ptp(half)) for half in np.array_split(swing, 2)]
-    size = max(load / one.stiffness for load, one in zip(loads, measured, strict=True))
+    size = max(load / item.stiffness for load, item in zip(loads, measured, strict=True))
     quiet = float(np.ptp(swing)) <= QUIET * size
     steady = bounded and (quiet or abs(halves[1] - halves[0]) <= SETTLED * max(halves))
     lines = _lines(time, swing) if steady and not quiet else ()
     reason = "" if known else str(predicted)
-    if bounded and max(one.in_contact for one in contacts) < TOUCHED:
+    if bounded and max(contact.in_contact for contact in contacts) < TOUCHED:
         lines, steady = (), False
         notes: tuple[str, ...] = (LET_GO,)
     else:
@@ -300,5 +301,5 @@ def _lines(time: Floats, values: Floats) -> tuple[Line, ...]:
 def _is_mixed(frequency: float, known: Sequence[float], apart: float) -> bool:
     """Say whether a frequency is one that is known, or a sum or difference of a few times two of these."""
     times = range(-MIXED, MIXED + 1)
-    sums = {i * one + j * other for one in known for other in known for i in times for j in times}
-    return any(abs(frequency - one) < apart for one in sums)
+    sums = {i * value + j * other for value in known for other in known for i in times for j in times}
+    return any(abs(frequency - value) < apart for value in sums)

@@ -143,7 +143,7 @@ class Ensemble(Result):
         values = np.array(listed)
         n = len(values)
         error = float(values.std(ddof=1) / math.sqrt(n)) if n > 1 else math.inf
-        quantiles = tuple(float(one) for one in np.quantile(values, QUANTILES))
+        quantiles = tuple(float(item) for item in np.quantile(values, QUANTILES))
         return Statistics(n, float(values.mean()), error, float(values.min()), float(values.max()), quantiles)
 
 
@@ -251,7 +251,7 @@ def _opened(model: bytes, settings: Settings) -> Simulation:
 def _runs(simulation: Simulation, numbers: range) -> list[Run]:
     """Play some runs."""
     player, found = simulation.player(), []
-    lengths = {one.local for one in simulation.signals if one.unit == LENGTH}
+    lengths = {signal.local for signal in simulation.signals if signal.unit == LENGTH}
     for number in numbers:
         watch = Watch(simulation)
         for block in blocks(simulation, run=number, player=player):

@@ -191,7 +191,7 @@ def integrals(rate: Any) -> tuple[tuple[int, int], ...]:
     type_: Any = casadi.SX if rate.is_a("SXFunction") else casadi.MX
     arguments = [type_.sym(f"a{i}", rate.numel_in(i)) for i in range(4)]
     speed = rate(*arguments)
-    slopes = casadi.horzcat(*(jacobian(speed, one) for one in arguments))
+    slopes = casadi.horzcat(*(jacobian(speed, argument) for argument in arguments))
     found: dict[int, int] = {}
     for i in range(speed.numel()):
         columns = slopes[i, :].sparsity().get_triplet()[1]
@@ -224,8 +224,8 @@ def state_scales(
     vectors
         The parameters of its different peers (n_p,).
     """
-    units = {one.name: one.unit for one in system.parameters}
-    units |= {one.name: one.unit for group in system.groups for one in group.values}
+    units = {parameter.name: parameter.unit for parameter in system.parameters}
+    units |= {value.name: value.unit for group in system.groups for value in group.values}
     largest: dict[str, float] = {}
     for place, name in enumerate(kind.parameters):
         size = max((abs(float(vector[place])) for vector in vectors), default=0.0)
@@ -234,7 +234,7 @@ def state_scales(
     scale = np.array([largest.get(state.unit, 0.0) for state in kind.states])
     first = np.zeros(len(scale))
     for vector in vectors:
-        x, u, _ = start_values(site, [float(one) for one in vector])
+        x, u, _ = start_values(site, [float(item) for item in vector])
         speed = np.abs(np.asarray(kind.derivative(x, u, vector, 0.0), dtype=np.float64).ravel())
         first = np.maximum(first, np.nan_to_num(speed, posinf=0.0))
     rates = integrals(kind.derivative)

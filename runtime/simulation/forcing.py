@@ -98,7 +98,7 @@ def site_forcing(rates: Rates, parameters: Floats, durations: Sequence[Fraction]
         pushed=pushed,
         force=casadi.Function("force", [t], [casadi.densify(g[list(pushed)])]),
         breaks=np.unique(at[np.isfinite(at)]),
-        durations=tuple(float(one) for one in durations),
+        durations=tuple(float(duration) for duration in durations),
     )
 
 

@@ -47,7 +47,7 @@ def pair_function(kind: Kind, partition: int, receive: int) -> tuple[Any, tuple[
     """
     clock = kind.clocks[partition]
     hearing = clock.receives[receive]
-    sending = next((one for one in kind.sends if one.link == hearing.link), None)
+    sending = next((send for send in kind.sends if send.link == hearing.link), None)
     sizes = (len(kind.states), len(kind.holds), len(clock.memories), len(kind.parameters))
     x, u, m, p = (casadi.SX.sym("own", size) for size in sizes)
     t, missing = casadi.SX.sym("t"), casadi.SX.sym("missing")
@@ -87,4 +87,4 @@ def count_pairs(system: CompiledSystem, exchange: Exchange) -> int:
         if edge_name(partition, receive)
     }
     n = exchange.peers
-    return sum(n * (n - 1) if exchange.is_complete(one) else len(exchange.arcs(one)[0]) for one in links)
+    return sum(n * (n - 1) if exchange.is_complete(link) else len(exchange.arcs(link)[0]) for link in links)

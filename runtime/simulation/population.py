@@ -81,9 +81,9 @@ def exchanges_within(schedules: Sequence[Schedule]) -> tuple[int, ...]:
 
     Something is sent that is heard in the same frame, or a tick looks at each sender by itself.
     """
-    slots = {one.sent for schedule in schedules for one in schedule.heard if one.lag == 0}
+    slots = {heard.sent for schedule in schedules for heard in schedule.heard if heard.lag == 0}
     # Over an unreliable link anything may be heard as soon as it is sent.
-    any_time = {one.way.link for schedule in schedules for one in schedule.selected}
+    any_time = {selected.way.link for schedule in schedules for selected in schedule.selected}
     found = {
         at
         for schedule in schedules
@@ -115,7 +115,7 @@ def refuse_unheard_of(system: CompiledSystem) -> None:
     for kind in system.kinds:
         for partition in kind.clocks:
             for receive in partition.receives:
-                if receive.link in zero and not any(one.link == receive.link for one in kind.sends):
+                if receive.link in zero and not any(send.link == receive.link for send in kind.sends):
                     what = (
                         f"{receive.name} hears {receive.link}, over which its peer sends nothing: it has no "
                         "value of its own to stand in for a missing one"
@@ -146,7 +146,7 @@ def build_population(
         E801 a mean over nobody, E802 a mean whose weights add up to 0.
     """
     schedule = members[0].program.schedule
-    columns = np.cumsum([0, *(len(one.program.recorded) * one.count for one in members)]).tolist()
+    columns = np.cumsum([0, *(len(member.program.recorded) * member.count for member in members)]).tolist()
     listed = (part for member in members for part in member.program.layout.parts)
     return Population(
         members=tuple(members),

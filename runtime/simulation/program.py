@@ -115,7 +115,9 @@ class Program:
     def constants(self, parameters: Floats, transitions: Sequence[Floats]) -> Floats:
         """Return sites' constants (sites, rows): parameters, then each duration's [E F c], columns first."""
         columns = self.rates.pattern.T
-        return np.concatenate([parameters, *(one.swapaxes(1, 2)[:, columns] for one in transitions)], axis=1)
+        return np.concatenate(
+            [parameters, *(transition.swapaxes(1, 2)[:, columns] for transition in transitions)], axis=1
+        )
 
 
 def timed_events(schedule: Schedule) -> list[tuple[int, Event]]:
@@ -200,10 +202,10 @@ def build_member(
         program=program,
         rows=own,
         parameters=some,
-        constants=program.constants(some, [one[used] for one in transitions]),
+        constants=program.constants(some, [transition[used] for transition in transitions]),
         sends={
-            one.link: np.asarray(one.send.map(len(some))(states, still, some.T, 0.0), np.float64).T
-            for one in kind.sends
+            send.link: np.asarray(send.send.map(len(some))(states, still, some.T, 0.0), np.float64).T
+            for send in kind.sends
         },
         carry=carry,
     )

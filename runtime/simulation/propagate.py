@@ -145,7 +145,7 @@ def exact_rates(rates_of: Rates, parameters: Floats) -> NDArray[Any]:
             rates_of.matrices, [exact_numbers(kind, np.asarray(parameters, dtype=np.float64))]
         )[0]
     else:
-        exact = [Fraction(float(one)) for one in np.asarray(rates_of.matrices(parameters)).ravel()]
+        exact = [Fraction(float(values)) for values in np.asarray(rates_of.matrices(parameters)).ravel()]
     return np.array(exact, dtype=object).reshape((n_x, n_x + n_u + 1), order="F")
 
 

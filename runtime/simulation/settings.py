@@ -115,7 +115,7 @@ def parse_method(text: str) -> Method:
     try:
         step = Fraction(quantity(size, place, what=f"the step of {name}", unit="s").value)
     except ApcError as error:
-        raise ApcError([replace(one, hint=EXAMPLES[name]) for one in error.mistakes]) from None
+        raise ApcError([replace(mistake, hint=EXAMPLES[name]) for mistake in error.mistakes]) from None
     if step <= 0:
         expected, got = "more than 0 s", size[:80]
         raise ApcError(Mistake("E911", place, f"the step of {name}", expected, got, EXAMPLES[name]))

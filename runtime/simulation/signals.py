@@ -64,9 +64,9 @@ def local_signals(kind: Kind, schedule: Schedule) -> tuple[LocalSignal, ...]:
             unit = kind.clocks[p].units[hold.output]
             found.append(LocalSignal(f"{hold.name} acting", unit, "hold", (h,)))
     found += [
-        LocalSignal(one.name, one.unit, "limited", (place,))
-        for place, one in enumerate(kind.limits)
-        if one.value is not None
+        LocalSignal(limit.name, limit.unit, "limited", (place,))
+        for place, limit in enumerate(kind.limits)
+        if limit.value is not None
     ]
     return tuple(found)
 
@@ -162,7 +162,7 @@ def choose(
         wanted = np.full((group.count, len(found)), not patterns)
         for pattern, test in tests:
             for place, local in enumerate(found):
-                fits = [any(test.fullmatch(one) for one in (local.name, f"{group.name}.{local.name}"))]
+                fits = [any(test.fullmatch(text) for text in (local.name, f"{group.name}.{local.name}"))]
                 if not fits[0] and ("[" in pattern or pattern.startswith(("*", group.name))):
                     names = (f"{group.name}[{i + 1}].{local.name}" for i in range(group.count))
                     fits = [bool(test.fullmatch(name)) for name in names]

@@ -181,7 +181,7 @@ def prepare(
         lucks=tuple(luck_of(system, timings, plan.exchange, route, quantum) for route in plan.routes),
         seed=system.experiment.seed if settings.seed is None else settings.seed,
         tolerances=_tolerances(system, plan.flows),
-        sent=tuple(dict.fromkeys(one.states[i].name for one in system.kinds for i in sent_states(one))),
+        sent=tuple(dict.fromkeys(kind.states[i].name for kind in system.kinds for i in sent_states(kind))),
         quantum=quantum,
         frame=schedule.frame,
         marks=marks,
@@ -270,7 +270,7 @@ def plan_of(system: CompiledSystem, method: Method) -> Plan:
         kept = {route.link: route.frames for route in routes}
         schedules = build_schedules(system, numbers.timings, patterns, kept=kept)
     if not system.clocks:  # then there is one interval, of any length
-        schedules = tuple(replace(one, quantum=ROW / one.frame) for one in schedules)
+        schedules = tuple(replace(schedule, quantum=ROW / schedule.frame) for schedule in schedules)
     _check_size(system, exchange, schedules)
     _check_step(system, numbers, schedules, method)
     return Plan(system, numbers, exchange, sites, flows, routes, schedules)
@@ -296,7 +296,7 @@ def _members(plan: Plan, choices: Sequence[Choice], method: Method, *, live: boo
     programs: dict[Any, Program] = {}
     members = []
     groups = zip(system.groups, plan.schedules, choices, strict=True)
-    for group, (one, schedule, choice) in enumerate(groups):
+    for group, (item, schedule, choice) in enumerate(groups):
         rows, vectors = numbers.rows[group], numbers.parameters[group]
         moves: Sequence[Floats] | None = None
         is_recorded = choice.wanted.any(axis=1)
@@ -304,13 +304,13 @@ def _members(plan: Plan, choices: Sequence[Choice], method: Method, *, live: boo
             peers = np.flatnonzero(which)
             if not len(peers):
                 continue
-            key = (one.kind, id(schedule), recorded)
+            key = (item.kind, id(schedule), recorded)
             if key not in programs:
-                programs[key] = build_program(linear[one.kind], schedule, recorded, cuts, flows[one.kind])
+                programs[key] = build_program(linear[item.kind], schedule, recorded, cuts, flows[item.kind])
             if moves is None:  # what the different sites of a group do over every interval
-                moves = transition_rows(linear[one.kind], vectors, programs[key].seconds)
+                moves = transition_rows(linear[item.kind], vectors, programs[key].seconds)
                 moves = perturbed(moves, 0) if method.perturbed else moves
-            numbered, site = plan.exchange.starts[group] + peers, plan.sites[one.kind]
+            numbered, site = plan.exchange.starts[group] + peers, plan.sites[item.kind]
             members.append(build_member(group, numbered, site, rows[peers], vectors, programs[key], moves))
     return members
 
@@ -318,8 +318,8 @@ def _members(plan: Plan, choices: Sequence[Choice], method: Method, *, live: boo
 def _chunk_length(population: Population, duration: Fraction) -> int:
     """Return how many frames to play at once: equal chunks, none larger than need be."""
     frames = int(duration / (population.frame * population.quantum)) + 1
-    pushed = sum(one.program.impulse_rows * len(one.parameters) for one in population.members)
-    seen = sum(one.ticks * len(one.pairs) for one in population.hearing.routes)
+    pushed = sum(member.program.impulse_rows * len(member.parameters) for member in population.members)
+    seen = sum(route.ticks * len(route.pairs) for route in population.hearing.routes)
     numbers = population.marks * population.width + pushed + seen
     most = max(1, min(MOST_FRAMES, CHUNK // max(1, numbers), frames))
     return -(-frames // -(-frames // most))
@@ -334,7 +334,7 @@ def _order(system: CompiledSystem, population: Population, signals: Sequence[Sig
         for place, local in enumerate(member.program.recorded)
         for i, peer in enumerate((member.peers - starts[member.group] + 1).tolist())
     }
-    return np.array([column_of[one.group, one.peer, one.local] for one in signals], np.int64)
+    return np.array([column_of[signal.group, signal.peer, signal.local] for signal in signals], np.int64)
 
 
 def _ticks_at_zero(system: CompiledSystem, numbers: Numbers) -> bool:
@@ -386,20 +386,20 @@ def _tolerances(system: CompiledSystem, flows: Sequence[Flow | None]) -> tuple[T
     """Return the tolerances of all states, each state of several kinds once, with the smallest."""
     found: dict[str, Tolerance] = {}
     for kind, flow in zip(system.kinds, flows, strict=True):
-        for one in flow.tolerances(kind) if flow else ():
-            if one.state not in found or one.absolute < found[one.state].absolute:
-                found[one.state] = one
+        for tolerance in flow.tolerances(kind) if flow else ():
+            if tolerance.state not in found or tolerance.absolute < found[tolerance.state].absolute:
+                found[tolerance.state] = tolerance
     return tuple(found.values())
 
 
 def _check_step(
     system: CompiledSystem, numbers: Numbers, schedules: Sequence[Schedule], method: Method
 ) -> None:
-    fastest = min((numbers.timings[one.period] for one in system.clocks), default=ROW)
+    fastest = min((numbers.timings[clock.period] for clock in system.clocks), default=ROW)
     lengths = [
-        event.duration * one.quantum
-        for one in schedules
-        for event in one.events
+        event.duration * schedule.quantum
+        for schedule in schedules
+        for event in schedule.events
         if isinstance(event, Propagate)
     ]
     check_step(system, method, fastest, max(lengths, default=fastest))
@@ -410,4 +410,4 @@ def _forces(member: Member) -> tuple[SiteForcing, ...]:
     program = member.program
     if not program.impulse_rows:
         return ()
-    return tuple(site_forcing(program.rates, one, program.seconds) for one in member.parameters)
+    return tuple(site_forcing(program.rates, parameter, program.seconds) for parameter in member.parameters)

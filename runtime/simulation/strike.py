@@ -51,17 +51,22 @@ def strike(system: CompiledSystem, peer: str = "") -> tuple[CompiledSystem, str]
     group = system.groups[place]
     kind: Kind = system.kinds[group.kind]
     sent = sent_states(kind)
-    moving = [row for row, one in enumerate(kind.states) if one.unit == "m/s"]
+    moving = [row for row, state in enumerate(kind.states) if state.unit == "m/s"]
     own = [row for row in moving if row not in sent] or moving
     if not own:
         what = f"nothing of {group.name} has a velocity that a push could change"
         raise ApcError(Mistake("E983", Place(system.name), what))
     state = kind.states[own[0]]
     known = {column.name: column.values for column in group.columns}
-    present = [one.value for one in (*system.parameters, *group.values) if one.name == state.start][-1]
+    present = [
+        parameter.value for parameter in (*system.parameters, *group.values) if parameter.name == state.start
+    ][-1]
     values = np.array(known.get(state.start, np.full(group.count, present)), dtype=np.float64)
     values[number - 1] += SPEED
-    columns = (*(one for one in group.columns if one.name != state.start), Column(state.start, values))
+    columns = (
+        *(column for column in group.columns if column.name != state.start),
+        Column(state.start, values),
+    )
     changed = replace(group, columns=columns)
     groups = (*system.groups[:place], changed, *system.groups[place + 1 :])
     return replace(system, groups=groups), f"{group.name}[{number}].{state.name.rpartition('.')[0]}"

@@ -120,21 +120,21 @@ def provenance_of(simulation: Simulation) -> Provenance:
         tolerances=simulation.tolerances,
         seed=simulation.seed,
         parameters=parameters_of(system),
-        timings=tuple((one.name, str(one.value)) for one in system.timings),
+        timings=tuple((timing.name, str(timing.value)) for timing in system.timings),
     )
 
 
 def parameters_of(system: CompiledSystem) -> tuple[tuple[str, float, str], ...]:
     """Return the parameters of a scene, its groups and peers: name, value in SI, unit."""
-    parameters = [(one.name, one.value, one.unit) for one in system.parameters]
+    parameters = [(parameter.name, parameter.value, parameter.unit) for parameter in system.parameters]
     for group in system.groups:
-        parameters += [(f"{group.name}.{one.name}", one.value, one.unit) for one in group.values]
-    units = {one.name: one.unit for one in system.parameters}
+        parameters += [(f"{group.name}.{value.name}", value.value, value.unit) for value in group.values]
+    units = {parameter.name: parameter.unit for parameter in system.parameters}
     for group in system.groups:
         for column in group.columns:
             parameters += [
-                (f"{group.name}[{i + 1}].{column.name}", float(one), units.get(column.name, "1"))
-                for i, one in enumerate(column.values[:MOST_LISTED])
+                (f"{group.name}[{i + 1}].{column.name}", float(value), units.get(column.name, "1"))
+                for i, value in enumerate(column.values[:MOST_LISTED])
             ]
     return tuple(parameters)
 

@@ -131,7 +131,11 @@ class _Writer:
         lengths = {event.duration for event in schedule.events if isinstance(event, Propagate)}
         self.durations = tuple(sorted(lengths))
         self.moves = [flow.over(length * schedule.quantum) for length in self.durations] if flow else []
-        functions = [kind.derivative, *(one.tick for one in kind.clocks), *(one.send for one in kind.sends)]
+        functions = [
+            kind.derivative,
+            *(clock.tick for clock in kind.clocks),
+            *(send.send for send in kind.sends),
+        ]
         functions += [*self.moves, *([kind.ports.port] if kind.ports else [])]
         plain = all(function.is_a("SXFunction") for function in functions)
         self.type_: Any = casadi.SX if plain else casadi.MX

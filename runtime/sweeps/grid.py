@@ -176,7 +176,7 @@ def _range(label: str, unit: str, text: str) -> tuple[Fraction, ...]:
         raise ApcError(Mistake("E881", PLACE, what, "LOW:HIGH:COUNT or LOW:HIGH:COUNT:log", text[:80], _FORM))
     count = _count(what, rest[0].strip()) if rest else DEFAULT_COUNT
     low, high = option_values(
-        label, unit, ends, PLACE, rest="".join(f":{one}" for one in text.split(":")[2:])
+        label, unit, ends, PLACE, rest="".join(f":{part}" for part in text.split(":")[2:])
     )
     if low >= high:
         got = f"{ends[0].strip()} to {ends[1].strip()}"

@@ -66,7 +66,7 @@ def find_quantity(system: CompiledSystem, text: str) -> Quantity:
     ApcError
         E884 no such quantity; what the quantity's own argument can be wrong in.
     """
-    criterion = next((one for one, start in BEGINNINGS.items() if text.startswith(start)), NOMINAL)
+    criterion = next((item for item, start in BEGINNINGS.items() if text.startswith(start)), NOMINAL)
     text = text.removeprefix(BEGINNINGS.get(criterion, ""))
     name, _, argument = text.partition(":")
     make = QUANTITIES.get(name.strip())
@@ -198,7 +198,7 @@ def _one_by_one(
                 rows.append(evaluate(apply(system, grid.overrides(point))))
             except ApcError as error:
                 rows.append(faulty(columns, error))
-        kinds = [object if one.kind == "text" else np.float64 for one in columns]  # None is NaN
+        kinds = [object if column.kind == "text" else np.float64 for column in columns]  # None is NaN
         return tuple(
             np.array(own, dtype=kind) for own, kind in zip(zip(*rows, strict=True), kinds, strict=True)
         )
@@ -229,7 +229,7 @@ def _critical(system: CompiledSystem, argument: str, criterion: str = "nominal")
         if found.value is None or found.error is None:
             return (found.verdict, None, None, 0, None, "")
         verdict = f"stable {found.stable_side} the value"
-        proof = next(one.proof for one in found.crossings if one.value == found.value)
+        proof = next(crossing.proof for crossing in found.crossings if crossing.value == found.value)
         return (verdict, finite(found.value), finite(found.error), len(found.crossings), proof, "")
 
     return Quantity(columns, _one_by_one(system, columns, evaluate))

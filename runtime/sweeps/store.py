@@ -118,7 +118,7 @@ def _packed(cells: Cells) -> bytes:
     np.savez(
         file,
         is_text=np.array([column.dtype == object for column in cells], np.bool_),
-        numbers=np.array([one for one in cells if one.dtype != object], np.float64).reshape(-1, points),
+        numbers=np.array([cell for cell in cells if cell.dtype != object], np.float64).reshape(-1, points),
         codes=np.array(codes, np.int32).reshape(-1, points),
         texts=np.frombuffer(listed, np.uint8),
     )

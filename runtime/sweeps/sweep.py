@@ -90,7 +90,7 @@ class Sweep(Result):
     @property
     def headings(self) -> tuple[str, ...]:
         """The headings of the columns, such as `verdict` or `contact.stiffness [N/m]`."""
-        return tuple(one.heading for one in self.listed)
+        return tuple(column.heading for column in self.listed)
 
     @property
     def columns(self) -> Cells:
@@ -201,7 +201,7 @@ def sweep(
     notes = _compute_missing(work, kept, whose, progress)
     listed = (*(Column(axis.heading) for axis in grid.axes), *quantity.columns)
     counts = Counter[str](), Counter[str]()
-    blocks, held = _blocks(work, kept, [one.kind for one in listed], counts), None
+    blocks, held = _blocks(work, kept, [column.kind for column in listed], counts), None
     if isinstance(kept, _Memory):
         held = tuple(np.concatenate(own) for own in zip(*blocks, strict=True))
         blocks = ([column[at : at + BLOCK] for column in held] for at in range(0, grid.points, BLOCK))
@@ -228,10 +228,12 @@ def part_points(points: int, *, quick: bool) -> int:
 
 def _description(system: CompiledSystem, work: Work) -> dict[str, Any]:
     """Return what a sweep is, as plain data: two with the same description have the same rows."""
-    parameters = {one.name: one.value for one in system.parameters}
-    parameters |= {one.name: float(one.value) for one in system.timings}
+    parameters = {parameter.name: parameter.value for parameter in system.parameters}
+    parameters |= {timing.name: float(timing.value) for timing in system.timings}
     varied = [axis.free for axis in work.grid.axes]
-    parameters |= {f"{group.name}.{one.name}": one.value for group in system.groups for one in group.values}
+    parameters |= {
+        f"{group.name}.{value.name}": value.value for group in system.groups for value in group.values
+    }
     return {
         "topology": system.name,
         "peers": system.peers,
@@ -354,14 +356,17 @@ def _blocks(
         counts[0].update(cells[0].tolist())
         counts[1].update(cells[-1].tolist())
         waiting.append(
-            [_counts(one) if kind == "count" else one for one, kind in zip(columns, kinds, strict=True)]
+            [
+                _counts(column) if kind == "count" else column
+                for column, kind in zip(columns, kinds, strict=True)
+            ]
         )
         rows += len(places)
         while rows >= BLOCK or (rows and number == work.parts - 1):
             whole = [np.concatenate(own) for own in zip(*waiting, strict=True)]
-            yield [one[:BLOCK] for one in whole]
+            yield [values[:BLOCK] for values in whole]
             rows = max(rows - BLOCK, 0)
-            waiting = [[one[BLOCK:] for one in whole]]
+            waiting = [[values[BLOCK:] for values in whole]]
 
 
 def _counts(numbers: NDArray[np.float64]) -> NDArray[Any]:

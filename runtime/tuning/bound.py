@@ -57,7 +57,7 @@ def none_better(
         When to give up, of `time.monotonic`.
     """
     beyond = value + (1 if larger else -1) * SHARE * abs(value)
-    spans = [(one.low, one.high) for one in gains]
+    spans = [(gain.low, gain.high) for gain in gains]
     spans[aim] = (beyond, gains[aim].high) if larger else (gains[aim].low, beyond)
     if not spans[aim][0] < spans[aim][1] or len(gains) > GAINS:
         return None
@@ -65,7 +65,7 @@ def none_better(
         opened = [open_questions(scene, gains, prepared, inside) for scene in scenes]
     except ApcError:  # a scene that is no rational function of the gains
         return None
-    questions = [question for one in opened for question in one.questions]
+    questions = [question for item in opened for question in item.questions]
     cells: list[Cell] = [tuple(spans)]
     looked = entries = 0
     while cells:
@@ -75,7 +75,7 @@ def none_better(
         looked += len(some)
         unstable, widest, size = _looked(questions, some)
         entries += size
-        for cell, place in ((some[one], int(widest[one])) for one in np.flatnonzero(~unstable)):
+        for cell, place in ((some[index], int(widest[index])) for index in np.flatnonzero(~unstable)):
             low, high = cell[place]
             halves = ((low, (low + high) / 2), ((low + high) / 2, high))
             cells += [(*cell[:place], half, *cell[place + 1 :]) for half in halves]
@@ -98,6 +98,6 @@ def _looked(
         outside = np.asarray(np.isfinite(matrix).all(axis=(1, 2, 3)))
         values = np.linalg.eigvals(value_of(matrix[outside]))
         outside[outside] = np.abs(values).max(axis=1, initial=0.0) > 1
-        low = [least_radius(one[0], one[2:], one[1]) for one in matrix[outside]]
+        low = [least_radius(item[0], item[2:], item[1]) for item in matrix[outside]]
         unstable[left[outside]] = np.array(low) > 1
     return unstable, reach.argmax(axis=1), size

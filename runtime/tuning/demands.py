@@ -31,7 +31,7 @@ from apc.vary.growth import MEAN_SQUARE, NOMINAL, PASSIVE, criterion_of, refuse_
 
 PLACE = Place("tune")
 FREE, AIM, SUBJECT, OVER, AGAINST = (
-    Place(f"--{one}") for one in ("free", "maximize", "subject", "over", "against")
+    Place(f"--{text}") for text in ("free", "maximize", "subject", "over", "against")
 )
 
 # What may be minimized beside a gain.
@@ -123,16 +123,16 @@ class Demands:
     @property
     def measured(self) -> tuple[Felt, ...]:
         """All that has to be known of what hands feel: the demands, then the terms of the aim."""
-        return (*self.felt, *(one for _, one in self.aim.terms if isinstance(one, Felt)))
+        return (*self.felt, *(felt for _, felt in self.aim.terms if isinstance(felt, Felt)))
 
     def at_frequency(self, frequency_hz: float) -> Demands:
         """Return the same with what is largest over all frequencies at one of them."""
 
-        def there(one: Felt) -> Felt:
-            return replace(one, frequency_hz=frequency_hz) if one.name == HINF else one
+        def there(felt: Felt) -> Felt:
+            return replace(felt, frequency_hz=frequency_hz) if felt.name == HINF else felt
 
         terms = tuple(
-            (weight, there(one) if isinstance(one, Felt) else one) for weight, one in self.aim.terms
+            (weight, there(felt) if isinstance(felt, Felt) else felt) for weight, felt in self.aim.terms
         )
         return replace(self, felt=tuple(map(there, self.felt)), aim=replace(self.aim, terms=terms))
 
@@ -192,27 +192,27 @@ def read_demands(
             )
         )
     gains = [_range(system, text, FREE) for text in free]
-    for one in gains:
-        if reaches_count(system, one.free) or is_delay(system, one.free):
-            what = f"{one.free.label} is no gain that can be chosen by degrees"
-            raise ApcError(Mistake("E995", FREE, what, hint=f"--over {one.free.label}=…"))
+    for gain in gains:
+        if reaches_count(system, gain.free) or is_delay(system, gain.free):
+            what = f"{gain.free.label} is no gain that can be chosen by degrees"
+            raise ApcError(Mistake("E995", FREE, what, hint=f"--over {gain.free.label}=…"))
     borne = given_ranges(system, [_range(system, text, OVER) for text in over])
-    for place, one in enumerate((*gains, *borne)):
-        if any(other.free.meets(one.free) for other in (*gains, *borne)[:place]):
-            raise ApcError(Mistake("E831", PLACE, f"{one.free.label} has two ranges"))
-    delays = [one for one in borne if is_delay(system, one.free)]
+    for place, gain in enumerate((*gains, *borne)):
+        if any(other.free.meets(gain.free) for other in (*gains, *borne)[:place]):
+            raise ApcError(Mistake("E831", PLACE, f"{gain.free.label} has two ranges"))
+    delays = [interval for interval in borne if is_delay(system, interval.free)]
     if len(delays) > 1:
-        names = " and ".join(one.free.label for one in delays)
+        names = " and ".join(delay.free.label for delay in delays)
         raise ApcError(Mistake("E831", OVER, f"one delay has a range, not more: {names}"))
-    counts = tuple(one for one in borne if reaches_count(system, one.free))
-    box = tuple(one for one in borne if one not in counts and one not in delays)
-    chosen = criterion_of(system, criterion, PLACE, [one.free for one in (*gains, *box)])
+    counts = tuple(interval for interval in borne if reaches_count(system, interval.free))
+    box = tuple(interval for interval in borne if interval not in counts and interval not in delays)
+    chosen = criterion_of(system, criterion, PLACE, [interval.free for interval in (*gains, *box)])
     if chosen == NOMINAL and unreliable(system):
         what = "gains are chosen for the network as it is, which loses or delays packets"
         raise ApcError(Mistake("E996", PLACE, what, hint=f"{MEAN_SQUARE}, or another topology"))
     if chosen == PASSIVE:
-        for one in (*gains, *box):
-            refuse_time(system, one.free, PLACE, chosen)
+        for gain in (*gains, *box):
+            refuse_time(system, gain.free, PLACE, chosen)
     felt = tuple(_felt(text) for text in subject if text.strip().startswith("feel."))
     decay = min((_decay(text) for text in subject if not text.strip().startswith("feel.")), default=1.0)
     best = _aim(gains, maximize, minimize)
@@ -249,15 +249,15 @@ def _range(system: CompiledSystem, text: str, place: Place) -> Range:
             return _counted(system, free, text, place)
         return parse_range(system, text)
     except ApcError as error:
-        raise ApcError(replace(one, place=place) for one in error.mistakes) from None
+        raise ApcError(replace(mistake, place=place) for mistake in error.mistakes) from None
 
 
 def _counted(system: CompiledSystem, free: Free, text: str, place: Place) -> Range:
-    ends = [one.strip() for one in text.partition("=")[2].split(":")]
+    ends = [part.strip() for part in text.partition("=")[2].split(":")]
     if len(ends) != 2 or not all(ends):
         got = text[:80]
         raise ApcError(Mistake("E830", place, "numbers of peers", "NAME=LOW:HIGH", got, f"{free.label}=2:10"))
-    limits = [option_value(place.file, one, what=free.label, unit="1") for one in ends]
+    limits = [option_value(place.file, end, what=free.label, unit="1") for end in ends]
     low, high = count_range(system, free, limits, float(limits[0]), place)
     if low < 1:
         what, hint = f"the range of {free.label}", f"{free.label}=2:{max(high, 2)}"
@@ -270,7 +270,7 @@ def _counted(system: CompiledSystem, free: Free, text: str, place: Place) -> Ran
     try:
         apply(system, [Override(free, Fraction(low))])
     except ApcError as error:  # too few for what follows the others
-        raise ApcError(replace(one, place=place) for one in error.mistakes) from None
+        raise ApcError(replace(mistake, place=place) for mistake in error.mistakes) from None
     return Range(free, "1", Fraction(low), Fraction(high))
 
 
@@ -280,7 +280,7 @@ def _aim(gains: Sequence[Range], maximize: str, minimize: str) -> Aim:
         what = "--maximize and --minimize both say what is best" if maximize else "nothing is to be best"
         raise ApcError(Mistake("E996", PLACE, what, hint=f"--maximize {gains[0].free.label}"))
     text, larger = (maximize or minimize).strip(), bool(maximize)
-    names = [one.free.label for one in gains]
+    names = [gain.free.label for gain in gains]
     if text in names:
         return Aim(text, names.index(text), larger, gains[names.index(text)].unit)
     if text in (RADIUS, SETTLING) and not larger:
@@ -312,9 +312,9 @@ def _aim(gains: Sequence[Range], maximize: str, minimize: str) -> Aim:
 
 def _measure(text: str, place: Place, wants: str = "") -> Felt:
     """Read `feel.impedance at 5 Hz`, or `feel.damping`."""
-    name, at, frequency = (one.strip() for one in text.strip().removeprefix("feel.").partition(" at "))
+    name, at, frequency = (item.strip() for item in text.strip().removeprefix("feel.").partition(" at "))
     if name not in FELT or bool(at) != FELT[name][1]:
-        names = ", ".join(f"feel.{one}{' at 5 Hz' if at else ''}" for one, (_, at) in FELT.items())
+        names = ", ".join(f"feel.{text}{' at 5 Hz' if at else ''}" for text, (_, at) in FELT.items())
         example = f'{place.file} "feel.impedance at 5 Hz{wants}"'
         raise ApcError(Mistake("E996", place, "what is felt", f"one of {names}", text[:80], example))
     if not at:
@@ -327,8 +327,8 @@ def _measure(text: str, place: Place, wants: str = "") -> Felt:
 
 def _decay(text: str) -> float:
     """Read `decay=60 dB in 2 s`; return the factor of a second."""
-    name, _, value = (one.strip() for one in text.partition("="))
-    size, within, time = (one.strip() for one in value.partition(" in "))
+    name, _, value = (item.strip() for item in text.partition("="))
+    size, within, time = (text.strip() for text in value.partition(" in "))
     if name != "decay" or not (within and size.lower().endswith("db")):
         wants = "decay=… dB in … or feel.… at … < …"
         raise ApcError(Mistake("E996", SUBJECT, "a demand", wants, text[:80], '"decay=60 dB in 2 s"'))
@@ -341,7 +341,7 @@ def _decay(text: str) -> float:
 
 def _felt(text: str) -> Felt:
     """Read `feel.impedance at 5 Hz < 20 N*s/m`, of a topology `feel.impedance at 5 Hz=< 20 N*s/m`."""
-    named, less, most = (one.strip() for one in text.replace("=<", "<").replace("= <", "<").partition("<"))
+    named, less, most = (item.strip() for item in text.replace("=<", "<").replace("= <", "<").partition("<"))
     felt = _measure(named if less else text, SUBJECT, " < 20 N*s/m")
     unit = FELT[felt.name][0]
     limit = _part(most, felt.label, unit, f"{felt.label} < 20 {unit}", SUBJECT)
@@ -360,4 +360,6 @@ def _part(text: str, what: str, unit: str, example: str, place: Place) -> Fracti
     try:
         return option_value(place.file, text, what=what, unit=unit)
     except ApcError as error:
-        raise ApcError(replace(one, hint=f'{place.file} "{example}"') for one in error.mistakes) from None
+        raise ApcError(
+            replace(mistake, hint=f'{place.file} "{example}"') for mistake in error.mistakes
+        ) from None

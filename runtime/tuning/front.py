@@ -102,13 +102,13 @@ def front(
 
     def felt(gains: Floats) -> float:
         """Return the largest that is felt in any scenario at gains (m,)."""
-        points = ((one.setting, np.append(gains, one.point)[None]) for one in every)
+        points = ((scenario.setting, np.append(gains, scenario.point)[None]) for scenario in every)
         return max(float(limits.measured(*point, limits.demands)[0, 0, 0]) for point in points)
 
     best = tune(system, demands, seconds=seconds, told=told)
     least = Aim(against.label, len(demands.free), False, FELT[against.name][0], ((1.0, against),))
     other = tune(system, replace(demands, aim=least), seconds=until - time.monotonic(), told=told)
-    low, high = other.best, felt(np.array([float(one.value) for one in best.gains]))
+    low, high = other.best, felt(np.array([float(gain.value) for gain in best.gains]))
     if not (best.met and other.met):
         what = f"no gains were found in these ranges that meet all demands, whatever {against.label} is"
         raise ApcError(Mistake("E996", AGAINST, what))
@@ -125,8 +125,8 @@ def front(
         asked = replace(demands, felt=(*demands.felt, replace(against, most=bound)))
         found = tune(system, asked, seconds=left, told=told)
         if found.met:
-            designs.append(_design(found, felt(np.array([float(one.value) for one in found.gains]))))
-    designs.sort(key=lambda one: one.felt)
+            designs.append(_design(found, felt(np.array([float(gain.value) for gain in found.gains]))))
+    designs.sort(key=lambda design: design.felt)
     return Front(
         topology=system.name,
         aim=demands.aim.label,
@@ -143,13 +143,13 @@ def front(
 
 
 def _design(found: Tuning, felt: float) -> Design:
-    gains = tuple((one.parameter, float(one.value), one.unit) for one in found.gains)
+    gains = tuple((gain.parameter, float(gain.value), gain.unit) for gain in found.gains)
     return Design(gains, found.value, felt, found.proved)
 
 
 def _knee(designs: list[Design]) -> int:
     """Return the place of the design farthest from the line between the ends."""
-    points = np.array([(one.felt, one.value) for one in designs])
+    points = np.array([(design.felt, design.value) for design in designs])
     size = np.ptp(points, axis=0)
     shares = (points - points[0]) / np.where(size == 0, 1.0, size) * np.sign(points[-1] - points[0])
     return int(np.argmax(shares[:, 1] - shares[:, 0]))

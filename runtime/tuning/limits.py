@@ -110,18 +110,18 @@ class Limits:
     @cached_property
     def settings(self) -> list[tuple[tuple[Override, ...], CompiledSystem]]:
         """Every number of peers with every delay that stands for others, and the scene with these."""
-        listed = [range(int(one.low), int(one.high) + 1) for one in self.demands.counts]
+        listed = [range(int(count.low), int(count.high) + 1) for count in self.demands.counts]
         found = []
         for counts in itertools.product(*listed):
             numbers = tuple(
-                Override(one.free, Fraction(count))
-                for one, count in zip(self.demands.counts, counts, strict=True)
+                Override(item.free, Fraction(count))
+                for item, count in zip(self.demands.counts, counts, strict=True)
             )
             scene, delay = apply(self.system, numbers), self.demands.delay
             if delay is None:
                 found.append((numbers, scene))
                 continue
-            for value in dict.fromkeys(one for one, _ in standing_delays(scene, delay)):
+            for value in dict.fromkeys(number for number, _ in standing_delays(scene, delay)):
                 late = Override(delay.free, value)
                 found.append(((*numbers, late), apply(scene, [late])))
         return found
@@ -148,7 +148,7 @@ class Limits:
 
     def every(self) -> list[Scenario]:
         """Return the middle and the corners of the box in every setting."""
-        ends = [(float(one.low), float(one.high)) for one in self.demands.box]
+        ends = [(float(interval.low), float(interval.high)) for interval in self.demands.box]
         middle = tuple((low + high) / 2 for low, high in ends)
         points = dict.fromkeys((middle, *itertools.product(*ends)))
         return [Scenario(place, point) for place in range(len(self.settings)) for point in points]
@@ -157,7 +157,7 @@ class Limits:
         """Return what gives the matrices of a setting over the gains and the box."""
         if setting not in self.known:
             _, scene = self.settings[setting]
-            free = [one.free for one in (*self.demands.free, *self.demands.box)]
+            free = [interval.free for interval in (*self.demands.free, *self.demands.box)]
             self.known[setting] = (
                 GrowthEvaluator(scene, tuple(free), self.prepared, PLACE, self.demands.criterion)
                 if self.by_growth
@@ -173,13 +173,13 @@ class Limits:
             if begin and self.late:
                 break
             some = slice(begin, begin + size)
-            for place, one in enumerate(scenarios):
-                points = np.hstack([chosen[some], np.tile(one.point, (len(chosen[some]), 1))])
+            for place, scenario in enumerate(scenarios):
+                points = np.hstack([chosen[some], np.tile(scenario.point, (len(chosen[some]), 1))])
                 sizes = [
-                    _sizes(matrix) for matrix in self.family(one.setting).matrices(self._numbers(points))
+                    _sizes(matrix) for matrix in self.family(scenario.setting).matrices(self._numbers(points))
                 ]
                 grown = np.max([np.full(len(points), NONE), *sizes], axis=0) - self.allowed
-                found[some, place] = np.max([grown, *self.asked(one.setting, points).T], axis=0)
+                found[some, place] = np.max([grown, *self.asked(scenario.setting, points).T], axis=0)
         return found
 
     def _numbers(self, points: Floats) -> Floats:
@@ -193,7 +193,7 @@ class Limits:
         The worst of a grid is followed to the top by Powell's method, which takes no slopes: where modes take
         turns there is a ridge.
         """
-        low, high = np.array([(float(one.low), float(one.high)) for one in self.demands.box]).T
+        low, high = np.array([(float(interval.low), float(interval.high)) for interval in self.demands.box]).T
 
         def value(shares: Floats) -> Floats:
             """Return the values at points of the box (k, b), each from 0 to 1 along every range."""
@@ -206,7 +206,7 @@ class Limits:
         minimize = load_pool("scipy.optimize").minimize
         bounds = [(0.0, 1.0)] * len(low)
         top = minimize(
-            lambda one: -float(value(one[None])[0]), begin, method="Powell", bounds=bounds, options=POWELL
+            lambda item: -float(value(item[None])[0]), begin, method="Powell", bounds=bounds, options=POWELL
         )
         point = low + np.clip(top.x, 0, 1) * (high - low)
         return Scenario(setting, tuple(point.tolist())), -float(top.fun) - self.allowed
@@ -214,9 +214,9 @@ class Limits:
     @property
     def views(self) -> list[Demands]:
         """The demands with what is largest over all frequencies at each of those known: smooth limits all."""
-        if all(one.name != HINF for one in self.demands.measured):
+        if all(felt.name != HINF for felt in self.demands.measured):
             return [self.demands]
-        return [self.demands.at_frequency(one) for one in self.frequencies]
+        return [self.demands.at_frequency(frequency) for frequency in self.frequencies]
 
     def heard(self, scenarios: Sequence[Scenario], chosen: Floats) -> bool:
         """Add frequencies at which gains are larger, with columns (m,), than at those known; say if any are.
@@ -226,11 +226,11 @@ class Limits:
         The exchange method for a limit at every frequency (Hettich and Kortanek, SIAM Rev. 35 (1993) 380).
         """
         before = len(self.frequencies)
-        for one in scenarios:
-            point = np.append(chosen, one.point)[None]
-            known = np.max([self.asked(one.setting, point, view=view) for view in self.views], axis=0)
-            peaks = self.measured(one.setting, self._numbers(point), self.demands)[0, :, 2]
-            if (self.asked(one.setting, point) > known + LARGER).any():
+        for scenario in scenarios:
+            point = np.append(chosen, scenario.point)[None]
+            known = np.max([self.asked(scenario.setting, point, view=view) for view in self.views], axis=0)
+            peaks = self.measured(scenario.setting, self._numbers(point), self.demands)[0, :, 2]
+            if (self.asked(scenario.setting, point) > known + LARGER).any():
                 named = zip(self.demands.measured, np.maximum(peaks, SLOWEST).tolist(), strict=True)
                 new = [peak for felt, peak in named if felt.name == HINF]
                 self.frequencies.extend(peak for peak in new if peak not in self.frequencies)
@@ -258,10 +258,10 @@ class Limits:
         off = felt[..., 1] if bounded else np.zeros(felt.shape[:2])
         count = len(demands.felt)
         found = np.log(np.maximum(felt[:, :count, 0] + off[:, :count], TINY))
-        found -= np.log([one.most for one in demands.felt])
+        found -= np.log([felt.most for felt in demands.felt])
         if aim.level or aim.fixed is not None:
             level = points[:, len(demands.free)] if aim.fixed is None else np.full(len(points), aim.fixed)
-            weights = [abs(weight) for weight, one in aim.terms if isinstance(one, Felt)]
+            weights = [abs(weight) for weight, item in aim.terms if isinstance(item, Felt)]
             short = (-1 if aim.larger else 1) * (self.sums(setting, points, demands) - level)
             beyond = short + off[:, count:] @ weights
             # Far beyond by its logarithm: gains beside a resonance are large, and slopes still lead away.
@@ -276,8 +276,8 @@ class Limits:
         demands = view or self.demands
         felt = iter(self.measured(setting, self._numbers(points), demands)[:, len(demands.felt) :, 0].T)
         parts = [
-            weight * (next(felt) if isinstance(one, Felt) else points[:, one])
-            for weight, one in demands.aim.terms
+            weight * (next(felt) if isinstance(number, Felt) else points[:, number])
+            for weight, number in demands.aim.terms
         ]
         total = np.asarray(np.sum(parts, axis=0))
         return np.where(np.isfinite(total), total, np.nan)
@@ -288,10 +288,10 @@ class Limits:
         It is infinite where nothing is felt, or nothing can be said.
         """
         views = (self.demands, *self.views)
-        asked = list(dict.fromkeys(one for demands in views for one in demands.measured))
+        asked = list(dict.fromkeys(felt for demands in views for felt in demands.measured))
         found = np.full((len(numbers), len(asked), 3), np.inf)
         _, scene = self.settings[setting]
-        free = [one.free for one in (*self.demands.free, *self.demands.box)]
+        free = [interval.free for interval in (*self.demands.free, *self.demands.box)]
         for place, point in enumerate(map(tuple, numbers.tolist()) if asked else ()):
             row = found[place]
             if (setting, point, len(asked)) not in self.felt:
@@ -303,7 +303,7 @@ class Limits:
                     row[:] = felt_in(changed, asked, self.prepared)
                 self.felt[setting, point, len(asked)] = row.copy()
             row[:] = self.felt[setting, point, len(asked)]
-        return found[:, [asked.index(one) for one in view.measured]]
+        return found[:, [asked.index(felt) for felt in view.measured]]
 
     def sampled(self, scenario: Scenario, chosen: Floats) -> Floats:
         """Return the largest value in a scenario (k,) with columns (k, m), the same whenever it is asked."""
@@ -314,20 +314,20 @@ class Limits:
     def rows(self, scenarios: Sequence[Scenario], chosen: Floats, *, wide: bool = False) -> Rows:
         """Return all limits with columns (m,), their slopes along the numbers of the box, too, if `wide`."""
         ranges = [*self.demands.columns, *self.demands.box]
-        along = np.diag([float(one.high - one.low) for one in ranges])
+        along = np.diag([float(interval.high - interval.low) for interval in ranges])
         along = along if wide else along[: len(chosen)]
         parts: list[tuple[Floats, Floats, Complexes, float, int]] = []
-        aim = [one for _, one in self.demands.aim.terms if isinstance(one, Felt)]
-        peaks = [one.name == HINF for one in self.demands.felt]
-        peaks += [any(one.name == HINF for one in aim)] * bool(self.demands.aim.terms)
-        for place, one in enumerate(scenarios):
-            point = np.append(chosen, one.point)
-            family = self.family(one.setting)
+        aim = [felt for _, felt in self.demands.aim.terms if isinstance(felt, Felt)]
+        peaks = [felt.name == HINF for felt in self.demands.felt]
+        peaks += [any(felt.name == HINF for felt in aim)] * bool(self.demands.aim.terms)
+        for place, scenario in enumerate(scenarios):
+            point = np.append(chosen, scenario.point)
+            family = self.family(scenario.setting)
             inwards = along * np.where(point > [float(own.low + own.high) / 2 for own in ranges], -1, 1)
             moved = np.vstack([point, point + STEP * inwards])
             if isinstance(family, GrowthEvaluator):
                 distinct, which = np.unique(self._numbers(moved), axis=0, return_inverse=True)
-                roots = np.array([family.parts(one) for one in distinct.tolist()])[which.reshape(-1)]
+                roots = np.array([family.parts(item) for item in distinct.tolist()])[which.reshape(-1)]
                 grown = np.nan_to_num(np.log(np.maximum(roots, TINY)), nan=BEYOND) - self.allowed
                 parts.append((*_differences(grown, inwards), math.nan, place))
             else:
@@ -335,10 +335,10 @@ class Limits:
                 for pair in family.slopes(at, self._numbers(along)):
                     values, slopes, found = _largest(*pair)
                     parts.append((values - self.allowed, slopes, found, math.nan, place))
-            still = self.asked(one.setting, moved)[:, np.logical_not(peaks)]
+            still = self.asked(scenario.setting, moved)[:, np.logical_not(peaks)]
             parts.append((*_differences(still, inwards), math.nan, place))
             for frequency, view in zip(self.frequencies, self.views if any(peaks) else (), strict=False):
-                asked = self.asked(one.setting, moved, view=view)[:, peaks]
+                asked = self.asked(scenario.setting, moved, view=view)[:, peaks]
                 parts.append((*_differences(asked, inwards), frequency, place))
         counts = [len(values) for values, *_ in parts]
         return Rows(
@@ -370,33 +370,33 @@ def felt_in(
     ApcError
         Those of `feel`; E996 nothing is felt of it.
     """
-    hertz = [one.frequency_hz for one in asked if not math.isnan(one.frequency_hz)] or [1.0]
-    beside = {PART_OF[one.name] for one in asked if one.name in PART_OF}
+    hertz = [felt.frequency_hz for felt in asked if not math.isnan(felt.frequency_hz)] or [1.0]
+    beside = {PART_OF[felt.name] for felt in asked if felt.name in PART_OF}
     # Beside what is stable, too, the slopes of a search want what is felt wherever there is something to say.
     told = feel(system, hertz, unstable="h2" not in beside, beside=beside, prepared=prepared)
     found = []
-    for one in asked:
-        value, off, hz = 0.0, 0.0, one.frequency_hz
-        if one.name in RESPONSES:
-            response, bound = (getattr(told, name) for name in RESPONSES[one.name])
-            value = abs(complex(response[hertz.index(one.frequency_hz)]))
-            off = value * float(bound[hertz.index(one.frequency_hz)])
-        elif one.name == "damping" and told.low_frequency is not None:
+    for felt in asked:
+        value, off, hz = 0.0, 0.0, felt.frequency_hz
+        if felt.name in RESPONSES:
+            response, bound = (getattr(told, name) for name in RESPONSES[felt.name])
+            value = abs(complex(response[hertz.index(felt.frequency_hz)]))
+            off = value * float(bound[hertz.index(felt.frequency_hz)])
+        elif felt.name == "damping" and told.low_frequency is not None:
             value, off = told.low_frequency.damping, told.low_frequency.errors[1]
-        elif one.name == "error_h2" and told.h2 and told.h2[0].error_m is not None:
+        elif felt.name == "error_h2" and told.h2 and told.h2[0].error_m is not None:
             value, off = told.h2[0].error_m, told.h2[0].errors[0] or 0.0
-        elif one.name == HINF:
+        elif felt.name == HINF:
             if COUPLED in told.notes:
-                what = f"{one.label} is not told of peers that differ, which move apart together"
+                what = f"{felt.label} is not told of peers that differ, which move apart together"
                 raise ApcError(Mistake("E996", PLACE, what, hint="feel.error_h2"))
             for mode in (mode for mode in told.hinf if mode.of == "error"):
                 peak = mode.sampled_data
                 own = (peak.norm, peak.error, peak.frequency_hz)
-                if not math.isnan(one.frequency_hz):
-                    own = (float(mode.gains[hertz.index(one.frequency_hz)]), peak.error, one.frequency_hz)
+                if not math.isnan(felt.frequency_hz):
+                    own = (float(mode.gains[hertz.index(felt.frequency_hz)]), peak.error, felt.frequency_hz)
                 value, off, hz = max((value, off, hz), own)
         if value == 0:
-            raise ApcError(Mistake("E996", SUBJECT, f"of {one.label} nothing is felt in this scene"))
+            raise ApcError(Mistake("E996", SUBJECT, f"of {felt.label} nothing is felt in this scene"))
         found.append((value, off, hz))
     return found
 

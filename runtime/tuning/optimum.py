@@ -99,11 +99,11 @@ class Search:
 
     @cached_property
     def _low(self) -> Floats:
-        return np.array([float(one.low) for one in self.limits.demands.columns])
+        return np.array([float(column.low) for column in self.limits.demands.columns])
 
     @cached_property
     def _width(self) -> Floats:
-        return np.array([float(one.high) for one in self.limits.demands.columns]) - self._low
+        return np.array([float(column.high) for column in self.limits.demands.columns]) - self._low
 
     @cached_property
     def _ends(self) -> Floats:
@@ -156,7 +156,7 @@ class Search:
         """
         points = np.vstack([np.clip((present - self._low) / self._width, *self._ends), self.even])
         gains = self.gains(points)
-        worst = np.max([self.limits.sampled(one, gains) for one in self.scenarios], axis=0)
+        worst = np.max([self.limits.sampled(scenario, gains) for scenario in self.scenarios], axis=0)
         points = self._at_level(points, self.scenarios)
         order = np.argsort(self._order(points, worst), kind="stable")
         if than is not None:
@@ -180,8 +180,10 @@ class Search:
         gains = self.gains(points)
         sums = np.array(
             [
-                self.limits.sums(one.setting, np.hstack([gains, np.tile(one.point, (len(gains), 1))]))
-                for one in scenarios
+                self.limits.sums(
+                    scenario.setting, np.hstack([gains, np.tile(scenario.point, (len(gains), 1))])
+                )
+                for scenario in scenarios
             ]
         )
         level = sums.min(axis=0) if self.sign > 0 else sums.max(axis=0)
@@ -324,7 +326,7 @@ class Search:
         def conditions(y: Floats) -> Floats:
             shares, rest = unpacked(y)
             found = rows_of(shares)
-            same = [_same(found, here, one) for one in active]
+            same = [_same(found, here, number) for number in active]
             values, slopes = found.values[same], found.slopes[same]
             weights = rest[:-1] if spare else rest
             along = self._aim() + weights @ slopes
@@ -378,10 +380,10 @@ class Search:
         return Optimum(tuple(self.scenarios), self.gains(shares), value, error, worst, rows, multipliers, 0)
 
 
-def _same(found: Rows, here: Rows, one: int) -> int:
+def _same(found: Rows, here: Rows, number: int) -> int:
     """Return the row that goes on a mode of another point: of its block, the nearest eigenvalue."""
-    own = np.flatnonzero(found.block == here.block[one])
-    return int(own[np.argmin(np.abs(found.eigenvalue[own] - here.eigenvalue[one]))])
+    own = np.flatnonzero(found.block == here.block[number])
+    return int(own[np.argmin(np.abs(found.eigenvalue[own] - here.eigenvalue[number]))])
 
 
 def _even(count: int, size: int) -> Floats:

@@ -225,12 +225,14 @@ class _Work:
     def __post_init__(self) -> None:
         self.limits = Limits(self.system, prepare(self.system), self.demands, self.until)
         # What can't be felt anywhere is refused before anything is looked for.
-        asked = [one for one in self.demands.felt if one.name in RESPONSES]
-        asked += [one for one in self.demands.measured if one.name == HINF]
+        asked = [felt for felt in self.demands.felt if felt.name in RESPONSES]
+        asked += [felt for felt in self.demands.measured if felt.name == HINF]
         if asked:
             felt_in(self.system, asked, self.limits.prepared)
         self.every = self.limits.every()
-        self.present = np.array([float(value_now(self.system, one.free)) for one in self.demands.free])
+        self.present = np.array(
+            [float(value_now(self.system, interval.free)) for interval in self.demands.free]
+        )
         first = len(self.every) // len(self.limits.settings)
         self.scenarios = list(dict.fromkeys((self.every[0], self.every[-first])))
         if self.demands.aim.terms:
@@ -242,8 +244,10 @@ class _Work:
         points = np.vstack([self.present, search.gains(search.even)])
         sums = np.array(
             [
-                self.limits.sums(one.setting, np.hstack([points, np.tile(one.point, (len(points), 1))]))
-                for one in self.scenarios
+                self.limits.sums(
+                    scenario.setting, np.hstack([points, np.tile(scenario.point, (len(points), 1))])
+                )
+                for scenario in self.scenarios
             ]
         )
         known = sums[np.isfinite(sums)]
@@ -264,7 +268,9 @@ class _Work:
         decays = self.limits.by_growth and (self.demands.decay < 1 or self.demands.aim.column is None)
         boxed = self.demands.criterion == PASSIVE and self.demands.box
         felt = self.demands.measured and (self.demands.box or self.demands.delay)
-        gains = any(one.name == HINF for one in self.demands.measured)  # right to an error, not bounded by it
+        gains = any(
+            felt.name == HINF for felt in self.demands.measured
+        )  # right to an error, not bounded by it
         return decays or gains or bool(boxed or felt)
 
     @property
@@ -301,13 +307,13 @@ class _Work:
             search = Search(self.limits, self.scenarios, column, sign)
             if not starts:
                 starts = begun = search.start(self.present, self.every)
-                for one in starts:
-                    self.limits.heard(self.scenarios, search.gains(one))
+                for start in starts:
+                    self.limits.heard(self.scenarios, search.gains(start))
             found = search.best(starts)
             self.looked += found.looked
             bound = found.rows.scenario[found.multipliers > 0]
             if turn < DROPPING and len(bound):  # what limits nothing is looked at again with all others
-                self.scenarios = [one for place, one in enumerate(self.scenarios) if place in bound]
+                self.scenarios = [scenario for place, scenario in enumerate(self.scenarios) if place in bound]
             level = max(found.worst, 0.0 if column is not None else -math.inf)
             starts = [search.shares(found)]
             if self._added(found.gains, level) or self.limits.heard(self.scenarios, found.gains):
@@ -325,11 +331,15 @@ class _Work:
         worst = self.limits.worst(self.every, gains[None])[0]
         order = np.argsort(-worst)
         new = [self.every[place] for place in order[:MORE] if worst[place] > level + ABOVE]
-        new = [one for one in new if one not in self.scenarios]
+        new = [item for item in new if item not in self.scenarios]
         if not new and self.demands.box and not self.limits.slow:
             nearest = dict.fromkeys(self.every[place].setting for place in order.tolist())
-            within = (self.limits.worst_within(one, gains) for one in list(nearest)[:MOST_LIMITED])
-            new = [one for one, value in within if value > level + ABOVE and one not in self.scenarios]
+            within = (self.limits.worst_within(item, gains) for item in list(nearest)[:MOST_LIMITED])
+            new = [
+                scenario
+                for scenario, value in within
+                if value > level + ABOVE and scenario not in self.scenarios
+            ]
         self.scenarios += new
         return bool(new)
 
@@ -352,7 +362,7 @@ class _Work:
                 gains = self._typed(gains, column, middle)
             if self.demands.aim.level:
                 gains[-1] = self._worth(gains)
-            point = np.array([float(one) for one in gains])
+            point = np.array([float(gain) for gain in gains])
             if column is not None and not self.late and self._added(point, -ABOVE):
                 middle = None
                 continue
@@ -360,15 +370,18 @@ class _Work:
             last = self.late or place + 1 == len(shares)
             if held or last:
                 proofs, failed = self._proofs(gains, whole=last)
-                proved = self._unproved or all(one.proof.stable for one in proofs)
+                proved = self._unproved or all(proof.proof.stable for proof in proofs)
                 if failed is not None or last or proved:
                     return gains, proofs, failed
             place += 1
 
     def _worth(self, gains: Sequence[Fraction]) -> Fraction:
         """Return the level that an aim keeps with gains in every scenario, rounded to where it is kept."""
-        point = np.array([float(one) for one in gains])
-        sums = [self.limits.sums(one.setting, np.append(point, one.point)[None])[0] for one in self.every]
+        point = np.array([float(gain) for gain in gains])
+        sums = [
+            self.limits.sums(scenario.setting, np.append(point, scenario.point)[None])[0]
+            for scenario in self.every
+        ]
         larger = self.demands.aim.larger
         worst = float(min(sums) if larger else max(sums))
         if not math.isfinite(worst):
@@ -390,7 +403,7 @@ class _Work:
         if aim.level:
             fixed_level = replace(aim, level=None, fixed=float(gains[column]))
             return replace(self.limits, demands=replace(self.demands, aim=fixed_level), samples={})
-        others = tuple(one for place, one in enumerate(free) if place != column)
+        others = tuple(interval for place, interval in enumerate(free) if place != column)
         fixed = apply(self.system, [Override(free[column].free, gains[column])])
         demands, heard = replace(self.demands, free=others), self.limits.frequencies
         return Limits(fixed, self.limits.prepared, demands, self.until, frequencies=heard)
@@ -412,8 +425,8 @@ class _Work:
         digits = range(DIGITS if self.late else 1, DIGITS + 1)
         listed = [
             [
-                min(max(_decimal(value, count), one.low), one.high)
-                for value, one in zip(middle, ranges, strict=True)
+                min(max(_decimal(value, count), interval.low), interval.high)
+                for value, interval in zip(middle, ranges, strict=True)
             ]
             for count in digits
         ]
@@ -426,7 +439,7 @@ class _Work:
         )
         fits = np.flatnonzero(worst[:-1] <= room)
         others = iter(listed[int(fits[0]) if len(fits) else -1])
-        return [one if place == column else next(others) for place, one in enumerate(gains)]
+        return [gain if place == column else next(others) for place, gain in enumerate(gains)]
 
     def _proofs(self, gains: Sequence[Fraction], *, whole: bool) -> tuple[list[Proved], Scenario | None]:
         """Return what is proved of gains with each number of peers, those first that limit them most.
@@ -436,8 +449,10 @@ class _Work:
         inside = self._inside(gains)
         delay, counts = self.demands.delay, self.demands.counts
         ranges = [*([delay] if delay else []), *self.demands.box]
-        changes = [Override(one.free, value) for one, value in zip(self.demands.free, gains, strict=False)]
-        point = np.array([[float(one) for one in gains]])
+        changes = [
+            Override(interval.free, value) for interval, value in zip(self.demands.free, gains, strict=False)
+        ]
+        point = np.array([[float(gain) for gain in gains]])
         worst = self.limits.worst(self.every, point)[0]
         order: dict[tuple[Override, ...], None] = {}
         for place in np.argsort(-worst, kind="stable"):
@@ -445,7 +460,7 @@ class _Work:
             order[numbers[: len(counts)]] = None
         found: list[Proved] = []
         for numbers in order:
-            named = tuple((one.free.label, int(one.value)) for one in numbers)
+            named = tuple((number.free.label, int(number.value)) for number in numbers)
             if self.late:
                 found.append(Proved(named, _unlooked(self.system.name, ranges)))
                 continue
@@ -482,7 +497,7 @@ class _Work:
         """Return what the spectral radius is to be proved below: of the least there is, a little above it."""
         if self.demands.aim.column is not None or self.limits.by_growth:
             return math.exp(self.limits.allowed)
-        point = np.array([[float(one) for one in gains]])
+        point = np.array([[float(gain) for gain in gains]])
         least = 1 - math.exp(float(self.limits.worst(self.every, point).max()) + self.limits.allowed)
         return float(1 - _decimal(least * (1 - BACK[-1]), DIGITS, ROUND_FLOOR))
 
@@ -490,12 +505,12 @@ class _Work:
         self, numbers: tuple[Override, ...], proof: BoxProof, ranges: Sequence[Range]
     ) -> Scenario | None:
         """Return the scenario in which gains are proved not to hold; None where it is one already."""
-        values = dict(zip([one.free for one in ranges], proof.point, strict=False))
+        values = dict(zip([interval.free for interval in ranges], proof.point, strict=False))
         late = self.demands.delay and values.get(self.demands.delay.free)
         for place, (own, _) in enumerate(self.limits.settings):
             here = len(own) == len(numbers) or float(own[-1].value) == late
             if own[: len(numbers)] == numbers and here:
-                box = tuple(values[one.free] for one in self.demands.box)
+                box = tuple(values[interval.free] for interval in self.demands.box)
                 found = Scenario(place, box)
                 return None if found in self.scenarios else found
         return None
@@ -511,7 +526,7 @@ class _Work:
         self, found: Optimum, gains: Sequence[Fraction], proofs: Sequence[Proved], *, met: bool = True
     ) -> Tuning:
         demands, column = self.demands, self.demands.aim.column
-        worst = float(self.limits.worst(self.every, np.array([[float(one) for one in gains]])).max())
+        worst = float(self.limits.worst(self.every, np.array([[float(gain) for gain in gains]])).max())
         met = met and (column is None or worst < 0)
         value = float(gains[column]) if column is not None else self._inside(gains)
         if column is None and self.limits.by_growth:
@@ -527,22 +542,22 @@ class _Work:
             unit=demands.aim.unit,
             larger=demands.aim.larger,
             met=met,
-            proved=met and bool(proofs) and all(one.proof.stable for one in proofs),
+            proved=met and bool(proofs) and all(proof.proof.stable for proof in proofs),
             value=value,
             best=best,
             error=error,
             worst=worst,
             gains=tuple(
                 Gain(
-                    one.free.label,
-                    one.unit,
-                    float(one.low),
-                    float(one.high),
+                    interval.free.label,
+                    interval.unit,
+                    float(interval.low),
+                    float(interval.high),
                     typed,
                     float(before),
                     float(now),
                 )
-                for one, typed, before, now in zip(
+                for interval, typed, before, now in zip(
                     demands.free, gains, found.gains, self.present, strict=False
                 )
             ),
@@ -554,7 +569,8 @@ class _Work:
             allowed=self.limits.allowed,
             proofs=tuple(proofs),
             binding=tuple(self._binding(found, met=met)),
-            looked=self.looked + sum(int((one != BEYOND).sum()) for one in self.limits.samples.values()),
+            looked=self.looked
+            + sum(int((sample != BEYOND).sum()) for sample in self.limits.samples.values()),
             bounded=self._bounded(found, gains) if met else None,
             notes=(
                 *[why for why in (self._why(),) if why and not met],
@@ -566,7 +582,7 @@ class _Work:
                 *left_out(
                     self.system,
                     network=demands.criterion != MEAN_SQUARE,
-                    varied=[one.free for one in demands.over],
+                    varied=[interval.free for interval in demands.over],
                 ),
             ),
             ranges=demands.free,
@@ -588,12 +604,12 @@ class _Work:
             or demands.aim.level
         ):
             return None
-        worst = self.limits.worst(self.every, np.array([[float(one) for one in gains]]))[0]
+        worst = self.limits.worst(self.every, np.array([[float(gain) for gain in gains]]))[0]
         order = np.argsort(-worst, kind="stable").tolist()
         listed = dict.fromkeys([*self._binding_scenarios(found), *(self.every[place] for place in order)])
         self.told("proving that no gains do better")
         return none_better(
-            [self._scene(one) for one in list(listed)[:LIMITING]],
+            [self._scene(item) for item in list(listed)[:LIMITING]],
             self.limits.prepared,
             demands.free,
             column,
@@ -610,7 +626,7 @@ class _Work:
     def _scene(self, scenario: Scenario) -> CompiledSystem:
         _, scene = self.limits.settings[scenario.setting]
         pairs = zip(self.demands.box, map(Fraction, scenario.point), strict=True)
-        return apply(scene, [Override(one.free, value) for one, value in pairs])
+        return apply(scene, [Override(interval.free, value) for interval, value in pairs])
 
     def _binding(self, found: Optimum, *, met: bool) -> list[Binding]:
         """Return what binds: each mode with a multiplier, and what less of the ends that meet there buys."""
@@ -619,8 +635,8 @@ class _Work:
         rows = self.limits.rows(found.scenarios, found.gains, wide=True)
         scale = 1.0
         if aim is not None and met:
-            one = self.demands.columns[aim]
-            scale = float(one.high - one.low) * (1 if self.demands.aim.larger else -1)
+            column = self.demands.columns[aim]
+            scale = float(column.high - column.low) * (1 if self.demands.aim.larger else -1)
         for place in np.flatnonzero(found.multipliers > 0):
             scenario = found.scenarios[rows.scenario[place]]
             numbers, _ = self.limits.settings[scenario.setting]
@@ -632,8 +648,14 @@ class _Work:
                     change = -share if value == float(own.high) else share
                     better = -scale * float(found.multipliers[place]) * float(slope) * change
                     buys.append((own.free.label, value, own.unit, better))
-            where = [(one.free.label, float(one.value), "1") for one in numbers[: len(self.demands.counts)]]
-            where += [(one.free.label, float(one.value), "s") for one in numbers[len(self.demands.counts) :]]
+            where = [
+                (number.free.label, float(number.value), "1")
+                for number in numbers[: len(self.demands.counts)]
+            ]
+            where += [
+                (number.free.label, float(number.value), "s")
+                for number in numbers[len(self.demands.counts) :]
+            ]
             where += [
                 (own.free.label, value, own.unit)
                 for own, value in zip(self.demands.box, scenario.point, strict=True)
@@ -650,7 +672,7 @@ class _Work:
         if np.isnan(eigenvalue) and not (passive and not self.demands.measured):
             return "", math.nan
         pairs = zip(self.demands.free, map(Fraction, found.gains.tolist()), strict=False)
-        changed = apply(self._scene(scenario), [Override(one.free, value) for one, value in pairs])
+        changed = apply(self._scene(scenario), [Override(interval.free, value) for interval, value in pairs])
         if passive:
             worst = passive_hands(changed).worst
             return ("", math.nan) if worst is None else (worst.name, worst.frequency_hz or math.nan)
@@ -660,7 +682,7 @@ class _Work:
             return "", math.nan
         if not len(modes):
             return "", math.nan
-        nearest = min(modes, key=lambda one: abs(one.eigenvalue - eigenvalue))
+        nearest = min(modes, key=lambda mode: abs(mode.eigenvalue - eigenvalue))
         return nearest.shape, nearest.frequency_hz
 
 

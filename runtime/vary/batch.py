@@ -139,7 +139,7 @@ class Bounded:
             error=some(self.error),
             whole=some(self.whole),
             heard=tuple(map(some, self.heard)),
-            sites=tuple(every_matrix(one, some) for one in self.sites),
+            sites=tuple(every_matrix(site, some) for site in self.sites),
         )
 
 
@@ -170,7 +170,7 @@ class BatchEvaluator:
     @property
     def names(self) -> tuple[str, ...]:
         """The names of the closed systems."""
-        return tuple(one.name for one in self.closed)
+        return tuple(closed_system.name for closed_system in self.closed)
 
     @property
     def one_shape(self) -> bool:
@@ -189,19 +189,23 @@ class BatchEvaluator:
 
     def states(self) -> int:
         """Return how many states the largest closed system has."""
-        return max((len(one.matrix) for one in self.closed), default=0)
+        return max((len(closed_system.matrix) for closed_system in self.closed), default=0)
 
     def errors(self, values: Floats) -> tuple[Floats, ...]:
         """Return bounds (k, n, n) on the errors of the matrices at values (k, m), entry by entry."""
         found = self.bounded(partial(self.vectors, values=values))
-        return tuple(np.broadcast_to(one.error, (len(values), *one.error.shape[1:])) for one in found)
+        return tuple(
+            np.broadcast_to(bounded.error, (len(values), *bounded.error.shape[1:])) for bounded in found
+        )
 
     def slopes(self, values: Floats, along: Floats) -> tuple[tuple[Floats, Floats], ...]:
         """Return each system's matrices (k, n, n) and their derivatives along directions (k, m)."""
         lifted = self.lifted(values + (STEP * 1j) * along)
         found = (reduced(wiring, closed_loop(wiring, lifted), len(values)) for wiring in self.wirings)
         # Squares of the step stand where nothing should: balancing would take them for entries.
-        return tuple((np.where(np.abs(one.real) <= STEP, 0.0, one.real), one.imag / STEP) for one in found)
+        return tuple(
+            (np.where(np.abs(values.real) <= STEP, 0.0, values.real), values.imag / STEP) for values in found
+        )
 
     def vectors(self, group: PeerGroup, values: Matrices) -> Matrices:
         """Return the parameter vectors (k, n_p) of a group, or (1, n_p) when no value reaches it."""
@@ -370,13 +374,13 @@ def batch_evaluator(
             for event in group.schedule.events
             if isinstance(event, Propagate)
         }
-    tangents = {one.jacobians.kind.name: _tangent(one.jacobians) for one in groups} if follows else {}
+    tangents = {group.jacobians.kind.name: _tangent(group.jacobians) for group in groups} if follows else {}
     found = BatchEvaluator(
         system=system,
         free=tuple(free),
         exchange=exchange,
         groups=tuple(groups),
-        wirings=tuple(wire(one) for one in systems),
+        wirings=tuple(wire(system) for system in systems),
         durations=durations,
         tangents=tangents,
         fixed={},
@@ -389,7 +393,7 @@ def _told_apart(evaluator: BatchEvaluator) -> tuple[Wiring, ...]:
     """Return the wirings, those marked whose rigid directions are not the same at another point."""
     if not any(wiring.rigid.names for wiring in evaluator.wirings):
         return evaluator.wirings
-    base = np.array([value_now(evaluator.system, one) for one in evaluator.free])
+    base = np.array([value_now(evaluator.system, free) for free in evaluator.free])
     other = (base * (1 + _generic(len(base))[0][0]) + 1e-3).tolist()
     lifted = evaluator.lifted(np.array([other]))
     found = []
@@ -467,7 +471,7 @@ def _tangent(built: SiteJacobians) -> Any:
     """Return the coefficients and their derivative along a direction, as a function of (p, dp)."""
     arguments = built.function.sx_in()
     along = casadi.SX.sym("along", arguments[4].numel())
-    zeros = [casadi.SX.zeros(one.numel()) for one in arguments]
+    zeros = [casadi.SX.zeros(argument.numel()) for argument in arguments]
     (flat,) = built.function.call([*zeros[:4], arguments[4], zeros[5]])
     slope = casadi.jtimes(flat, arguments[4], along)
     return casadi.Function("tangent", [arguments[4], along], [casadi.densify(flat), casadi.densify(slope)])

@@ -56,7 +56,11 @@ def count_range(
     placed = any(link.graph.shape != "complete" for link in system.links)
     span = PLACED_SPAN if placed else SPAN  # there each peer has a place of its own
     most = min(
-        (one.maximum for one in system.parameters if one.name == free.name and one.maximum is not None),
+        (
+            parameter.maximum
+            for parameter in system.parameters
+            if parameter.name == free.name and parameter.maximum is not None
+        ),
         default=math.inf,
     )
     return first, _whole(high, int(min(max(math.ceil(span * present), first + 1), most)), place)

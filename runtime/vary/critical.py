@@ -162,7 +162,7 @@ def critical(
         timed, counted = reaches_time(system, free), reaches_count(system, free)
         unit = unit_of(system, free.name)
         present = float(delay_now(system, free)) if timed else parameter_of(system, free).value
-        limits = [_limit(*one, free, unit) for one in (("--lower", lower), ("--upper", upper))]
+        limits = [_limit(*pair, free, unit) for pair in (("--lower", lower), ("--upper", upper))]
         _check_limits(system, free, limits, timed=timed)
         prepared = prepare(system)
 
@@ -178,7 +178,7 @@ def critical(
             )
         elif by_growth:
             refuse_time(system, free, _PLACE, chosen_criterion)
-            low, high = (None if one is None else float(one) for one in limits)
+            low, high = (None if limit is None else float(limit) for limit in limits)
             points = growth_points(system, free, low, high, present)
             found = search(
                 GrowthLine(GrowthEvaluator(system, (free,), prepared, _PLACE, chosen_criterion), points),
@@ -249,7 +249,7 @@ def _everywhere(found: Search, present: float, stable_now: Callable[[], bool | N
 def _line(system: CompiledSystem, free: Free, limits: Sequence[Fraction | None], prepared: Prepared) -> Line:
     """Return a scene along a parameter that reaches no time: by its matrices, or value by value."""
     parameter = parameter_of(system, free)
-    low, high = (None if one is None else float(one) for one in limits)
+    low, high = (None if limit is None else float(limit) for limit in limits)
     low = parameter.minimum if low is None else low
     most = math.inf if parameter.maximum is None else parameter.maximum
     try:
@@ -304,11 +304,11 @@ def _chosen(found: Search, present: float, stable_now: Callable[[], bool | None]
     """Return the crossing that matters, see `Critical`; on a jump, the scene itself tells its side."""
     if not found.edges:
         return None
-    below = sum(one.boundary < present for one in found.edges)
-    upto = sum(one.boundary <= present for one in found.edges)
+    below = sum(edge.boundary < present for edge in found.edges)
+    upto = sum(edge.boundary <= present for edge in found.edges)
     if upto > below and found.stable[below] != stable_now():
         below = upto
     if found.stable[below]:
         return found.edges[below] if below < len(found.edges) else found.edges[below - 1]
-    lost = [one for one in found.edges if one.stable_side == "below"]
+    lost = [edge for edge in found.edges if edge.stable_side == "below"]
     return lost[0] if lost else found.edges[0]

@@ -194,8 +194,8 @@ class _Samples:
         """Return both together; rows of fewer states are filled up with zeros, which decide nothing."""
         wide = max(self.values.shape[1], other.values.shape[1])
 
-        def both(one: Complexes, more: Complexes) -> Complexes:
-            rows = [np.pad(part, ((0, 0), (0, wide - part.shape[1]))) for part in (one, more)]
+        def both(values: Complexes, more: Complexes) -> Complexes:
+            rows = [np.pad(part, ((0, 0), (0, wide - part.shape[1]))) for part in (values, more)]
             return np.concatenate(rows)
 
         points = np.concatenate([self.points, other.points])
@@ -261,7 +261,7 @@ def search(line: Line, *, first: bool = False, told: Told | None = None) -> Sear
                     edges.append(found)
                     stable.append(side[place + 1])
         before = stretch
-        if why or (first and any(one.stable_side == "below" for one in edges)):
+        if why or (first and any(edge.stable_side == "below" for edge in edges)):
             break
     scanned = (ends[0], ends[-1]) if ends else (math.nan, math.nan)
     return Search(

@@ -61,12 +61,12 @@ def prove_over_delay(
     ApcError
         E831 two delays, or one that forces wait for, too; E846 too many pieces; those of `prove`.
     """
-    delays = [one for one in ranges if is_delay(system, one.free)]
+    delays = [interval for interval in ranges if is_delay(system, interval.free)]
     if len(delays) > 1:
-        names = " and ".join(dict.fromkeys(one.free.label for one in delays))
+        names = " and ".join(dict.fromkeys(delay.free.label for delay in delays))
         raise ApcError(Mistake("E831", PLACE, f"one range of one delay is taken in a box, not more: {names}"))
     (delay,) = delays
-    rest = [one for one in ranges if one is not delay]
+    rest = [interval for interval in ranges if interval is not delay]
     place, width = list(ranges).index(delay), delay.high - delay.low
     cells, left, verdict = 0, Fraction(0), UNDECIDED
     open_point: tuple[float, ...] = ()

@@ -76,7 +76,7 @@ def delay_now(system: CompiledSystem, free: Free) -> Fraction:
     for timing in system.timings:
         if timing.name == free.name:
             return timing.value
-    return next(one.number for one in system.parameters if one.name == free.name)
+    return next(parameter.number for parameter in system.parameters if parameter.name == free.name)
 
 
 def delay_pieces(
@@ -215,10 +215,10 @@ def borders(system: CompiledSystem, free: Free, *, place: Place) -> Callable[[Fr
         *itertools.product(packets, ticks),
     ]
     found = set()
-    for one, other in meetings:
+    for item, other in meetings:
         first, second = (
             (clocks[clock], at[0].get(delay, Fraction(0)), slopes.get(delay, Fraction(0)))
-            for clock, delay in (one, other)
+            for clock, delay in (item, other)
         )
         slope = first[2] - second[2]
         if slope:

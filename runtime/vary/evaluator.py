@@ -98,7 +98,7 @@ class PointEvaluator:
     def states(self) -> int:
         """Return how many states the largest closed system has, with the scene's own numbers."""
         systems = split(*lifted_groups(self.system, prepared=self.prepared))
-        return max((len(one.matrix) for one in systems), default=0)
+        return max((len(system.matrix) for system in systems), default=0)
 
     def matrices(self, values: Floats) -> tuple[Floats, ...]:
         """Return the reduced frame matrices of all systems as blocks (k, n, n) at values (k, m).
@@ -137,7 +137,7 @@ class PointEvaluator:
         blocks = [self._blocks(value) for value in points]
         here, before, after = np.split(_filled_up(blocks), 3)
         slope = (after - before) / (2 * step[:, None, None])
-        shapes = [[len(one) for one in listed] for listed in blocks]
+        shapes = [[len(values) for values in listed] for listed in blocks]
         count = len(values)
         for row in range(count):
             if shapes[row] == shapes[count + row] == shapes[2 * count + row]:
@@ -145,7 +145,7 @@ class PointEvaluator:
             slope[row] = np.nan
             way = 1.0 if shapes[row] == shapes[2 * count + row] else -1.0
             inside = [self._blocks(value) for value in values[row] + way * np.outer([1.0, 2.0], moved[row])]
-            if all([len(one) for one in listed] == shapes[row] for listed in inside):
+            if all([len(values) for values in listed] == shapes[row] for listed in inside):
                 _, second, third = _filled_up([blocks[row], *inside])
                 size = len(second)
                 slope[row] = 0.0
@@ -183,10 +183,10 @@ class PointEvaluator:
                 except ApcError:
                     continue
             blocks = self.alike[place].matrices(values[rows])
-            sure = np.all([_is_apart(one) for one in blocks], axis=0)
+            sure = np.all([_is_apart(block) for block in blocks], axis=0)
             which[rows[sure]], still[rows[sure]] = place, False
-            for one in blocks:
-                _put_in(listed, rows[sure], one[sure])
+            for block in blocks:
+                _put_in(listed, rows[sure], block[sure])
             place += 1
         return which, listed
 
@@ -236,16 +236,16 @@ def _is_apart(matrices: Floats) -> Truths:
 
 def _filled_up(blocks: Sequence[Sequence[Floats]]) -> Floats:
     """Return the blocks of each point as one matrix (k, n, n), all of it NaN where a block is."""
-    size = max((sum(len(one) for one in listed) for listed in blocks), default=0)
+    size = max((sum(len(values) for values in listed) for listed in blocks), default=0)
     found = np.zeros((len(blocks), size, size))
     for matrix, listed in zip(found, blocks, strict=True):
-        if not all(np.isfinite(one).all() for one in listed):
+        if not all(np.isfinite(values).all() for values in listed):
             matrix[:] = np.nan
             continue
         start = 0
-        for one in listed:
-            rows = slice(start, start + len(one))
-            matrix[rows, rows] = one
+        for values in listed:
+            rows = slice(start, start + len(values))
+            matrix[rows, rows] = values
             start = rows.stop
     return found
 
@@ -258,7 +258,7 @@ def _reduced(system: ClosedSystem, free: RigidModes) -> tuple[Floats, Floats]:
 
 def _filled_up_pairs(pairs: Sequence[Sequence[tuple[Floats, Floats]]]) -> tuple[Floats, Floats]:
     """Return the matrices of each point as one (k, n, n), and their errors."""
-    matrices, errors = ([[pair[place] for pair in one] for one in pairs] for place in (0, 1))
+    matrices, errors = ([[pair[place] for pair in item] for item in pairs] for place in (0, 1))
     return _filled_up(matrices), _filled_up(errors)
 
 
@@ -321,7 +321,7 @@ def many_packets(system: CompiledSystem, prepared: Prepared) -> bool:
     """Say whether packets on their way are most of a scene's states: an analysis leaves them out."""
     packets = max(sum(schedule.depths) for schedule in prepared.schedules)
     used = zip(prepared.schedules, system.groups, strict=True)
-    return packets > max(states_of(one, prepared.jacobians[group.kind]) for one, group in used) / 2
+    return packets > max(states_of(schedule, prepared.jacobians[group.kind]) for schedule, group in used) / 2
 
 
 def evaluator_of_many(
@@ -347,7 +347,10 @@ def evaluator_of_many(
         states = found.states()
     except ApcError as error:  # an analysis has methods that spare the matrix, a range of values has none
         raise ApcError(
-            [replace(one, hint=hint) if "--method" in one.hint else one for one in error.mistakes]
+            [
+                replace(mistake, hint=hint) if "--method" in mistake.hint else mistake
+                for mistake in error.mistakes
+            ]
         ) from None
     if states > MOST_STATES:
         what = (
@@ -361,10 +364,10 @@ def evaluator_of_many(
 def generic(system: CompiledSystem, free: Sequence[Free]) -> CompiledSystem:
     """Return the system with meaningless values for what is free: peers alike there are so everywhere."""
     overrides = []
-    for place, one in enumerate(free):
-        value = Fraction(parameter_of(system, one).value)
+    for place, item in enumerate(free):
+        value = Fraction(parameter_of(system, item).value)
         share = GENERIC * Fraction(place + 3, 3)
-        overrides.append(Override(one, value * (1 + share) if value else share))
+        overrides.append(Override(item, value * (1 + share) if value else share))
     unbounded = replace(
         system,
         parameters=tuple(_unbounded(parameter) for parameter in system.parameters),
@@ -391,22 +394,22 @@ def free_parameters(system: CompiledSystem) -> list[Free]:
     shaping = scope_of(system).needed(
         [*(timing.name for timing in system.timings), *(group_count(group.name) for group in system.groups)]
     )
-    for one in system.parameters:
-        if one.formula is not None or not is_named(one.name) or one.name in shaping:
+    for parameter in system.parameters:
+        if parameter.formula is not None or not is_named(parameter.name) or parameter.name in shaping:
             continue
         several = {
-            group.name: any(column.name == one.name for column in group.columns)
-            or any(own.name == one.name and own.formula for own in group.values)
+            group.name: any(column.name == parameter.name for column in group.columns)
+            or any(own.name == parameter.name and own.formula for own in group.values)
             for group in system.groups
         }
-        own = any(own.name == one.name for group in system.groups for own in group.values)
+        own = any(own.name == parameter.name for group in system.groups for own in group.values)
         if not own and not any(several.values()):
-            listed.append(Free(one.name))
+            listed.append(Free(parameter.name))
             continue
         listed += [
-            Free(one.name, group.name)
+            Free(parameter.name, group.name)
             for group in system.groups
-            if not several[group.name] and _reaches(system, group, one.name)
+            if not several[group.name] and _reaches(system, group, parameter.name)
         ]
     return listed
 
@@ -421,8 +424,8 @@ def _reaches(system: CompiledSystem, group: Group, name: str) -> bool:
 def overrides_at(system: CompiledSystem, free: Sequence[Free], value: Sequence[float]) -> list[Override]:
     """Return what sets parameters to a point (m,); of a number of peers, to the nearest whole number."""
     return [
-        Override(one, Fraction(round(number) if reaches_count(system, one) else float(number)))
-        for one, number in zip(free, value, strict=True)
+        Override(item, Fraction(round(number) if reaches_count(system, item) else float(number)))
+        for item, number in zip(free, value, strict=True)
     ]
 
 

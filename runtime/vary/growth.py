@@ -77,7 +77,7 @@ def criterion_of(system: CompiledSystem, asked: str | None, place: Place, varied
     if asked not in (None, MEAN_SQUARE, NOMINAL, PASSIVE):
         what = f"{str(asked)[:40]} is no criterion ({MEAN_SQUARE}, {NOMINAL}, {PASSIVE})"
         raise ApcError(Mistake("E898", place, what, hint=f"--in {MEAN_SQUARE}"))
-    by_chance = unreliable(system) or any(one.name in channel_numbers(system) for one in varied)
+    by_chance = unreliable(system) or any(free.name in channel_numbers(system) for free in varied)
     return asked or (MEAN_SQUARE if by_chance else NOMINAL)
 
 
@@ -150,7 +150,7 @@ def growth_at(
     if found.why:
         what = f"the scene can't be judged in mean square: {found.why}"
         hint = f"--in {NOMINAL}"
-        if any(one.free.name in channel_numbers(system) for one in overrides):
+        if any(override.free.name in channel_numbers(system) for override in overrides):
             hint = "apc simulate" if aged(system) else "a narrower range between --lower and --upper"
         raise ApcError(Mistake("E898", place, what, hint=hint))
     return found
@@ -172,7 +172,7 @@ class GrowthEvaluator:
     def growth(self, value: Sequence[float], *, bounded: bool = False) -> Growth:
         """Return what second moments grow by at a point (m,), NaN where there is none."""
         overrides = [
-            Override(one, Fraction(float(number))) for one, number in zip(self.free, value, strict=True)
+            Override(free, Fraction(float(number))) for free, number in zip(self.free, value, strict=True)
         ]
         where = self.system, self.prepared, overrides, self.place
         try:
@@ -186,14 +186,14 @@ class GrowthEvaluator:
         """Return the roots at a point (m,), of which the largest counts: one of each loop of hands."""
         if self.criterion != PASSIVE:
             return [math.sqrt(self.growth(value).radius)]
-        changes = [Override(*one) for one in zip(self.free, map(Fraction, value), strict=True)]
+        changes = [Override(*pair) for pair in zip(self.free, map(Fraction, value), strict=True)]
         try:
             found = loop_growths(apply(self.system, changes), self.prepared, bounded=False)
         except ApcError as error:
             if error.mistakes[0].code not in NOWHERE:
                 raise
             return [math.nan]
-        return [math.sqrt(one.radius) for one in found]
+        return [math.sqrt(growth.radius) for growth in found]
 
     def matrices(self, values: Floats) -> tuple[Floats, ...]:
         """Return the root (k, 1, 1) at values (k, m)."""
@@ -205,34 +205,38 @@ class GrowthEvaluator:
         # At an end of what a parameter may be, the parabola through two points further inside.
         at_end = ~(self._allowed(values - moved) & self._allowed(values + moved))[:, None]
         way = np.where(self._allowed(values + 2 * moved), 1.0, -1.0)[:, None]
-        one = values + np.where(at_end, way, -1.0) * moved
+        item = values + np.where(at_end, way, -1.0) * moved
         other = values + np.where(at_end, 2 * way, 1.0) * moved
-        (here,), (first,), (second,) = (self.matrices(points) for points in (values, one, other))
+        (here,), (first,), (second,) = (self.matrices(points) for points in (values, item, other))
         inside = (4 * first - 3 * here - second) * way[:, None] / (2 * DIFFERENCE)
         return ((here, np.where(at_end[:, None], inside, (second - first) / (2 * DIFFERENCE))),)
 
     def _allowed(self, values: Floats) -> NDArray[np.bool_]:
         """Say which values (k, m) are within what each parameter may be."""
         found = np.ones(len(values), dtype=bool)
-        for own, one in zip(values.T, self.free, strict=True):
-            least, most = allowed(self.system, one)
+        for own, free in zip(values.T, self.free, strict=True):
+            least, most = allowed(self.system, free)
             found &= (own >= least) & (own <= most)
         return found
 
     def errors(self, values: Floats) -> tuple[Floats, ...]:
         """Return bounds (k, 1, 1) on the errors of the root at values (k, m)."""
         found = [self.growth(value, bounded=True) for value in values.tolist()]
-        return (np.array([(one.high - one.low) / max(one.radius, LEAST) for one in found])[:, None, None],)
+        return (
+            np.array([(growth.high - growth.low) / max(growth.radius, LEAST) for growth in found])[
+                :, None, None
+            ],
+        )
 
 
 def allowed(system: CompiledSystem, free: Free) -> tuple[float, float]:
     """Return between which values a parameter may be."""
     if any(timing.name == free.name for timing in system.timings):
         return 0.0, math.inf
-    one = parameter_of(system, free)
+    parameter = parameter_of(system, free)
     return (
-        -math.inf if one.minimum is None else one.minimum,
-        math.inf if one.maximum is None else one.maximum,
+        -math.inf if parameter.minimum is None else parameter.minimum,
+        math.inf if parameter.maximum is None else parameter.maximum,
     )
 
 

@@ -96,9 +96,9 @@ def _leading(
 ) -> Leading:
     enclosed = []
     for part in parts:
-        one = systems[part.system]
+        system = systems[part.system]
         # What is the same at all points is there once.
-        block, off = (_block(whole, part.states) for whole in (one.matrix, one.error))
+        block, off = (_block(whole, part.states) for whole in (system.matrix, system.error))
         enclosed.append(enclose_stack(*np.broadcast_arrays(block, off)))
     value = np.zeros((len(parts), count), dtype=np.complex128)
     low, high, second, clear = np.zeros((4, len(parts), count))
@@ -124,12 +124,12 @@ def _leading(
     for number, (part, (pairs, _)) in enumerate(zip(parts, enclosed, strict=True)):
         mine = np.flatnonzero(certain & (leads == number))
         if len(mine):
-            wiring, one = evaluator.wirings[part.system], systems[part.system].at(mine)
+            wiring, system = evaluator.wirings[part.system], systems[part.system].at(mine)
             right, left = (
                 np.broadcast_to(vectors, (count, len(part.states)))[mine]
                 for vectors in (pairs.right[:, :, 0], pairs.left[:, 0])
             )
-            angle[mine] = _angles(wiring, one, part, largest[mine], right, left)
+            angle[mine] = _angles(wiring, system, part, largest[mine], right, left)
     rate = (np.log(radius) + 1j * np.where(np.abs(angle) > STRAIGHT, angle, 0.0)) / frame_s
     return Leading(
         radius=radius,

@@ -186,10 +186,10 @@ def _one_by_one(judge: Callable[[Fraction], Verdict], values: Floats) -> tuple[C
     One nearer to the circle than floats can tell has the side that was proved; an open verdict has none.
     """
     radii = []
-    for one in (judge(Fraction(value)) for value in values.tolist()):
-        beside = abs(one.radius - 1) <= 2 * UNSURE
-        nearest = 1 - 2 * UNSURE if one.stable else 1 + 2 * UNSURE
-        radii.append(math.nan if one.stable is None else nearest if beside else one.radius)
+    for verdict in (judge(Fraction(value)) for value in values.tolist()):
+        beside = abs(verdict.radius - 1) <= 2 * UNSURE
+        nearest = 1 - 2 * UNSURE if verdict.stable else 1 + 2 * UNSURE
+        radii.append(math.nan if verdict.stable is None else nearest if beside else verdict.radius)
     found = np.array(radii, dtype=np.complex128)[:, None]
     return found, np.full(found.shape, np.nan, np.complex128)
 
@@ -306,10 +306,10 @@ class DelayLine(_JudgedLine):
         except ApcError:  # an analysis spares a matrix that is too large
             return 1.0
         if len(systems) not in self.rigid:
-            self.rigid[len(systems)] = [len(rigid_modes_here(one).names) for one in systems]
+            self.rigid[len(systems)] = [len(rigid_modes_here(system).names) for system in systems]
         largest = 0.0
-        for one, count in zip(systems, self.rigid[len(systems)], strict=True):
-            values = np.linalg.eigvals(one.matrix)
+        for system, count in zip(systems, self.rigid[len(systems)], strict=True):
+            values = np.linalg.eigvals(system.matrix)
             moving = np.argsort(np.abs(values - 1))[count:]
             largest = max(largest, float(np.abs(values[moving]).max(initial=0.0)))
         return largest

@@ -60,7 +60,9 @@ def root_locus(system: CompiledSystem, found: Critical) -> Locus:
     """
     free = find(system, found.parameter, counts=True)
     low, high = found.scanned
-    most = max([abs(found.present), *(one.value for one in found.crossings[:1]), found.value or 0.0])
+    most = max(
+        [abs(found.present), *(crossing.value for crossing in found.crossings[:1]), found.value or 0.0]
+    )
     high = min(high, BEYOND * most) if most > low else high
     values = np.linspace(low, high, POINTS)
     if found.counted:
@@ -94,11 +96,13 @@ def eigenvalues_at(
     with single_threaded(), np.errstate(all="ignore"):
         family = evaluator_of_many(system, [free], Place(free.label), prepared=prepared)
         matrices = family.matrices(np.array(values, np.float64)[:, None])
-    known = np.all([np.isfinite(one).all(axis=(1, 2)) for one in matrices], axis=0)
-    chosen = [one[known] if len(one) > 1 else one for one in matrices]
-    listed = [eigenvalues_of(one, np.zeros_like(one))[0] for one in chosen]
+    known = np.all([np.isfinite(matrix).all(axis=(1, 2)) for matrix in matrices], axis=0)
+    chosen = [matrix[known] if len(matrix) > 1 else matrix for matrix in matrices]
+    listed = [eigenvalues_of(values, np.zeros_like(values))[0] for values in chosen]
     places = np.flatnonzero(np.broadcast_to(known, len(values))).tolist()
-    every = np.concatenate([np.broadcast_to(one, (len(places), one.shape[1])) for one in listed], axis=1)
+    every = np.concatenate(
+        [np.broadcast_to(values, (len(places), values.shape[1])) for values in listed], axis=1
+    )
     return places, tuple(every.astype(np.complex128))
 
 

@@ -181,26 +181,28 @@ class ManyAnalyses:
             given = tuple(
                 self.varied[column].override(place) for column, place in zip(self.times, timing, strict=True)
             )
-            asked = Asked.of(self.system, [one.free for one in self.varied], self.prepared)
+            asked = Asked.of(self.system, [varied.free for varied in self.varied], self.prepared)
             self.families[timing] = _family(asked, self.times, given)
         return self.families[timing]
 
     def _alone(self, places: Integers, row: int, found: Rows) -> None:
         """Analyse one point by itself."""
         try:
-            overrides = [one.override(place) for one, place in zip(self.varied, places.tolist(), strict=True)]
-            one: Analysis = analyze(apply(self.system, overrides), prepared=self.prepared)
+            overrides = [
+                varied.override(place) for varied, place in zip(self.varied, places.tolist(), strict=True)
+            ]
+            analysis: Analysis = analyze(apply(self.system, overrides), prepared=self.prepared)
         except ApcError as error:
             first = error.mistakes[0]
             found.verdict[row], found.message[row] = FAULT + first.code, first.sentence
             return
-        found.verdict[row] = one.verdict
-        found.spectral_radius[row] = one.spectral_radius
-        found.spectral_radius_error[row] = one.spectral_radius_error
-        found.rigid_modes[row] = one.rigid_modes
-        if one.modes:
-            found.frequency_hz[row] = one.modes[0].frequency_hz
-            found.damping_ratio[row] = one.modes[0].damping_ratio
+        found.verdict[row] = analysis.verdict
+        found.spectral_radius[row] = analysis.spectral_radius
+        found.spectral_radius_error[row] = analysis.spectral_radius_error
+        found.rigid_modes[row] = analysis.rigid_modes
+        if analysis.modes:
+            found.frequency_hz[row] = analysis.modes[0].frequency_hz
+            found.damping_ratio[row] = analysis.modes[0].damping_ratio
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -266,7 +268,7 @@ def analyze_many(system: CompiledSystem, values: Mapping[str, Any]) -> Analyses:
     try:
         arrays = np.broadcast_arrays(*listed)
     except ValueError:
-        shapes = " and ".join(str(one.shape) for one in listed)
+        shapes = " and ".join(str(values.shape) for values in listed)
         what = "values of shapes that can't be broadcast"
         raise ApcError(Mistake("E881", PLACE, what, "equal shapes", shapes)) from None
     varied, places = [], []
@@ -276,15 +278,15 @@ def analyze_many(system: CompiledSystem, values: Mapping[str, Any]) -> Analyses:
         places.append(which)
     found = many_analyses(system, varied).at(np.stack(places, axis=1))
     shape = arrays[0].shape
-    units = [unit_of(system, one.name) for one in frees]
+    units = [unit_of(system, free.name) for free in frees]
     return Analyses(
         topology=system.name,
         parameters=tuple(
-            one.label if unit == "1" else f"{one.label} [{unit}]"
-            for one, unit in zip(frees, units, strict=True)
+            free.label if unit == "1" else f"{free.label} [{unit}]"
+            for free, unit in zip(frees, units, strict=True)
         ),
         values=tuple(arrays),
-        **{one.name: getattr(found, one.name).reshape(shape) for one in fields(found)},
+        **{field.name: getattr(found, field.name).reshape(shape) for field in fields(found)},
         left_out=(*near_start(system), *left_out(system, varied=frees), *notes_for_all_groups(system, frees)),
     )
 
@@ -293,12 +295,12 @@ def _numbers_of(system: CompiledSystem, free: Free, given: Any) -> Floats:
     """Read the values of a parameter: numbers in SI, or quantities."""
     unit, what = unit_of(system, free.name), f"the values of {free.label}"
     array = np.asarray(given)
-    if array.dtype.kind in "UO" and all(isinstance(one, str) for one in array.ravel().tolist()):
+    if array.dtype.kind in "UO" and all(isinstance(item, str) for item in array.ravel().tolist()):
         # The language of quantities, which numbers never need.
         from apc.compiler.language.units import quantity
 
         read = [quantity(text, PLACE, what=free.label, unit=unit).value for text in array.ravel().tolist()]
-        array = np.array([float(one) for one in read]).reshape(array.shape)
+        array = np.array([float(number) for number in read]).reshape(array.shape)
     if array.dtype.kind not in "fiu" or not array.size or not np.isfinite(array).all():
         expected = f"finite numbers, in {unit}" if unit != "1" else "finite numbers"
         raise ApcError(Mistake("E881", PLACE, what, expected, str(given)[:40]))
@@ -328,8 +330,8 @@ def many_analyses(system: CompiledSystem, varied: Sequence[Varied]) -> ManyAnaly
     """
     times = tuple(
         column
-        for column, one in enumerate(varied)
-        if reaches_time(system, one.free) or reaches_count(system, one.free)
+        for column, item in enumerate(varied)
+        if reaches_time(system, item.free) or reaches_count(system, item.free)
     )
     return ManyAnalyses(system, tuple(varied), prepare(system), times)
 
@@ -364,8 +366,8 @@ def _family(of: Asked, times: tuple[int, ...], given: tuple[Override, ...]) -> _
             return None
         rigid += loop.multiplicity * len(wiring.rigid.names)
         drifts += loop.multiplicity * wiring.rigid.drifts
-    names = {one.name: column for column, one in zip(columns, free, strict=True)}
-    every = (*timed_system.parameters, *(one for group in timed_system.groups for one in group.values))
+    names = {item.name: column for column, item in zip(columns, free, strict=True)}
+    every = (*timed_system.parameters, *(value for group in timed_system.groups for value in group.values))
     parts, patterns = parts_of(evaluator)
     return _Family(
         system=timed_system,
@@ -374,7 +376,7 @@ def _family(of: Asked, times: tuple[int, ...], given: tuple[Override, ...]) -> _
         reaching=_reaching(timed_system, columns, free),
         rigid=rigid,
         drifts=drifts,
-        bounds=tuple((names[one.name], one) for one in every if one.name in names),
+        bounds=tuple((names[parameter.name], parameter) for parameter in every if parameter.name in names),
         patterns=patterns,
         parts=parts,
     )
@@ -384,8 +386,8 @@ def _reaching(system: CompiledSystem, columns: Sequence[int], free: Sequence[Fre
     """Return the varied numbers from which any others follow, those together of which the same does."""
     scopes = [scope_of(system), *(scope_of(system, group.values) for group in system.groups)]
     found: list[_Reaching] = []
-    for column, one in zip(columns, free, strict=True):
-        reached = [scope.follow({one.name: None}, lambda *_: None, lambda _: None) for scope in scopes]
+    for column, item in zip(columns, free, strict=True):
+        reached = [scope.follow({item.name: None}, lambda *_: None, lambda _: None) for scope in scopes]
         mine = _Reaching((column,), frozenset[str]().union(*reached))
         if len(mine.names) > 1:
             shared = [other for other in found if other.names & mine.names]
@@ -405,7 +407,7 @@ def _filled(
 ) -> Truths:
     """Fill in what the matrices of some points decide, and say of each whether they do."""
     done = np.zeros(len(some), dtype=np.bool_)
-    states = max(len(one.layout.names) for one in family.evaluator.closed)
+    states = max(len(closed_system.layout.names) for closed_system in family.evaluator.closed)
     together = max(1, min(TOGETHER, ENTRIES // states**2))
     with single_threaded(), np.errstate(all="ignore"):
         for start in range(0, len(some), together):
@@ -424,14 +426,14 @@ def _decided(
     """Do so for few points at a time."""
     allowed, vectors = _vectors(family, varied, places)
     systems = family.evaluator.bounded(vectors)
-    for one, pattern in zip(systems, family.patterns, strict=True):
+    for system, pattern in zip(systems, family.patterns, strict=True):
         # What is 0 at a value of no meaning is so at all; NaN and infinite are no matrices.
-        size = np.abs(one.matrix) + one.error
+        size = np.abs(system.matrix) + system.error
         allowed &= np.isfinite(size.sum(axis=(1, 2)))
         if not pattern.all():
             allowed &= ~size[:, ~pattern].any(axis=1)
     some = np.flatnonzero(allowed)
-    known = leading(family.evaluator, family.parts, [one.at(some) for one in systems], len(some))
+    known = leading(family.evaluator, family.parts, [system.at(some) for system in systems], len(some))
     into = np.flatnonzero(known.certain)
     into = into[~_loose(known.error[into])]
     some = some[into]
@@ -474,9 +476,9 @@ def _vectors(
     settled = []
     for some in family.reaching:
         different, which = np.unique(places[:, list(some.columns)], axis=0, return_inverse=True)
-        there = [_resolved(family, varied, some, one) for one in different.tolist()]
+        there = [_resolved(family, varied, some, item) for item in different.tolist()]
         settled.append((some.names, there, which.ravel()))
-        allowed &= np.array([one is not None for one in there])[which.ravel()]
+        allowed &= np.array([numbers is not None for numbers in there])[which.ravel()]
     plain = sorted(
         set(family.columns).difference(*(some.columns for some in family.reaching)),
         key=lambda column: varied[column].free.group or "",
@@ -495,8 +497,8 @@ def _vectors(
 
         for reached, there, which in settled:
             rows = [
-                group.parameters if one is None else one.parameters[place][one.rows[place][peer]]
-                for one in there
+                group.parameters if numbers is None else numbers.parameters[place][numbers.rows[place][peer]]
+                for numbers in there
             ]
             where = [column for column, name in enumerate(names) if name in reached]
             put(where, np.array(rows)[:, where][which])

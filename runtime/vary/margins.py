@@ -117,7 +117,7 @@ def margins(system: CompiledSystem, *, prepared: Prepared | None = None, quick: 
         largest = max(states)
         slow = largest > MOST_SCANNED and many_packets(system, at)
         chosen = free if slow or largest <= MOST_SCANNED else []
-        rest = [not_looked(system, one, f"{largest:,} states") for one in free if one not in chosen]
+        rest = [not_looked(system, item, f"{largest:,} states") for item in free if item not in chosen]
         now = analyze(system, prepared=prepared)
         if not now.stable and now.verdict != DRIFTS:
             return Margins((), NOT_STABLE.format("stable" if now.stable is False else "proved stable"))
@@ -126,25 +126,25 @@ def margins(system: CompiledSystem, *, prepared: Prepared | None = None, quick: 
         lines = _lines(system, chosen, at, slow=slow)
         found = [row for pair in zip(chosen, lines, strict=True) if (row := _along(system, *pair))]
         found += rest
-        found += [_delay_margin(system, one, at, largest) for one in delays]
+        found += [_delay_margin(system, delay, at, largest) for delay in delays]
         return Margins(tuple(found), _notes(found, start))
 
 
 def _loops(system: CompiledSystem, prepared: Prepared, *, most: float) -> list[int]:
     """Return how many states each loop has, none where what they would take is beyond the most."""
     schedules = prepared.schedules
-    events = OF_EVENT * max(len(one.events) for one in schedules)
+    events = OF_EVENT * max(len(schedule.events) for schedule in schedules)
     kinds = [prepared.jacobians[group.kind] for group in system.groups]
     # Of one peer alone it is known without a matrix.
     if events + max(map(states_of, schedules, kinds)) ** 2 > most:
         return []
     states = [loop.states for loop in arrange(*lifted_groups(system, prepared=prepared)).loops]
-    return states if events + sum(one**2 for one in states) <= most else []
+    return states if events + sum(state**2 for state in states) <= most else []
 
 
 def _notes(rows: Sequence[Margin], start: Prepared | None) -> str:
     """Return what is to be said of all margins together."""
-    estimated = [one.parameter for one in rows if one.estimated]
+    estimated = [row.parameter for row in rows if row.estimated]
     notes = ["delays were not varied: how the scene moves hangs on what is heard at the start"] * (
         start is None
     )
@@ -157,9 +157,9 @@ def coupler_parameters(system: CompiledSystem) -> list[Free]:
     """Return the stiffnesses and dampings of parts without motion of their own, and the named ones."""
     moving = {state.name.rpartition(".")[0] for kind in system.kinds for state in kind.states}
     return [
-        one
-        for one in free_parameters(system)
-        if parameter_of(system, one).unit in UNITS and one.name.rpartition(".")[0] not in moving
+        free
+        for free in free_parameters(system)
+        if parameter_of(system, free).unit in UNITS and free.name.rpartition(".")[0] not in moving
     ]
 
 
@@ -180,23 +180,23 @@ def _lines(
     What a stiffness of 0 leaves free is no relative motion of the scene as it is, but one of every scene in
     which it varies: a parameter of 0 varies by itself.
     """
-    base = np.array([parameter_of(system, one).value for one in free])
-    some = [one for one, value in zip(free, base, strict=True) if value]
+    base = np.array([parameter_of(system, item).value for item in free])
+    some = [item for item, value in zip(free, base, strict=True) if value]
     together = evaluator(system, some, prepared=prepared) if some and not slow else None
-    for one, present in zip(free, base.tolist(), strict=True):
-        limit = parameter_of(system, one).maximum
+    for item, present in zip(free, base.tolist(), strict=True):
+        limit = parameter_of(system, item).maximum
         most = math.inf if limit is None else limit
         if slow:
             scale = abs(present) or 1.0
             top = min(GROWTH * scale, most)
-            line = AnalysedLine(system, one, prepared, present, top, scale)
+            line = AnalysedLine(system, item, prepared, present, top, scale)
             yield line if top > present else None
             continue
         if present:
             assert together is not None, "it is among those that are not 0"
-            whole = MatrixLine(together, base[base != 0], some.index(one), present)
+            whole = MatrixLine(together, base[base != 0], some.index(item), present)
         else:
-            whole = MatrixLine(evaluator(system, [one], prepared=prepared), np.zeros(1), 0, present)
+            whole = MatrixLine(evaluator(system, [item], prepared=prepared), np.zeros(1), 0, present)
         top = min(GROWTH * whole.scale, most)
         yield replace(whole, top=top) if top > present else None
 
@@ -208,7 +208,7 @@ def _along(system: CompiledSystem, free: Free, line: MatrixLine | AnalysedLine |
     found = search(line, first=True)
     if not found.enters:
         return None
-    lost = [one for one in found.edges if one.stable_side == "below"]
+    lost = [edge for edge in found.edges if edge.stable_side == "below"]
     present, unit = value_now(system, free), Unit.of(parameter_of(system, free))
     return _margin(free.label, unit, present, lost[0] if lost else None, found.scanned[1])
 

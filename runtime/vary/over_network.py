@@ -88,29 +88,29 @@ def network_margins(
             return Margins((), NOT_STABLE.format(f"{known} in mean square"))
         if why := _not_varied(here):
             return Margins((), f"not looked for: {why}")
-        scales = {one.parameter: one.value or one.scanned / GROWTH for one in nominal.rows}
-        open_rows = {one.parameter for one in nominal.rows if one.note}
-        unscaled = {one.label for one in free if not nominal.rows or one.label in open_rows}
+        scales = {row.parameter: row.value or row.scanned / GROWTH for row in nominal.rows}
+        open_rows = {row.parameter for row in nominal.rows if row.note}
+        unscaled = {item.label for item in free if not nominal.rows or item.label in open_rows}
         rows: list[Margin] = []
         notes, open_sides, looked = [], [], 0
         beyond: dict[str, list[str]] = {}
-        for one in free:
-            samples = _samples(system, one, scales)
-            if one.label in unscaled and len(samples) == 1:
-                rows.append(not_looked(system, one, "from 0 nothing says how far"))
+        for item in free:
+            samples = _samples(system, item, scales)
+            if item.label in unscaled and len(samples) == 1:
+                rows.append(not_looked(system, item, "from 0 nothing says how far"))
                 continue
             line = GrowthLine(
-                GrowthEvaluator(system, (one,), prepared, PLACE), np.array(samples), {samples[0]: here}
+                GrowthEvaluator(system, (item,), prepared, PLACE), np.array(samples), {samples[0]: here}
             )
             found = search(line, first=True)
             looked += found.looked
             if not found.enters:
                 continue
-            rows.append(_margin(system, one, found))
+            rows.append(_margin(system, item, found))
             if found.why:
-                beyond.setdefault(found.why, []).append(one.label)
+                beyond.setdefault(found.why, []).append(item.label)
             if found.edges and found.edges[0].proof != BOUNDED[MEAN_SQUARE]:
-                open_sides.append(f"{one.label} ({found.edges[0].proof})")
+                open_sides.append(f"{item.label} ({found.edges[0].proof})")
     notes += [f"beyond these values of {', '.join(labels)}, {why}" for why, labels in beyond.items()]
     if open_sides:
         notes.append(f"not bounded on either side: {', '.join(open_sides)}")
@@ -142,8 +142,8 @@ def _not_varied(here: Growth) -> str:
 def _of_channels(system: CompiledSystem) -> list[Free]:
     """Return what links lose and delay packets by, where it follows from nothing else."""
     numbers = channel_numbers(system)
-    times = [Free(one.name) for one in named_times(system) if one.formula is None]
-    return [one for one in (*free_parameters(system), *times) if one.name in numbers]
+    times = [Free(timing.name) for timing in named_times(system) if timing.formula is None]
+    return [free for free in (*free_parameters(system), *times) if free.name in numbers]
 
 
 def _samples(system: CompiledSystem, free: Free, scales: dict[str, float]) -> list[float]:
@@ -155,13 +155,13 @@ def _samples(system: CompiledSystem, free: Free, scales: dict[str, float]) -> li
             for link in system.links
             if link.channel is not None and link.channel.jitter == free.name
         ]
-        return [float(one) for one in np.linspace(present, min([most, *delays]), SHARES + 1)]
+        return [float(value) for value in np.linspace(present, min([most, *delays]), SHARES + 1)]
     scale = abs(present) or scales.get(free.label, 0.0)
     if not scale:
         return [present]
     first, last = (scale if present else scale / GROWTH), scale * GROWTH
     ahead = np.geomspace(first, last, round(SAMPLES * np.log10(last / first)) + 1)
-    return [present, *(float(one) for one in ahead if present < one <= most)]
+    return [present, *(float(item) for item in ahead if present < item <= most)]
 
 
 def _margin(system: CompiledSystem, free: Free, found: Search) -> Margin:
@@ -198,17 +198,17 @@ def network_sensitivities(system: CompiledSystem, prepared: Prepared) -> Sensiti
         if why := _too_many(len(free)) or _not_varied(here := growth(system, prepared)):
             return Sensitivities(0.0, (), (), f"what moves it most: not looked for: {why}")
         rows, without = [], []
-        for one in free:
-            present = value_now(system, one)
+        for item in free:
+            present = value_now(system, item)
             try:
-                slope = _derivative(system, one, present, prepared)
+                slope = _derivative(system, item, present, prepared)
             except ApcError:  # not even so near can it be judged
                 slope = None
             if slope is None:
-                without.append(one.label)
+                without.append(item.label)
                 continue
-            unit = unit_of(system, one.name)
-            rows.append(Sensitivity(one.label, unit, present, slope, slope * present, 0))
+            unit = unit_of(system, item.name)
+            rows.append(Sensitivity(item.label, unit, present, slope, slope * present, 0))
     rows.sort(key=lambda row: (-abs(row.relative), row.parameter))
     note = "by differences of two steps"
     if without:

@@ -123,39 +123,45 @@ def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -
 
         def frees(*together: Free) -> bool:
             """Say whether something that is rigid in the scene as it is moves where these vary."""
-            return any(np.abs(one.values).max() > most for one in clusters_of(*together) or ())
+            return any(np.abs(cluster.values).max() > most for cluster in clusters_of(*together) or ())
 
-        zero = [one for one in free if not parameter_of(system, one).value]
-        rest = [one for one in free if one not in zero]
-        loose = [one for one in zero if frees(one)]
-        loose += [one for one in rest if frees(one)] if frees(*rest) else []
-        listed = [[one for one in rest if one not in loose], *([one] for one in zero if one not in loose)]
+        zero = [item for item in free if not parameter_of(system, item).value]
+        rest = [item for item in free if item not in zero]
+        loose = [free for free in zero if frees(free)]
+        loose += [free for free in rest if frees(free)] if frees(*rest) else []
+        listed = [
+            [free for free in rest if free not in loose],
+            *([free] for free in zero if free not in loose),
+        ]
         rows: list[Sensitivity] = []
         clusters: list[_Cluster] = []
-        notes, untied = [], [one.label for one in loose]
+        notes, untied = [], [free.label for free in loose]
         for together in listed:
             found = clusters_of(*together)
             if found is None:
                 return Sensitivities(0.0, (), (), NO_MATRIX)
             clusters, first = clusters or found, 0
-            for one in found:
-                if not one.condition < WORST:
+            for cluster in found:
+                if not cluster.condition < WORST:
                     continue
                 for column, own in enumerate(together):
-                    if one.still[column]:
-                        rows += _rows(system, own, one, column, first)
+                    if cluster.still[column]:
+                        rows += _rows(system, own, cluster, column, first)
                     else:
                         untied.append(own.label)
-                first += len(one.values)
-    radius = max((float(np.abs(one.values).max()) for one in clusters), default=0.0)
+                first += len(cluster.values)
+    radius = max((float(np.abs(cluster.values).max()) for cluster in clusters), default=0.0)
     if not clusters:
         return Sensitivities(0.0, (), (), "nothing moves: there is no eigenvalue")
     if not radius:  # e^(λT) is below every float
         note = "what moves it most: nothing, as every motion dies out to 0 within a frame"
         return Sensitivities(0.0, (), (), note)
-    notes += [_defective(one) for one in clusters if not one.condition < WORST]
+    notes += [_defective(cluster) for cluster in clusters if not cluster.condition < WORST]
     active = tuple(
-        (complex(value), one.name) for one in clusters if one.condition < WORST for value in one.values
+        (complex(value), cluster.name)
+        for cluster in clusters
+        if cluster.condition < WORST
+        for value in cluster.values
     )
     if len(active) > 1:
         notes.append(f"{len(active)} eigenvalues share the radius: the largest of their changes decides")
@@ -173,9 +179,9 @@ def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -
 def varied(system: CompiledSystem) -> list[Free]:
     """Return the free parameters that are no start values, and no numbers of unreliable links."""
     starts = {state.start for kind in system.kinds for state in kind.states}
-    starts |= {start for kind in system.kinds for one in kind.clocks for start in one.starts}
+    starts |= {start for kind in system.kinds for clock in kind.clocks for start in clock.starts}
     kept_out = starts | channel_numbers(system)
-    return [one for one in free_parameters(system) if one.name not in kept_out]
+    return [free for free in free_parameters(system) if free.name not in kept_out]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -193,11 +199,13 @@ class _Cluster:
     condition: float
 
 
-def _rows(system: CompiledSystem, free: Free, one: _Cluster, column: int, first: int) -> list[Sensitivity]:
+def _rows(
+    system: CompiledSystem, free: Free, cluster: _Cluster, column: int, first: int
+) -> list[Sensitivity]:
     """Return how the magnitudes of a cluster follow one parameter, the fastest first."""
     parameter = parameter_of(system, free)
-    moves = np.linalg.eigvals(one.rates[column])
-    growth = np.sort((one.values.conj() * moves).real / np.abs(one.values))[::-1]
+    moves = np.linalg.eigvals(cluster.rates[column])
+    growth = np.sort((cluster.values.conj() * moves).real / np.abs(cluster.values))[::-1]
     return [
         Sensitivity(
             parameter=free.label,
@@ -212,10 +220,10 @@ def _rows(system: CompiledSystem, free: Free, one: _Cluster, column: int, first:
     ]
 
 
-def _defective(one: _Cluster) -> str:
+def _defective(cluster: _Cluster) -> str:
     """Say which eigenvalues have no derivative."""
-    size, many = float(np.abs(one.values).max()), len(one.values) > 1
-    what = f"{counted(len(one.values), 'eigenvalue')} of {one.name} at magnitude {size:.6g}"
+    size, many = float(np.abs(cluster.values).max()), len(cluster.values) > 1
+    what = f"{counted(len(cluster.values), 'eigenvalue')} of {cluster.name} at magnitude {size:.6g}"
     return f"{what} {'share' if many else 'shares'} one motion: there the radius has no derivative"
 
 
@@ -225,7 +233,7 @@ def _clusters(system: CompiledSystem, free: Sequence[Free], prepared: Prepared) 
     None where there is no matrix, or no derivative of it.
     """
     family = evaluator(system, free, prepared=prepared)
-    here = np.array([parameter_of(system, one).value for one in free])
+    here = np.array([parameter_of(system, item).value for item in free])
     unit = np.eye(len(free))
     pairs = family.slopes(
         np.repeat(here[None], max(len(free), 1), axis=0), unit if free else np.zeros((1, 0))
@@ -234,23 +242,25 @@ def _clusters(system: CompiledSystem, free: Sequence[Free], prepared: Prepared) 
         return None
     beside = family.matrices(here + np.diag(BESIDE * np.where(here == 0, 1.0, here))) if free else ()
     still = np.ones(len(free), dtype=np.bool_)
-    for one in beside:
-        still &= np.isfinite(one).all(axis=(1, 2))
+    for values in beside:
+        still &= np.isfinite(values).all(axis=(1, 2))
     found = []
     for name, (matrix, slopes) in zip(family.names, pairs, strict=True):
         if not matrix.shape[1]:
             continue
         own = _of_system(name, matrix[0], slopes[: len(free)], still)
-        if not all(one.condition < WORST for one in own):  # peers in a chain share eigenvalues, no motion
+        if not all(
+            cluster.condition < WORST for cluster in own
+        ):  # peers in a chain share eigenvalues, no motion
             own = []
             for states in _alone(matrix[0], slopes):
                 block = np.index_exp[..., states[:, None], states]
                 own += _of_system(name, matrix[0][block], slopes[block][: len(free)], still)
         found += own
-    sizes = [float(np.abs(one.values).max()) for one in found]
+    sizes = [float(np.abs(item.values).max()) for item in found]
     least = max(sizes, default=0.0) - SHARED * max(1.0, *sizes, 0.0)
-    kept = [one for one, size in zip(found, sizes, strict=True) if size >= least]
-    return sorted(kept, key=lambda one: -float(np.abs(one.values).max()))
+    kept = [item for item, size in zip(found, sizes, strict=True) if size >= least]
+    return sorted(kept, key=lambda item: -float(np.abs(item.values).max()))
 
 
 def _alone(matrix: Floats, slopes: Floats) -> list[Places]:

@@ -88,7 +88,7 @@ def told_by_constants(wiring: Wiring, there: RigidModes) -> Wiring:
     if len(there.names) != len(wiring.rigid.names):  # other motions are free there: none of these follows
         return wiring
     same = [
-        all(one == other for one, other in zip(*pair, strict=True))
+        all(item == other for item, other in zip(*pair, strict=True))
         for pair in zip(zip(*wiring.rigid.exact, strict=True), zip(*there.exact, strict=True), strict=True)
     ]
     constant = np.where(np.array(same)[:, None], basis, 0.0)
@@ -100,7 +100,7 @@ def told_by_constants(wiring: Wiring, there: RigidModes) -> Wiring:
 def closed_loop(wiring: Wiring, lifted: Mapping[tuple[int, int], FrameMap]) -> Matrices:
     """Close the loop of one system at all points: its matrices (k, n, n), see `closing.close`."""
     maps = [lifted[site_key(group)] for group in wiring.system.sites]
-    return close(maps, [one.plain for one in wiring.feedback], wiring.system.layout).matrix
+    return close(maps, [feedback.plain for feedback in wiring.feedback], wiring.system.layout).matrix
 
 
 def reduced(wiring: Wiring, matrix: Matrices, count: int) -> Matrices:
@@ -126,10 +126,10 @@ def relative_at(wiring: Wiring, matrix: Matrices) -> tuple[Relative, NDArray[np.
         return at, are_rigid(wiring, matrix.real)
     unit = np.eye(len(rest))
     weights = np.full((len(matrix), len(rest), len(held)), np.nan, dtype=matrix.dtype)
-    for k, one in enumerate(matrix):
-        if np.isfinite(one).all():
+    for k, item in enumerate(matrix):
+        if np.isfinite(item).all():
             with contextlib.suppress(np.linalg.LinAlgError):
-                weights[k] = np.linalg.solve(unit - one[np.ix_(rest, rest)], one[np.ix_(rest, held)])
+                weights[k] = np.linalg.solve(unit - item[np.ix_(rest, rest)], item[np.ix_(rest, held)])
     own = matrix[:, held[:, None], held] + matrix[:, held[:, None], rest] @ weights
     size = 1 + np.abs(matrix[:, held[:, None], rest].real) @ np.abs(weights.real)
     still = np.abs(own.real - np.eye(len(held))) <= RIGID * size
