@@ -48,7 +48,7 @@ def with_heard(groups: Sequence[Group], kinds: Sequence[Kind], links: Sequence[L
         Of the model; on a graph that isn't complete, every peer sends.
     """
     heard = {count_of(link.name): _heard(link, groups, kinds) for link in links}
-    found = []
+    result = []
     for place, group in enumerate(groups):
         values = [value for value in group.values if value.name not in heard]
         columns = [column for column in group.columns if column.name not in heard]
@@ -59,8 +59,8 @@ def with_heard(groups: Sequence[Group], kinds: Sequence[Kind], links: Sequence[L
                     values.append(Parameter(name, "1", float(number), about=COUNT_ABOUT, exact=number))
                 else:
                     columns.append(Column(name, number))
-        found.append(replace(group, values=tuple(values), columns=tuple(columns)))
-    return tuple(found)
+        result.append(replace(group, values=tuple(values), columns=tuple(columns)))
+    return tuple(result)
 
 
 def heard_sums(link: Link, peers: int) -> NDArray[Any]:

@@ -118,10 +118,10 @@ class ApcError(Exception):
     """The input is at fault. `mistakes` holds at least one `Mistake`, in file order."""
 
     def __init__(self, mistakes: Iterable[Mistake] | Mistake) -> None:
-        found = (mistakes,) if isinstance(mistakes, Mistake) else tuple(mistakes)
-        assert found, "an ApcError names at least one mistake"
-        self.mistakes = found
-        super().__init__("\n".join(str(mistake) for mistake in found))
+        result = (mistakes,) if isinstance(mistakes, Mistake) else tuple(mistakes)
+        assert result, "an ApcError names at least one mistake"
+        self.mistakes = result
+        super().__init__("\n".join(str(mistake) for mistake in result))
 
 
 class Mistakes:

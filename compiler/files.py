@@ -113,10 +113,10 @@ def read_file(path: Path, most: int) -> bytes:
 def _read(path: Path, most: int) -> bytes:
     check_file(path, most)  # first, as opening a device can already do something
     with _refusing(), open(path, "rb", opener=_without_waiting) as stream:
-        found = os.fstat(stream.fileno())
-        _check(found, most)  # of what was opened
-        data = stream.read(found.st_size + 1)  # as many bytes are set aside
-        if len(data) > found.st_size:
+        result = os.fstat(stream.fileno())
+        _check(result, most)  # of what was opened
+        data = stream.read(result.st_size + 1)  # as many bytes are set aside
+        if len(data) > result.st_size:
             data += stream.read(most + 1 - len(data))
     return data
 
@@ -140,14 +140,14 @@ def _refusing() -> Iterator[None]:
         raise RefusedError("unreadable", f"can't be read: {_reason(error)}") from None
 
 
-def _check(found: os.stat_result, most: int) -> None:
-    if stat.S_ISDIR(found.st_mode):
+def _check(result: os.stat_result, most: int) -> None:
+    if stat.S_ISDIR(result.st_mode):
         raise RefusedError("folder", "is a folder")
-    if not stat.S_ISREG(found.st_mode):
+    if not stat.S_ISREG(result.st_mode):
         raise RefusedError("special", "is a device, pipe or socket")
-    if found.st_dev in _kernels_devices():
+    if result.st_dev in _kernels_devices():
         raise RefusedError("special", KERNELS_OWN)
-    _check_size(found.st_size, most)
+    _check_size(result.st_size, most)
 
 
 def _check_size(size: int, most: int) -> None:
@@ -188,7 +188,7 @@ def files_below(folder: Path, suffix: str) -> tuple[Path, ...]:
 
 def listing(folder: Path, suffix: str) -> bytes:
     """Return the names, from the folder, of the files that `files_below` gives, a line each."""
-    found: list[Path] = []
+    paths: list[Path] = []
     kernels, entries = _kernels_devices(), 0
     with _refusing():
         for name, folders, files in os.walk(folder, onerror=_raise):
@@ -200,8 +200,8 @@ def listing(folder: Path, suffix: str) -> bytes:
             entries += len(folders) + len(files)
             if entries > MOST_ENTRIES:
                 raise RefusedError("large", f"holds more than {MOST_ENTRIES} files and folders")
-            found += [below / file for file in files if file.endswith(suffix)]
-    return os.fsencode("\n".join(map(str, sorted(found))))
+            paths += [below / file for file in files if file.endswith(suffix)]
+    return os.fsencode("\n".join(map(str, sorted(paths))))
 
 
 def _raise(error: OSError) -> None:

@@ -55,8 +55,8 @@ class Interpolation:
 
     def values(self, at: Any) -> Any:
         """Return what the table says at floats, or at complex steps from them."""
-        found = np.interp(np.real(at), self.times, self.numbers)
-        return found + 1j * self.slopes(at) * np.imag(at) if np.iscomplexobj(at) else found
+        result = np.interp(np.real(at), self.times, self.numbers)
+        return result + 1j * self.slopes(at) * np.imag(at) if np.iscomplexobj(at) else result
 
     def slopes(self, at: Any) -> Any:
         """Return how fast that changes with them."""

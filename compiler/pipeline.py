@@ -80,9 +80,9 @@ def check_definition(path: Path) -> str:
         elif component := library.component(name):
             check_alone(component, Place(str(path)), mistakes)
     # Its own mistakes first.
-    found = [*mistakes.found, *(mistake for error in beside for mistake in error.mistakes)]
-    if found:
-        raise ApcError(found)
+    result = [*mistakes.found, *(mistake for error in beside for mistake in error.mistakes)]
+    if result:
+        raise ApcError(result)
     return f"{name}, a {kind}"
 
 

@@ -120,10 +120,10 @@ def walk(
     rule
         What an operation is in this kind of number.
     """
-    found = [*values, *function.tables]
+    result = [*values, *function.tables]
     for word, *places in function.operations:
-        found.append(rule(word)(*(found[place] for place in places)))
-    return found
+        result.append(rule(word)(*(result[place] for place in places)))
+    return result
 
 
 @functools.cache
@@ -157,16 +157,16 @@ def composed(name: str, loops: Sequence[Loop], result: Any, words: Sequence[str]
         The names of the inputs.
     """
     inputs = [casadi.MX.sym(word, result.numel_in(place)) for place, word in enumerate(words)]
-    found: list[Any] = []
+    outcome: list[Any] = []
     for place, loop in enumerate(loops):
-        begin, q = loop.given.call([*inputs, *found])
+        begin, q = loop.given.call([*inputs, *outcome])
         z, given = (casadi.SX.sym(word, loop.residual.numel_in(i)) for i, word in enumerate("zq"))
         residual = loop.residual(z, given)
         solver = casadi.rootfinder(f"loop{place}", "newton", {"x": z, "p": given, "g": residual}, NEWTON)
         last_step = casadi.solve(casadi.jacobian(residual, z), residual)
         polish = casadi.Function(POLISH, [z, given], [z - last_step])
-        found.append(polish(solver(x0=begin, p=q)["x"], q))
-    outputs = result.call([*inputs, *found])
+        outcome.append(polish(solver(x0=begin, p=q)["x"], q))
+    outputs = result.call([*inputs, *outcome])
     return casadi.Function(name, inputs, outputs, list(words), result.name_out())
 
 
@@ -217,9 +217,9 @@ def _called(function: Any, calls: Sequence[int]) -> dict[int, tuple[str, Interpo
     """Return what an SX function's calls, by their instructions, call, and the table that is looked up."""
     expressions: Any = function.instructions_sx() if calls else None
     known: dict[bytes, Interpolation] = {}  # of equal rows, which are one table
-    found = {}
+    result = {}
     for k in calls:
         item = expressions[k].which_function()
         table = table_of(item)
-        found[k] = item.name(), known.setdefault(table.times.tobytes() + table.numbers.tobytes(), table)
-    return found
+        result[k] = item.name(), known.setdefault(table.times.tobytes() + table.numbers.tobytes(), table)
+    return result

@@ -48,10 +48,10 @@ def seal(content: bytes) -> str:
     return hmac.digest(secret, content, "sha256").hex() if secret else ""
 
 
-def is_sealed(content: bytes, found: str) -> bool:
+def is_sealed(content: bytes, text: str) -> bool:
     """Return whether a seal is the one this user's apc made of some bytes."""
     expected = seal(content)
-    return bool(expected) and hmac.compare_digest(expected.encode(), found.encode())
+    return bool(expected) and hmac.compare_digest(expected.encode(), text.encode())
 
 
 def _folder() -> Path:
@@ -87,7 +87,7 @@ def _read(path: Path) -> bytes:
     """Return the secret in a file; empty if there is none, or others may have seen it."""
     if path.is_symlink() or not path.is_file():
         return b""
-    found = path.stat()
-    if os.name == "posix" and (found.st_uid != os.geteuid() or stat.S_IMODE(found.st_mode) != 0o600):
+    result = path.stat()
+    if os.name == "posix" and (result.st_uid != os.geteuid() or stat.S_IMODE(result.st_mode) != 0o600):
         return b""
-    return path.read_bytes() if found.st_size == LENGTH else b""
+    return path.read_bytes() if result.st_size == LENGTH else b""

@@ -46,11 +46,11 @@ def part(name: str) -> Iterator[None]:
 def record() -> Iterator[dict[str, float]]:
     """Measure the parts of the body; give their seconds, and of what is in none of them."""
     global _taken
-    found: dict[str, float] = {}
-    _taken = found
+    result: dict[str, float] = {}
+    _taken = result
     try:
         with part(REST):
-            yield found
+            yield result
     finally:
         _taken = None
-        found[REST] = found.pop(REST)  # last
+        result[REST] = result.pop(REST)  # last

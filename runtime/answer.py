@@ -150,17 +150,17 @@ def answer(
         As `analysis.analyze` and `box_proof.prove_box`.
     """
     prepared = prepare(system)
-    found = judge(system, method=method, certify=certify, prepared=prepared)
+    analysis = judge(system, method=method, certify=certify, prepared=prepared)
     modes, notes = _contact_modes(system, prepared)
-    compared = conventions(system, prepared=prepared, default=found, quick=not every_convention)
+    compared = conventions(system, prepared=prepared, default=analysis, quick=not every_convention)
     if compared.not_repeated and not every_convention:
         notes = (*notes, compared.not_repeated)
-    moved = sensitivities_of(system, prepared, found)
-    nominal = _margins(system, prepared, found, wanted=margins)
+    moved = sensitivities_of(system, prepared, analysis)
+    nominal = _margins(system, prepared, analysis, wanted=margins)
     buzz, no_buzz = _buzz(system, prepared, modes) if with_buzz else (None, "")
     return Answer(
-        analysis=replace(found, notes=(*found.notes, *notes)),
-        network=_over_network(system, prepared, found, nominal, certify=certify, wanted=margins),
+        analysis=replace(analysis, notes=(*analysis.notes, *notes)),
+        network=_over_network(system, prepared, analysis, nominal, certify=certify, wanted=margins),
         sensitivities=moved,
         margins=nominal,
         contact_modes=modes,
@@ -177,7 +177,7 @@ def answer(
 def _over_network(
     system: CompiledSystem,
     prepared: Prepared,
-    found: Analysis,
+    analysis: Analysis,
     nominal: Margins,
     *,
     certify: bool,
@@ -192,7 +192,7 @@ def _over_network(
     verdict = judge_network(system, prepared, certify=certify)
     if verdict is None:
         return None
-    if why := _too_large(system, prepared, found) or _too_many_products(system):
+    if why := _too_large(system, prepared, analysis) or _too_many_products(system):
         return NetworkAnswer(verdict, _not_told(0.0, why), Margins((), why))
     moved = network_sensitivities(system, prepared)
     if wanted is False:
@@ -299,34 +299,34 @@ def proved_at(
         assert network is not None, "a link is unreliable"
         verdict, stable, left = network.verdict, network.stable, near_start(system, prepared)
     else:
-        found = analyze(system)
-        verdict, stable, left = found.verdict, found.stable, found.left_out
-        if stable and inside != 1 and not found.spectral_radius + found.spectral_radius_error < inside:
-            stable = False if found.spectral_radius - found.spectral_radius_error >= inside else None
+        analysis = analyze(system)
+        verdict, stable, left = analysis.verdict, analysis.stable, analysis.left_out
+        if stable and inside != 1 and not analysis.spectral_radius + analysis.spectral_radius_error < inside:
+            stable = False if analysis.spectral_radius - analysis.spectral_radius_error >= inside else None
     return BoxProof(system.name, (), verdict, stable, 1, float(stable is None), (), (), left)
 
 
-def sensitivities_of(system: CompiledSystem, prepared: Prepared, found: Analysis) -> Sensitivities:
+def sensitivities_of(system: CompiledSystem, prepared: Prepared, analysis: Analysis) -> Sensitivities:
     """Return what moves the spectral radius of an analysis most, or only why it couldn't be had.
 
     Parameters
     ----------
     system, prepared
         The compiled scene, and what `analysis.prepare` made of it.
-    found
+    analysis
         Its analysis.
     """
-    if why := _too_large(system, prepared, found) or _too_many_products(system):
-        return _not_told(found.spectral_radius, why)
+    if why := _too_large(system, prepared, analysis) or _too_many_products(system):
+        return _not_told(analysis.spectral_radius, why)
     try:
         told = sensitivities(system, prepared=prepared)
     except ApcError as error:
-        return _not_told(found.spectral_radius, f"not looked for: {error.mistakes[0].what}")
+        return _not_told(analysis.spectral_radius, f"not looked for: {error.mistakes[0].what}")
     # Derivatives are of matrices in floats, the analysis is of exact exponentials: both have one radius.
-    apart = abs(told.radius - found.spectral_radius) - found.spectral_radius_error
-    if told.active and not apart <= SAME_RADIUS * max(1.0, found.spectral_radius):
+    apart = abs(told.radius - analysis.spectral_radius) - analysis.spectral_radius_error
+    if told.active and not apart <= SAME_RADIUS * max(1.0, analysis.spectral_radius):
         why = "not told: floats lose the digits of what would be differentiated"
-        return _not_told(found.spectral_radius, why)
+        return _not_told(analysis.spectral_radius, why)
     return told
 
 
@@ -334,9 +334,9 @@ def _not_told(radius: float, why: str) -> Sensitivities:
     return Sensitivities(radius, (), (), f"what moves it most: {why}")
 
 
-def _too_large(system: CompiledSystem, prepared: Prepared, found: Analysis) -> str:
+def _too_large(system: CompiledSystem, prepared: Prepared, analysis: Analysis) -> str:
     """Return why nothing is varied, "" unless the scene is more than few small matrices and short frames."""
-    if why := _too_many_peers(system, found):
+    if why := _too_many_peers(system, analysis):
         return why
     ticks = max(sum(schedule.ticks) for schedule in prepared.schedules)
     if ticks > MOST_TICKS:
@@ -347,10 +347,10 @@ def _too_large(system: CompiledSystem, prepared: Prepared, found: Analysis) -> s
     return ""
 
 
-def _too_many_peers(system: CompiledSystem, found: Analysis) -> str:
+def _too_many_peers(system: CompiledSystem, analysis: Analysis) -> str:
     """Return why nothing is varied, "" unless very many peers differ or stand on a graph."""
     complete = all(link.graph.shape == "complete" for link in system.links)
-    apart = found.method == "determinant" or not complete
+    apart = analysis.method == "determinant" or not complete
     return "not looked for in so large a population" if apart and system.peers > FEW_PEERS else ""
 
 
@@ -362,13 +362,15 @@ def _too_many_products(system: CompiledSystem) -> str:
     return ""
 
 
-def _margins(system: CompiledSystem, prepared: Prepared, found: Analysis, *, wanted: bool | None) -> Margins:
+def _margins(
+    system: CompiledSystem, prepared: Prepared, analysis: Analysis, *, wanted: bool | None
+) -> Margins:
     """Return the margins, or only why they couldn't be had."""
     if wanted is False:
         return Margins((), "not looked for: they were not wanted")
-    if found.stable is None or found.verdict == UNSTABLE:
-        return Margins((), NOT_STABLE.format("proved stable" if found.stable is None else "stable"))
-    if why := _too_many_peers(system, found):
+    if analysis.stable is None or analysis.verdict == UNSTABLE:
+        return Margins((), NOT_STABLE.format("proved stable" if analysis.stable is None else "stable"))
+    if why := _too_many_peers(system, analysis):
         return Margins((), why)
     try:
         return margins_of(system, prepared=prepared, quick=not wanted)
@@ -379,7 +381,7 @@ def _margins(system: CompiledSystem, prepared: Prepared, found: Analysis, *, wan
 def _contact_modes(system: CompiledSystem, prepared: Prepared) -> tuple[ContactModes | None, tuple[str, ...]]:
     """Return the modes of contact, None where nothing switches, and what to say where they can't be had."""
     try:
-        found = contact_modes(system, prepared=prepared)
+        modes = contact_modes(system, prepared=prepared)
     except ApcError as error:
         return None, (f"modes of contact: {error.mistakes[0].sentence}",)
-    return (found if found.modes else None), ()
+    return (modes if modes.modes else None), ()

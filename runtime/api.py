@@ -1030,10 +1030,10 @@ def report(
             check_topology_outputs(path, {"out=": Path(out)})
     if out is not None:
         check_report_path(Path(out))
-    found = contents.report(paths, [f"{name}={value}" for name, value in (set or {}).items()])
+    result = contents.report(paths, [f"{name}={value}" for name, value in (set or {}).items()])
     if out is not None:
-        save_report(found, Path(out))
-    return found
+        save_report(result, Path(out))
+    return result
 
 
 @checked

@@ -46,26 +46,26 @@ def read_arrays(data: bytes, expected: Mapping[str, tuple[str, int]], most: int)
         raise DamageError("it is no archive of arrays as NumPy writes them") from None
     if sum(member.file_size for member in members) > most:
         raise DamageError(f"it unpacks to more than {most >> 20} MiB")
-    found = {}
+    result = {}
     for member in members:
         name, suffix = member.filename[:-4], member.filename[-4:]
         kind = next((kind for pattern, kind in expected.items() if re.fullmatch(pattern, name)), None)
         if kind is None or suffix != ".npy":
             raise DamageError("it holds what does not belong there")
-        found[name] = _array(archive, name, *kind)
-    return found
+        result[name] = _array(archive, name, *kind)
+    return result
 
 
 def _array(archive: NpzFile, name: str, kind: str, dimensions: int) -> NDArray[Any]:
     """Return the array of a member of a file."""
     try:
-        found = archive[name]
+        values = archive[name]
     except Exception:
-        found = None
-    if not isinstance(found, np.ndarray) or found.dtype.str != kind:
+        values = None
+    if not isinstance(values, np.ndarray) or values.dtype.str != kind:
         raise DamageError(f"its {name} is no array of {kind}")
-    if found.ndim != dimensions:
-        raise DamageError(f"its {name} has {found.ndim} dimensions, not {dimensions}")
-    if kind == "|b1" and found.view(np.uint8).max(initial=0) > 1:
+    if values.ndim != dimensions:
+        raise DamageError(f"its {name} has {values.ndim} dimensions, not {dimensions}")
+    if kind == "|b1" and values.view(np.uint8).max(initial=0) > 1:
         raise DamageError(f"its {name} holds what is neither yes nor no")
-    return found
+    return values

@@ -57,5 +57,5 @@ def _changed_again(system: CompiledSystem, change: Sequence[tuple[str, str]]) ->
     for name, value in change:
         if name == HANDS_CHANGE:
             return with_hands(system, value)
-    found = [(find(system, name, counts=True), Fraction(value)) for name, value in change]
-    return apply(system, [Override(free, value) for free, value in found])
+    pairs = [(find(system, name, counts=True), Fraction(value)) for name, value in change]
+    return apply(system, [Override(free, value) for free, value in pairs])

@@ -164,8 +164,8 @@ def _listed(numbers: NDArray[Any]) -> list[Cell]:
     if numbers.dtype.kind == "f" and np.isnan(numbers).any():
         cells = numbers.astype(object)
         cells[np.isnan(numbers)] = None
-    found: list[Cell] = cells.tolist()
-    return found
+    result: list[Cell] = cells.tolist()
+    return result
 
 
 def _lines(rows: Iterable[Sequence[Cell]]) -> bytes:

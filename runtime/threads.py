@@ -45,10 +45,10 @@ def single_threaded() -> Iterator[None]:
 def load_pool(module: str) -> Any:
     """Import what brings a pool of its own, as SciPy's linear algebra: `single_threaded` limits it too."""
     new = module not in sys.modules
-    found = importlib.import_module(module)
+    module_type = importlib.import_module(module)
     if new and _entered:  # the outermost keeps the limit until all have left
         _limit(_entered[0])
-    return found
+    return module_type
 
 
 def _limit(limits: ExitStack) -> None:

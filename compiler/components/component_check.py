@@ -145,8 +145,8 @@ class ComponentNames:
     def _size(self, expression: Expr, where: Where) -> int | None:
         """Return the size of an expression; 0 of one at fault, which `_checked` reports."""
         with Mistakes():
-            found = written_out(expression, self.size_of, where.text, where.place)
-            return None if found is None else len(found) if len(found) > 1 else 0
+            result = written_out(expression, self.size_of, where.text, where.place)
+            return None if result is None else len(result) if len(result) > 1 else 0
         return 0
 
     def _inferred(self, expression: Expr, where: Where) -> Dimension | None:

@@ -72,15 +72,15 @@ def read_equations(root: Body, mistakes: Mistakes) -> tuple[tuple[Equation, ...]
     -------
     The equations, and the names that stand alone on the left of those that couldn't be read.
     """
-    found, undefined = list[Equation](), set[str]()
+    equations, undefined = list[Equation](), set[str]()
     for item in root.read("equations", _items, ()):
         with mistakes:
             text = text_of(item, "an equation", "- a + b = c")
             defined = _DEFINES.findall(text)
             undefined.update(defined)
-            found.append(parse_equation(text, text_place(item)))
+            equations.append(parse_equation(text, text_place(item)))
             undefined.difference_update(defined)
-    return tuple(found), undefined
+    return tuple(equations), undefined
 
 
 def _items(node: Node, what: str) -> tuple[Node, ...]:
@@ -91,13 +91,13 @@ def _items(node: Node, what: str) -> tuple[Node, ...]:
 
 def read_sends(root: Body, mistakes: Mistakes) -> tuple[Send, ...]:
     """Read `sends: {x: sample(object.x)}`, their dimensions left open."""
-    found = []
+    sends = []
     for key, value in root.section("sends", "{x: sample(object.x)}"):
         with mistakes:
             name = name_of(key, "what is sent")
             text, place = text_of(value, name, f"{name}: sample(object.x)"), text_place(value)
-            found.append(Send(name, parse_expression(text, place), text, place, DIMENSIONLESS))
-    return tuple(found)
+            sends.append(Send(name, parse_expression(text, place), text, place, DIMENSIONLESS))
+    return tuple(sends)
 
 
 def read_variables(root: Body, section: str = "variables") -> tuple[Variable, ...]:

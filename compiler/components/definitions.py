@@ -202,15 +202,15 @@ def _with_inner(root: Body, outer: Component, library: Definitions, mistakes: Mi
                 name = among(key.text, dict(outer.connectors), key.place, f"{what} this component")
                 among(text, known, value.place, f"{what} an inner part")
                 passed.append((name, part, connector))
-    found = replace(outer, inner=(*outer.inner, *inner), passed=(*outer.passed, *passed))
+    component = replace(outer, inner=(*outer.inner, *inner), passed=(*outer.passed, *passed))
     hint = "fewer components around one another"
-    if found.depth > DEEPEST:
+    if component.depth > DEEPEST:
         what = f"the parts of {outer.name} stand inside one another more than {DEEPEST} deep"
         mistakes.add("E216", outer.place, what, hint=hint)
-    if found.size > MOST_PARTS:
-        what = f"{outer.name} holds {found.size:,} parts, those inside parts included, and {MOST_PARTS}"
+    if component.size > MOST_PARTS:
+        what = f"{outer.name} holds {component.size:,} parts, those inside parts included, and {MOST_PARTS}"
         mistakes.add("E216", outer.place, f"{what} are the most", hint=f"fewer parts, or {hint}")
-    return found
+    return component
 
 
 def _connectors(root: Body, library: Definitions) -> list[tuple[str, Connector, bool]]:

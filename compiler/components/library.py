@@ -98,10 +98,10 @@ class Library:
             except ApcError as error:
                 self._read[name] = error
             self._open.pop()
-        found: T | ApcError = self._read[name]
-        if isinstance(found, ApcError):
-            raise found
-        return found
+        result: T | ApcError = self._read[name]
+        if isinstance(result, ApcError):
+            raise result
+        return result
 
     def _source(self, name: str) -> Source:
         if name not in self._sources:

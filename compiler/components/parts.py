@@ -296,12 +296,12 @@ def read_entry(entry: PartEntry, scope: Scope, mistakes: Mistakes, index: int = 
 
     def each(items: Iterable[Item], read: Callable[[Item], T | None]) -> Named[T]:
         """Return what is read of items by their names, those at fault left out."""
-        found = []
+        pairs = []
         for item in items:
             with mistakes:
                 if (value := read(item)) is not None:
-                    found.append((item.name, value))
-        return tuple(found)
+                    pairs.append((item.name, value))
+        return tuple(pairs)
 
     missing = dict[str, str]()
     for name, parameters in by_vector(component.parameters).items():
@@ -338,9 +338,9 @@ def _vector(node: Node, name: str, vector: Sequence[Number | Variable], scope: S
         place = text_place(node)
         sizes = sizes_of(tuple(known.split(".")) for known in scope.names)
         tree = parse_expression(node.text, place)
-        found = written_out(tree, lambda parts: sizes.get(parts, 0), node.text, place)
-        if found is not None and len(found) == len(vector):
-            return tuple(replace(node, text=format_expression(item)) for item in found)
+        result = written_out(tree, lambda parts: sizes.get(parts, 0), node.text, place)
+        if result is not None and len(result) == len(vector):
+            return tuple(replace(node, text=format_expression(item)) for item in result)
     return list_of(node, name, len(vector), _one(vector[0].unit))
 
 
@@ -369,10 +369,10 @@ def _joined(
         return GROUND, ""
     if outer is not None and text in dict(outer.connectors):
         return "", text
-    if (found := _TARGET.match(text)) is None:
+    if (result := _TARGET.match(text)) is None:
         expected = "a part, such as device, device.flange or chain[2]"
         raise fault("E210", node.place, connector, expected, brief(text))
-    other, first, last, named = found.groups()
+    other, first, last, named = result.groups()
     part = parts.get(other)
     if other in scope.parts.faulty or (part is None and not scope.complete):
         raise AlreadyReportedError

@@ -32,12 +32,12 @@ class Aliases:
         self.velocities: dict[Derivative, str] = {}  # derivatives that have names of their own
 
     def _velocities(self) -> dict[Derivative, str]:
-        found: dict[Derivative, str] = {}
+        result: dict[Derivative, str] = {}
         for name in self.names:
             sign, x, order = self._meaning(name, 0)
             if sign == 1 and order:
-                found.setdefault((x, order), name)
-        return found
+                result.setdefault((x, order), name)
+        return result
 
     def value(self, name: str, order: int = 0) -> Term:
         """Return what a derivative of a variable is, in the variables that stand for themselves."""

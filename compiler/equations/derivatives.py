@@ -36,8 +36,8 @@ class Moving:
     def derivatives(self, expression: Term) -> dict[Symbol, Derivative]:
         """Return the variables and derivatives an expression holds, in the order of their names."""
         orders = {s: s.name.count("der(") for s in in_order(expression.free_symbols)}
-        found = {s: (s.name[4 * order : len(s.name) - order], order) for s, order in orders.items()}
-        return {s: pair for s, pair in found.items() if pair[0] in self.variables}
+        result = {s: (s.name[4 * order : len(s.name) - order], order) for s, order in orders.items()}
+        return {s: pair for s, pair in result.items() if pair[0] in self.variables}
 
     def differentiate(self, expression: Term) -> Term:
         """Return the time derivative. Raises NoDerivativeError if a held force would have to give it."""

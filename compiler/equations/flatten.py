@@ -217,12 +217,12 @@ def flatten(scene: Scene) -> FlatSystem:
 def _delay_names(kind: FlatKind) -> set[str]:
     """Return the numbers of parts that a hold's delay is or depends on: of the schedule, not of equations."""
     delays = [crossing.delay for crossing in kind.crossings if isinstance(crossing, HoldCrossing)]
-    found = {format_expression(name) for delay in delays for name in names(delay)}
+    texts = {format_expression(name) for delay in delays for name in names(delay)}
     for part in reversed(kind.parts):  # what an inner part's number depends on is a number of an outer part
         for name, value in part.values:
-            if f"{part.name}.{name}" in found and value.expression is not None:
-                found.update(map(format_expression, names(value.expression)))
-    return found
+            if f"{part.name}.{name}" in texts and value.expression is not None:
+                texts.update(map(format_expression, names(value.expression)))
+    return texts
 
 
 def flatten_alone(component: Component, place: Place, mistakes: Mistakes) -> FlatKind:

@@ -82,8 +82,8 @@ class ImplicitBlock:
     @property
     def free_symbols(self) -> set[Symbol]:
         """The symbols the block's solution depends on."""
-        found = {s for expression in self.expressions for s in expression.free_symbols}
-        return found - {symbol(name) for name in self.unknowns}
+        result = {s for expression in self.expressions for s in expression.free_symbols}
+        return result - {symbol(name) for name in self.unknowns}
 
     @property
     def chain(self) -> str:

@@ -79,10 +79,10 @@ class SortedKind:
     @property
     def definitions(self) -> dict[Symbol, Definition]:
         """What gives each unknown and each sample its value."""
-        found: dict[str, Definition] = {}
+        result: dict[str, Definition] = {}
         for step in (step for part in self.partitions for step in part.assignments):
-            found |= dict.fromkeys(step.unknowns, step) if isinstance(step, ImplicitBlock) else dict([step])
-        return {symbol(name): item for name, item in (found | dict((*self.aliases, *self.samples))).items()}
+            result |= dict.fromkeys(step.unknowns, step) if isinstance(step, ImplicitBlock) else dict([step])
+        return {symbol(name): item for name, item in (result | dict((*self.aliases, *self.samples))).items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +114,7 @@ def sort(clocked: ClockedSystem) -> SortedSystem:
 def _numbers(scene: Scene, kind: ClockedKind) -> list[dict[Symbol, Given]]:
     """Return the numbers of each group of a kind, those that differ from peer to peer as they do."""
     common = {f"{part.name}.{name}": value for part in scene.parts for name, value in part.values}
-    found = []
+    result = []
     for group in (group for group in scene.groups if group.name in kind.flat.groups):
         varying: dict[str, Given] = dict(group.columns)
         numbers: dict[str, Given] = {"peers": Fraction(scene.peers)}
@@ -124,8 +124,8 @@ def _numbers(scene: Scene, kind: ClockedKind) -> list[dict[Symbol, Given]]:
             used = () if value.expression is None else map(format_expression, names(value.expression))
             if value.expression is not None and not varying.keys().isdisjoint(used):
                 varying.setdefault(name, to_term(value.expression))
-        found.append({symbol(name): number for name, number in (numbers | varying).items()})
-    return found
+        result.append({symbol(name): number for name, number in (numbers | varying).items()})
+    return result
 
 
 def _sorted(kind: ClockedKind, divisors: Divisors, mistakes: Mistakes) -> SortedKind:
@@ -223,7 +223,7 @@ def _sides(
     equations: Sequence[FlatEquation], differentiate: Callable[[Term], Term] | None, problem: Problem
 ) -> list[tuple[Term, Term]]:
     """Return both sides of equations. Raises ApcError for derivatives and constants that do not exist."""
-    found = []
+    pairs = []
     for equation in equations:
         with problem.mistakes:
             try:
@@ -232,7 +232,7 @@ def _sides(
                 raise problem.no_derivative(Residual(ZERO, equation), missing) from missing
             if any(map(is_no_number, sides)):
                 raise problem.no_number([Residual(ZERO, equation)])
-            found.append(sides)
-    if len(found) < len(equations):
+            pairs.append(sides)
+    if len(pairs) < len(equations):
         raise AlreadyReportedError
-    return found
+    return pairs

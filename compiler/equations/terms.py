@@ -187,9 +187,9 @@ def _is_none(node: Term) -> bool:
 
 def slope(expression: Term, by: Symbol) -> Term:
     """Return the derivative by a symbol, that of the branch taken; what jumps is constant between jumps."""
-    found = expression.diff(by)
-    jumps = found.atoms(sympy.DiracDelta, sympy.Derivative, sympy.Subs)
-    return found.xreplace(dict.fromkeys(jumps, ZERO)) if jumps else found
+    result = expression.diff(by)
+    jumps = result.atoms(sympy.DiracDelta, sympy.Derivative, sympy.Subs)
+    return result.xreplace(dict.fromkeys(jumps, ZERO)) if jumps else result
 
 
 def differential(expression: Term, rate: Callable[[Symbol], Term]) -> Term:

@@ -210,8 +210,10 @@ def check_links(scene: Scene, kinds: Sequence[Kind], places: Sequence[int]) -> N
 
 def _taken(kind: Kind, link: str) -> str:
     """Return what a kind takes over those it hears over a link that is nothing over nobody, if anything."""
-    found = (receive.operator for clock in kind.clocks for receive in clock.receives if receive.link == link)
-    return next((text for text in found if text in ("mean", "max", "min")), "")
+    generator = (
+        receive.operator for clock in kind.clocks for receive in clock.receives if receive.link == link
+    )
+    return next((text for text in generator if text in ("mean", "max", "min")), "")
 
 
 def compiled_groups(
@@ -237,7 +239,7 @@ def compiled_groups(
     """
     exact = {timing.name for timing in timings.found}
     declared = _declared(scene)
-    found, declared = [], _declared(scene)
+    groups, declared = [], _declared(scene)
     for group, place in zip(scene.groups, places, strict=True):
         values = []
         for name, value in group.values:
@@ -245,14 +247,14 @@ def compiled_groups(
             own = replace(value, expression=Name(tuple(timing.split(".")))) if timing in exact else value
             values.append(_of_part(name, own, declared))
         columns = tuple(Column(name, numbers) for name, numbers in group.columns)
-        found.append(Group(group.name, group.count, place, tuple(values), columns))
+        groups.append(Group(group.name, group.count, place, tuple(values), columns))
     for link in (link for link in scene.links if link.graph.shape != "complete"):
         sending = [any(send.link == link.name for send in kind.sends) for kind in kinds]
-        silent = [group.name for group in found if not sending[group.kind]]
+        silent = [group.name for group in groups if not sending[group.kind]]
         if silent and any(count_of(link.name) in kind.parameters for kind in kinds):
             what = f"the graph of {link.name} joins all peers, and those of {silent[0]} send nothing over it"
             raise ApcError(Mistake("E215", link.place, what))
-    return with_heard(found, kinds, links)
+    return with_heard(groups, kinds, links)
 
 
 def with_rounded(scene: Scene, kind: Kind, links: Sequence[Link]) -> Kind:
@@ -307,11 +309,11 @@ def _named(
 
 def _declared(scene: Scene) -> dict[str, NumberParameter | Variable]:
     """Return by whole name what declares each number and start value of the parts."""
-    found: dict[str, NumberParameter | Variable] = {}
+    result: dict[str, NumberParameter | Variable] = {}
     for part in scene.parts:
         for declared in (part.component.variables, part.component.numbers):
-            found |= {f"{part.name}.{item.name}": item for item in declared}
-    return found
+            result |= {f"{part.name}.{item.name}": item for item in declared}
+    return result
 
 
 def _of_part(name: str, value: Value, all_declared: Mapping[str, NumberParameter | Variable]) -> Parameter:
@@ -336,29 +338,29 @@ def all_parameters(scene: Scene, kinds: Sequence[Kind], links: Sequence[Link]) -
     declared = _declared(scene)
     needed = {name for kind in kinds for name in kind.parameters}
     used = {link.name for link in links}
-    found = [_named(name, value) for name, value in scene.parameters]
+    parameters = [_named(name, value) for name, value in scene.parameters]
     for part in scene.parts:
         numbers = dict(part.values) | {
             own: value for own, value in part.all_starts if f"{part.name}.{own}" in needed
         }
-        found += [_of_part(f"{part.name}.{own}", value, declared) for own, value in numbers.items()]
+        parameters += [_of_part(f"{part.name}.{own}", value, declared) for own, value in numbers.items()]
     for link in scene.links:
         if count_of(link.name) in needed:  # every group has its own value
-            found.append(Parameter(count_of(link.name), "1", float(scene.peers - 1), about=COUNT_ABOUT))
+            parameters.append(Parameter(count_of(link.name), "1", float(scene.peers - 1), about=COUNT_ABOUT))
         if link.channel is not None and link.name in used:
             probabilities = zip(link.channel.loss, PROBABILITIES.values(), strict=False)
-            found += [_named(*number, about, 0, 1) for number, about in probabilities]
+            parameters += [_named(*number, about, 0, 1) for number, about in probabilities]
     for clock in scene.clocks:
         if (name := f"{clock.name}.period") in needed:  # by `interval`: the same number as the timing
             about = f"from one tick of {clock.name} to the next"
-            found.append(_named(name, clock.period, about, 0, open_minimum=True))
+            parameters.append(_named(name, clock.period, about, 0, open_minimum=True))
     for group in scene.groups:
         expression = None if group.counted is None else group.counted.expression
         count = Value(Fraction(group.count), DIMENSIONLESS, expression, group.place)
         about, most = f"number of peers of group {group.name}", _most_peers(scene, group)
-        found.append(_named(group_count(group.name), count, about, 1, most))
-    found.append(Parameter(PEERS, "1", float(scene.peers), about="number of peers"))
-    return tuple({parameter.name: parameter for parameter in found}.values())
+        parameters.append(_named(group_count(group.name), count, about, 1, most))
+    parameters.append(Parameter(PEERS, "1", float(scene.peers), about="number of peers"))
+    return tuple({parameter.name: parameter for parameter in parameters}.values())
 
 
 def _most_peers(scene: Scene, group: SceneGroup) -> float | None:

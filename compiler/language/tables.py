@@ -56,9 +56,9 @@ class NamedFiles:
     def read(self, name: str, reader: Callable[[Path], F]) -> F | None:
         """Return what a reader finds in a file; None, and its mistakes are taken, if that is at fault."""
         with self.mistakes:
-            found = reader(self.folder / name)
+            result = reader(self.folder / name)
             self.names.add(name)
-            return found
+            return result
         return None
 
 
@@ -252,7 +252,7 @@ def _headings(texts: list[str], file: str) -> Headings:
         what = f"the table has {len(texts)} columns, and {MOST_COLUMNS} are the most"
         raise fault("E702", place, what, hint="several groups, each with a table")
     mistakes = Mistakes()
-    found: dict[str, tuple[str, Unit, Place]] = {}
+    result: dict[str, tuple[str, Unit, Place]] = {}
     for text in texts:
         name, written = _parts(text)
         unit = NO_UNIT
@@ -263,18 +263,18 @@ def _headings(texts: list[str], file: str) -> Headings:
             unit = parse_unit(written, place) if written else NO_UNIT
         except ApcError as error:
             mistakes.take(error)
-        if name in found:
+        if name in result:
             mistakes.add("E702", place, f"the heading {brief(name)} is used twice")
-        found[name] = (name, unit, place)
+        result[name] = (name, unit, place)
         place = place.shifted(len(text) + 1)
     mistakes.raise_if_any()
-    return tuple(found.values())
+    return tuple(result.values())
 
 
 def _parts(heading: str) -> tuple[str, str | None]:
     """Return the name and the unit of a heading, None if it has none; no name if it is no heading."""
-    found = _HEADING.match(heading.strip())
-    if found is None:
+    result = _HEADING.match(heading.strip())
+    if result is None:
         return "", None
-    unit = found["unit"]
-    return found["name"].strip(), None if unit is None else unit.strip()
+    unit = result["unit"]
+    return result["name"].strip(), None if unit is None else unit.strip()

@@ -112,10 +112,10 @@ class _Checker:
 
     def agree(self, code: str, parts: Sequence[Expr]) -> Dimension | None:
         """Return the dimension most parts have, the first of them in a tie; report the others."""
-        found = [(part, self.dimension(part)) for part in parts]
-        known = [(part, dimension) for part, dimension in found if dimension not in (None, ANY)]
+        pairs = [(part, self.dimension(part)) for part in parts]
+        known = [(part, dimension) for part, dimension in pairs if dimension not in (None, ANY)]
         if not known:
-            return None if any(dimension is None for _, dimension in found) else ANY
+            return None if any(dimension is None for _, dimension in pairs) else ANY
         usual = Counter(dimension for _, dimension in known).most_common(1)[0][0]
         like = next(part for part, dimension in known if dimension == usual)
         for part, dimension in known:
@@ -155,15 +155,15 @@ class _Checker:
                 self.dimension(condition)
         # Of the branches, sides or entries of one; atan2: of the sides of a triangle, whatever their unit.
         equal = word not in FUNCTIONS or word in ("max", "min", "atan2")
-        found = self.agree("E404", parts) if equal else self.dimension(parts[0])
+        result = self.agree("E404", parts) if equal else self.dimension(parts[0])
         for time in parts[1:] if word in _TIMES else ():
             self.fits(time, SECOND, "E405", _TIMES[word])
         if word in ("atan2", "sign", "count", *CONDITIONS):
             return DIMENSIONLESS
-        if word == "der" and found != ANY:
-            return found and found.divide(SECOND)
+        if word == "der" and result != ANY:
+            return result and result.divide(SECOND)
         # Else of if, {, max, min, hold, interpolate, sample, previous, initial, mean, sum, abs and norm.
-        return SECOND if word == "age" else found
+        return SECOND if word == "age" else result
 
     def product(self, word: str, left: Expr, right: Expr) -> Dimension | None:
         base = self.factor(left)

@@ -84,16 +84,16 @@ def read_graph(node: Node, numbers: NamedNumbers) -> Graph:
     if "peers" in numbers.faulty:
         raise AlreadyReportedError
     numbered = _peers(numbers.counts)
-    found: dict[tuple[int, int], float] = {}
+    result: dict[tuple[int, int], float] = {}
     for pair in items:
         with mistakes:
             sender, receiver, weight = _arc(pair, key, numbered, mistakes)
-            if (sender, receiver) in found or (key == "edges" and (receiver, sender) in found):
+            if (sender, receiver) in result or (key == "edges" and (receiver, sender) in result):
                 raise fault("E213", pair.place, f"the pair {sender + 1}, {receiver + 1} is given twice")
-            found[sender, receiver] = weight
+            result[sender, receiver] = weight
     if key == "edges":
-        found |= {(receiver, sender): weight for (sender, receiver), weight in found.items()}
-    return Graph("arcs", np.array([*found], np.int64).reshape(-1, 2), np.array([*found.values()]))
+        result |= {(receiver, sender): weight for (sender, receiver), weight in result.items()}
+    return Graph("arcs", np.array([*result], np.int64).reshape(-1, 2), np.array([*result.values()]))
 
 
 def _pairs_of(table: Table) -> tuple[Node, ...]:
@@ -162,7 +162,7 @@ def read_delays(node: Node, numbers: NamedNumbers) -> tuple[SceneDelay, ...]:
     ApcError
         E203 it is no mapping; other mistakes are recorded.
     """
-    found, what = [], "delays names {}, which is no group of peers"
+    scene_delays, what = [], "delays names {}, which is no group of peers"
     hint, counts = "delays: {left: {right: 12 ms}}", numbers.counts
     for key, body in mapping_of(node, "delays", hint).entries:
         with numbers.mistakes:
@@ -174,5 +174,5 @@ def read_delays(node: Node, numbers: NamedNumbers) -> tuple[SceneDelay, ...]:
                     delay = numbers.read(value, f"the delay from {sender} to {receiver}", SECOND, "ms")
                     if delay.number < 0:
                         raise fault("E207", delay.place, "a delay", "0 s or more", str(delay))
-                    found.append(SceneDelay(sender, receiver, delay))
-    return tuple(found)
+                    scene_delays.append(SceneDelay(sender, receiver, delay))
+    return tuple(scene_delays)

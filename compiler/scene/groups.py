@@ -106,7 +106,7 @@ def read_counts(root: Body, files: NamedFiles) -> dict[str, GroupBody]:
     files
         Reads its tables.
     """
-    found: dict[str, GroupBody] = {}
+    result: dict[str, GroupBody] = {}
     example = "{user: {count: 3}}"
     section, peers = root.section("peers", example), root.nodes.get("peers")
     if isinstance(peers, MappingNode) and not section:
@@ -129,8 +129,8 @@ def read_counts(root: Body, files: NamedFiles) -> dict[str, GroupBody]:
                 count = body.nodes.get("count")
                 if isinstance(count, Scalar) and count.plain and _IN_NAMES.match(count.text):
                     counted = read_count_by_names(count, root)
-                found[name] = GroupBody(name, _count(name, body, table, counted), body, table, counted)
-    return found
+                result[name] = GroupBody(name, _count(name, body, table, counted), body, table, counted)
+    return result
 
 
 def _count(name: str, body: Body, table: Table | None, counted: Value | None) -> int:

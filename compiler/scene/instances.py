@@ -140,17 +140,17 @@ class PartReader:
 
     def _settled(self, bindings: Named[Binding], component: Component) -> Named[Value]:
         """Return what named bindings come to, within the bounds of a component's parameters."""
-        found = []
+        pairs = []
         for name, binding in bindings:
             with self.numbers.mistakes:
-                found.append((name, value := settle(binding, self.numbers.number)))
+                pairs.append((name, value := settle(binding, self.numbers.number)))
                 if isinstance(parameter := component.parameter(name), Number):
                     parameter.bounds.check(value, name, self.numbers.mistakes)
-        return tuple(found)
+        return tuple(pairs)
 
     def _tables(self, entry: PartEntry, nodes: Mapping[str, Node]) -> tuple[TimeTable, ...]:
         """Read the files of a part's quantities over time."""
-        found = []
+        time_tables = []
         for parameter in entry.component.parameters:
             if isinstance(parameter, Reference) and parameter.role == "table":
                 name, unit = parameter.name, parameter.unit
@@ -160,8 +160,8 @@ class PartReader:
                     if (node := nodes.get(name)) is None:
                         raise fault("E201", entry.place, f"{entry.name} has no {name}", hint=hint)
                     reader = partial(read_time_table, name=name, unit=unit, named_at=node.place)
-                    found.append(self.numbers.files.read(text_of(node, name, hint), reader))
-        return tuple(filter(None, found))
+                    time_tables.append(self.numbers.files.read(text_of(node, name, hint), reader))
+        return tuple(filter(None, time_tables))
 
     def _groups_of(self, entry: PartEntry) -> tuple[str, ...]:
         """Return the groups whose peers have a part."""
@@ -178,12 +178,12 @@ class PartReader:
         if not (isinstance(node, Sequence) and items):
             got = "an empty one" if isinstance(node, Sequence) else form(node)
             raise fault("E203", node.place, "at", "a list of groups", got, f"at: [{groups}]")
-        found = []
+        texts = []
         for item in items:
             with self.numbers.mistakes:
                 what = f"{name} is at {{}}, which is no group of peers"
-                found.append(among(text_of(item, "a group"), counts, item.place, what))
-        return tuple(found)
+                texts.append(among(text_of(item, "a group"), counts, item.place, what))
+        return tuple(texts)
 
 
 def _shared(entry: PartEntry) -> bool:
@@ -209,13 +209,13 @@ def _inside(part: Part, inner: Inner, peers: int) -> Part:
         return parts if parts == PEERS else (*part.name.split("."), *parts)
 
     def settled(bindings: Named[Binding]) -> Named[Value]:
-        found = []
+        pairs = []
         for name, binding in bindings:
             with suppress(ApcError, KeyError):  # what the outer part has no value for was reported there
                 value = settle(binding, numbers.__getitem__)
                 tree = value.expression and renamed(value.expression, whole)
-                found.append((name, replace(value, place=part.place, expression=tree)))
-        return tuple(found)
+                pairs.append((name, replace(value, place=part.place, expression=tree)))
+        return tuple(pairs)
 
     return replace(
         part,
@@ -241,7 +241,7 @@ def settable_names(parts: Iterable[Part]) -> dict[str, tuple[Settable, list[str]
 
     The name of an array stands for all its elements: `a[1].b[2]` is one of `a.b[2]`, `a[1].b` and `a.b`.
     """
-    found: dict[str, tuple[Settable, list[str]]] = {}
+    result: dict[str, tuple[Settable, list[str]]] = {}
     for part in parts:
         items: list[Settable] = [
             p for p in part.component.parameters if not isinstance(p, Reference) or p.role == "clock"
@@ -251,6 +251,6 @@ def settable_names(parts: Iterable[Part]) -> dict[str, tuple[Settable, list[str]
             *(dict.fromkeys((name, whole_and_index(name)[0])) for name in part.name.split("."))
         )
         for name, item in product(map(".".join, elements), items):
-            _, wholes = found.setdefault(f"{name}.{item.name}", (item, []))
+            _, wholes = result.setdefault(f"{name}.{item.name}", (item, []))
             wholes.append(f"{part.name}.{item.name}")
-    return found
+    return result

@@ -93,12 +93,12 @@ def oddities(
 
 def _joined(parts: Sequence[Part]) -> DisjointSet:
     """Return the parts of one group as sets of what is joined, directly or not; the ground joins nothing."""
-    found = DisjointSet(part.name for part in parts)
+    result = DisjointSet(part.name for part in parts)
     for part in parts:
         for _, other, _ in part.connections:
-            if other in found:
-                found.merge(part.name, other)
-    return found
+            if other in result:
+                result.merge(part.name, other)
+    return result
 
 
 def warning_texts(warnings: Collection[Mistake]) -> tuple[str, ...]:

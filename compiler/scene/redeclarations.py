@@ -32,17 +32,17 @@ def redeclared(groups: Iterable[GroupBody], parts: Parts) -> dict[str, dict[str,
     parts
         The parts of the topology; its mistakes get what is wrong with a type.
     """
-    found: dict[str, dict[str, PartEntry]] = {}
+    result: dict[str, dict[str, PartEntry]] = {}
     for group in groups:
         settings = list(_settings(group))
         for key, node in settings:
             entry = parts.entries.get(key.text.removesuffix(TYPE))
             if key.text.endswith(TYPE) and entry is not None:
-                at = found.setdefault(entry.name, {})
+                at = result.setdefault(entry.name, {})
                 at[group.name] = entry  # if there is a mistake in it
                 with parts.mistakes:
                     at[group.name] = _entry(entry, key, node, settings, parts)
-    return found
+    return result
 
 
 def _settings(group: GroupBody) -> Iterator[tuple[Scalar, Node]]:

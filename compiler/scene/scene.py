@@ -97,13 +97,13 @@ def library_folders(source: Source) -> tuple[Path, ...]:
     """Return the folders of components that a topology names. Raises ApcError for one that isn't there."""
     node = source.root.get("library") if isinstance(source.root, Mapping) else None
     mistakes = Mistakes()
-    found = []
+    paths = []
     for item in node.items if isinstance(node, Sequence) else () if node is None else (node,):
         with mistakes:
             text = text_of(item, "library", "library: ./parts")
-            found.append(readable_library(_folder_of(source) / text, text, item.place))
+            paths.append(readable_library(_folder_of(source) / text, text, item.place))
     mistakes.raise_if_any()
-    return tuple(found)
+    return tuple(paths)
 
 
 def readable_library(folder: Path, text: str, place: Place, hint: str = "library: ./parts") -> Path:

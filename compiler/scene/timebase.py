@@ -45,12 +45,12 @@ def read_clocks(root: Body, numbers: NamedNumbers, taken: Container[str]) -> dic
     taken
         The names that are used already.
     """
-    found: dict[str, SceneClock] = {}
+    result: dict[str, SceneClock] = {}
     for key, value in root.section("clocks", "{haptic: 1 ms}"):
         with root.mistakes:
             name = name_of(key, "a clock", taken, "this topology", RESERVED)
-            found[name] = _read_clock(name, value, numbers, root)
-    return found
+            result[name] = _read_clock(name, value, numbers, root)
+    return result
 
 
 def _read_clock(name: str, node: Node, numbers: NamedNumbers, root: Body) -> SceneClock:

@@ -163,11 +163,11 @@ class Body:
 
     def each(self, key: str, hint: str, reader: Callable[[Scalar, Node], T]) -> list[T]:
         """Return what a reader makes of the entries of a section, each its key and value."""
-        found = []
+        result = []
         for name, node in self.section(key, hint):
             with self.mistakes:
-                found.append(reader(name, node))
-        return found
+                result.append(reader(name, node))
+        return result
 
 
 def unknown(code: str, place: Place, what: str, name: str, known: Collection[str]) -> ApcError:

@@ -130,10 +130,10 @@ _CONTROL = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u2028\u2029\ufeff\uf
 
 def _refuse_control_characters(text: str, lines: Lines) -> None:
     """Raise E107 for the first character that no editor shows."""
-    if (found := _CONTROL.search(text)) is None:
+    if (search := _CONTROL.search(text)) is None:
         return
-    before = re.split(r"\r\n|\n|\r", text[: found.start()])
-    character = found.group()
+    before = re.split(r"\r\n|\n|\r", text[: search.start()])
+    character = search.group()
     name = unicodedata.name(character, "a control character")
     got = f"U+{ord(character):04X} ({name})" + (": is this a binary file" if character == "\0" else "")
     place = lines.place(len(before) - 1, len(before[-1]))

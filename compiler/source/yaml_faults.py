@@ -58,10 +58,10 @@ _BRACKET = re.compile(r"[\[{][^{}\[\]]*[\]}][^,:{}\[\]]*")
 
 def with_colon(text: str) -> str:
     """Return a line that lacks the colon behind its key as it was meant; an empty text if it has no key."""
-    found = _KEY_ONLY.fullmatch(text.strip())
-    if found is None:
+    result = _KEY_ONLY.fullmatch(text.strip())
+    if result is None:
         return ""
-    return f"{found[1]}: {found[2]}" if found[1] else ""
+    return f"{result[1]}: {result[2]}" if result[1] else ""
 
 
 def _line_above(line: int, lines: Lines) -> int:
@@ -134,8 +134,8 @@ def not_yaml(error: yaml.MarkedYAMLError, lines: Lines) -> Mistake:
     }
     for part in slips:
         for slip, line in slips[part] if part in told else ():
-            if (found := slip(line, lines)) is not None:
-                return found
+            if (mistake := slip(line, lines)) is not None:
+                return mistake
     for part, sentence, hint in _PROBLEMS:
         if part in told:
             if error.context_mark and sentence.startswith("this ") and "indented" not in sentence:

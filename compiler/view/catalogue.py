@@ -57,12 +57,12 @@ def library_document(library: Library) -> dict[str, Any]:
 
 def _found(library: Library, name: str) -> Component | Connector:
     """Return a component or connector. Raises ApcError (E206) where the library has none of that name."""
-    if (found := library.component(name) or library.connector(name)) is None:
+    if (result := library.component(name) or library.connector(name)) is None:
         names = {name.lower(): name for name in library.names}
         near = names.get(nearest(name.lower(), names), "")
         what = f"the library has no {name[:80] or 'nameless component'}"
         raise ApcError(Mistake("E206", Place("apc library"), what, hint=f"apc library {near}".rstrip()))
-    return found
+    return result
 
 
 def component_text(library: Library, name: str) -> str:
@@ -92,10 +92,10 @@ def component_text(library: Library, name: str) -> str:
 
 def component_document(library: Library, name: str) -> dict[str, Any]:
     """Return a component of a library, or a connector, as plain data: see `component_text`."""
-    found = _found(library, name)
-    kind, whole = "component", found
+    result = _found(library, name)
+    kind, whole = "component", result
     if isinstance(whole, Connector):  # it has no parts of its own to tell of
-        kind, whole = "connector", Component(name, found.about, "", Place(""))
+        kind, whole = "connector", Component(name, result.about, "", Place(""))
     vectors = by_vector(whole.parameters)
     return {
         "name": name,

@@ -158,8 +158,8 @@ def prepare_at_start(
         As `plan.refuse_varying`.
     """
     refuse_varying(system, prepared.jacobians)
-    found = _starting(system, prepared.jacobians, varied)
-    return None if found is None else replace(prepared, jacobians=found, starting=True)
+    result = _starting(system, prepared.jacobians, varied)
+    return None if result is None else replace(prepared, jacobians=result, starting=True)
 
 
 def _starting(
@@ -174,8 +174,8 @@ def _starting(
             for group, rows in zip(system.groups, resolve(system).parameters, strict=True)
         )
     listed = [at_start(site, silent=silent) if kind in used else site for kind, site in enumerate(sites)]
-    found = tuple(site for site in listed if site is not None)
-    return found if len(found) == len(sites) else None
+    result = tuple(site for site in listed if site is not None)
+    return result if len(result) == len(sites) else None
 
 
 def near_start(system: CompiledSystem, prepared: Prepared | None = None) -> tuple[str, ...]:
@@ -304,15 +304,15 @@ def _what_stands(spectrum: Spectrum, loops: Sequence[Loop], population: Sequence
         anyhow = {way: ((Fraction(-1, 3),),) for way in used_ways([group.schedule])}
         listed = [*listed, (Loop(group.name, 1, (group,), anyhow), group.count)]
     with_drifts = bool(spectrum.drifts and loops)
-    found = [(what_stands(loop, with_drifts=with_drifts), many) for loop, many in listed]
-    names = tuple(dict.fromkeys(name for standing, _ in found for name in standing.names))
-    unfelt = sum(standing.unfelt * many for standing, many in found)
+    pairs = [(what_stands(loop, with_drifts=with_drifts), many) for loop, many in listed]
+    names = tuple(dict.fromkeys(name for standing, _ in pairs for name in standing.names))
+    unfelt = sum(standing.unfelt * many for standing, many in pairs)
     if not loops:
         return Standing(spectrum.rigid_modes - unfelt, 0, spectrum.drifts, unfelt, names)
     return Standing(
-        translations=sum(standing.translations * many for standing, many in found),
-        rotations=sum(standing.rotations * many for standing, many in found),
-        drifts=sum(standing.drifts * many for standing, many in found),
+        translations=sum(standing.translations * many for standing, many in pairs),
+        rotations=sum(standing.rotations * many for standing, many in pairs),
+        drifts=sum(standing.drifts * many for standing, many in pairs),
         unfelt=unfelt,
         names=names,
     )
@@ -408,10 +408,10 @@ def prepared_at(system: CompiledSystem, prepared: Prepared, timings: Mapping[str
     """
     sites = at_timings(system, prepared.jacobians, timings, prepared.order)
     if prepared.starting and sites is not prepared.jacobians:
-        found = _starting(system, sites)
-        if found is None:
+        result = _starting(system, sites)
+        if result is None:
             raise hangs_on_heard(system)
-        sites = found
+        sites = result
     return replace(_scheduled(system, sites, timings, prepared.order), starting=prepared.starting)
 
 

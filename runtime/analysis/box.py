@@ -174,11 +174,11 @@ def open_systems(
         raise ApcError(Mistake("E830", _PLACE, "no parameter is left open", hint="contact.stiffness=±1%"))
     for interval in ranges:
         refuse_channel_number(system, interval.free, _PLACE)
-    found = open_sites(system, ranges, prepared, lambda changed: lifted_groups(changed, prepared=prepared))
-    by_site = {id(group.site): found.sites[group.name] for group in found.groups}
+    sites = open_sites(system, ranges, prepared, lambda changed: lifted_groups(changed, prepared=prepared))
+    by_site = {id(group.site): sites.sites[group.name] for group in sites.groups}
     return [
         (closed_system, tuple(by_site[id(group.site)] for group in closed_system.sites))
-        for closed_system in split(found.groups, found.exchange)
+        for closed_system in split(sites.groups, sites.exchange)
     ]
 
 
@@ -284,8 +284,8 @@ def _opened(system: CompiledSystem, group: Group, ranges: Sequence[Range], field
             raise ApcError(Mistake("E832", _PLACE, what)) from None
 
     wanted = system.kinds[group.kind].parameters
-    found = scope.follow(given, compute, lambda name: Fraction(scope.holder[name].value), wanted)
-    return {name: found[name] for name in wanted if isinstance(found.get(name), Ratio)}
+    result = scope.follow(given, compute, lambda name: Fraction(scope.holder[name].value), wanted)
+    return {name: result[name] for name in wanted if isinstance(result.get(name), Ratio)}
 
 
 def _power(base: Any, exponent: Any) -> Any:

@@ -135,7 +135,7 @@ def prove_box(
                 or analysis.spectral_radius - analysis.spectral_radius_error > inside
             )
 
-        found = search_box(
+        box_proof = search_box(
             system.name,
             ranges,
             partial(_looked, opened.questions, is_unstable),
@@ -144,9 +144,9 @@ def prove_box(
             unstable=UNSTABLE,
             cells=0 if opened.notes else cells,
         )
-        if opened.notes and found.stable is None:
-            return replace(found, point=(), notes=opened.notes)
-        return found
+        if opened.notes and box_proof.stable is None:
+            return replace(box_proof, point=(), notes=opened.notes)
+        return box_proof
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -275,18 +275,18 @@ def _looked(
         proved, inside = np.ones((2, len(some)), dtype=np.bool_)
         reach = np.array([[float(high - low) for low, high in cell] for cell in some])
         for question in questions:
-            found = contracted(matrices_over(question, some))
-            sound = found.inside | found.proved
+            contraction = contracted(matrices_over(question, some))
+            sound = contraction.inside | contraction.proved
             left = np.flatnonzero(~sound)
             if len(left):
                 at = [points[place] for place in left.tolist()]
                 sound[left] = contracted(matrices_over(question, at)).proved
             inside &= sound
-            fails = ~found.proved & np.isfinite(found.reach).all(axis=1)
+            fails = ~contraction.proved & np.isfinite(contraction.reach).all(axis=1)
             first = fails & proved
-            reach[first] = found.reach[first]
-            reach[fails] = np.maximum(reach, found.reach)[fails]
-            proved &= found.proved
+            reach[first] = contraction.reach[first]
+            reach[fails] = np.maximum(reach, contraction.reach)[fails]
+            proved &= contraction.proved
         for cell, is_proved, is_sound, matters in zip(some, proved, inside, reach, strict=True):
             if is_proved or is_sound:
                 yield Looked(None if is_proved else matters, work=LIGHT)

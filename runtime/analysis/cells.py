@@ -171,8 +171,8 @@ def contracted(matrix: Matrix) -> Contraction:
     known = np.isfinite(basis).all(axis=(1, 2)) & np.isfinite(matrix).all(axis=(1, 2, 3))
     reach[~known] = np.nan
     if known.any():
-        found = _contracted(basis[known], value[known], off[known], slopes[known])
-        proved[known], inside[known], reach[known] = found.proved, found.inside, found.reach
+        contraction = _contracted(basis[known], value[known], off[known], slopes[known])
+        proved[known], inside[known], reach[known] = contraction.proved, contraction.inside, contraction.reach
     return Contraction(proved, inside, reach)
 
 
@@ -222,11 +222,11 @@ def _norm_below(matrix: Floats, limit: Floats) -> Truths:
 
 def _cholesky(matrix: Floats) -> Floats:
     """Return the lower triangular L (k, n, n) of matrices L Lᵀ, NaN where there is none."""
-    found = np.full(matrix.shape, np.nan)
+    values = np.full(matrix.shape, np.nan)
     for place, value in enumerate(matrix):  # NumPy refuses a whole stack where it refuses one of it
         with contextlib.suppress(np.linalg.LinAlgError):
-            found[place] = np.linalg.cholesky(value)
-    return found
+            values[place] = np.linalg.cholesky(value)
+    return values
 
 
 def _change_of_basis(matrix: Floats) -> Floats:
@@ -238,17 +238,17 @@ def _change_of_basis(matrix: Floats) -> Floats:
     that ‖R M R⁻¹‖ ≤ γ for P = RᵀR.
     """
     n = matrix.shape[-1]
-    found = np.full(matrix.shape, np.nan)
+    values = np.full(matrix.shape, np.nan)
     some = np.flatnonzero(np.isfinite(matrix).all(axis=(1, 2)))
     if not len(some):
-        return found
+        return values
     # Cells of one box are alike enough for the units of one.
     scale = balance(np.abs(matrix[some]).max(axis=0) + np.finfo(np.float64).tiny)
     balanced = matrix[some] / scale[:, None] * scale
     radius = np.abs(np.linalg.eigvals(balanced)).max(axis=1)
     some, balanced, radius = (item[radius < 1] for item in (some, balanced, radius))
     if not len(some):
-        return found
+        return values
     power_of = balanced / (radius + DECAY * (1 - radius))[:, None, None]
     total = np.broadcast_to(np.eye(n), balanced.shape)
     for _ in range(DOUBLINGS):
@@ -256,8 +256,8 @@ def _change_of_basis(matrix: Floats) -> Floats:
         power_of = power_of @ power_of
         if not np.abs(power_of).max() > np.finfo(np.float64).tiny:
             break
-    found[some] = _cholesky((total + total.swapaxes(1, 2)) / 2).swapaxes(1, 2) / scale
-    return found
+    values[some] = _cholesky((total + total.swapaxes(1, 2)) / 2).swapaxes(1, 2) / scale
+    return values
 
 
 def matrices_over(asked: OpenSystem, cells: Sequence[Cell]) -> Matrix:
@@ -278,10 +278,10 @@ def matrices_over(asked: OpenSystem, cells: Sequence[Cell]) -> Matrix:
     closed = close(maps, heard, asked.system.layout, numbers=taylor(count)).matrix
     closed = np.broadcast_to(closed, (len(cells), *closed.shape[-3:]))
     at = replace(asked.relative, weights=within(asked.relative.weights, count))
-    found = relative(closed, at, taylor(count))
+    values = relative(closed, at, taylor(count))
     if asked.inside == 1:
-        return found
-    larger = found / asked.inside
+        return values
+    larger = values / asked.inside
     radius_of(larger)[...] = (radius_of(larger) + UNIT * np.abs(larger).sum(axis=1)) * (1 + 8 * UNIT)
     return larger
 
@@ -304,11 +304,11 @@ def frames_over(asked: OpenFrames, cells: Sequence[Cell]) -> list[FrameMap]:
 
     def over(written: Matrix) -> Matrix:
         item: _Written = written.item()
-        found = np.empty((len(cells), 2 + count, *item.still.shape[1:]))
-        found[:] = within(item.still, count)
+        result = np.empty((len(cells), 2 + count, *item.still.shape[1:]))
+        result[:] = within(item.still, count)
         for (row, column), place in item.moving.items():
-            found[..., row, column] = values[place][..., 0, 0]
-        return found
+            result[..., row, column] = values[place][..., 0, 0]
+        return result
 
     known: dict[tuple[int, int], FrameMap] = {}
     maps = []
@@ -328,15 +328,15 @@ def frames_over(asked: OpenFrames, cells: Sequence[Cell]) -> list[FrameMap]:
 def _parameters(cells: Sequence[Cell], *, wide: bool) -> list[Matrix]:
     """Return the parameters over cells (k, 2 + m, 1, 1) each, m being 0 of points."""
     count = len(cells[0])
-    found = []
+    result = []
     for place in range(count):
         number = np.zeros((len(cells), 2 + (count if wide else 0), 1, 1))
         number[:, 0, 0, 0] = [float((cell[place][0] + cell[place][1]) / 2) for cell in cells]
         if wide:
             number[:, 2 + place, 0, 0] = [float((cell[place][1] - cell[place][0]) / 2) for cell in cells]
         radius_of(number)[...] = UNIT * np.abs(number).sum(axis=1) * (1 + 8 * UNIT)
-        found.append(number)
-    return found
+        result.append(number)
+    return result
 
 
 def _bounded(number: Fraction) -> tuple[float, float]:

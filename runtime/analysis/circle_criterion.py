@@ -98,8 +98,8 @@ def _posed(open_loop: OpenLoop, weights: Weights) -> tuple[Matrix, Matrix, Matri
 
 def _weigh(open_loop: OpenLoop, weights: Weights) -> Matrix:
     """Return the weights of a loop's ticks, of all their peers, on a diagonal with their radii."""
-    found = np.zeros((2, len(open_loop.ports), len(open_loop.ports)))
+    values = np.zeros((2, len(open_loop.ports), len(open_loop.ports)))
     for k, (port, count) in enumerate(zip(open_loop.ports, open_loop.counts.tolist(), strict=True)):
         value, radius = weights.get(port, (1.0, 0.0))
-        found[:, k, k] = value * count, (radius + UNIT * value) * count * (1 + 4 * UNIT)
-    return found
+        values[:, k, k] = value * count, (radius + UNIT * value) * count * (1 + 4 * UNIT)
+    return values

@@ -137,26 +137,26 @@ def contact_modes(system: CompiledSystem, *, prepared: Prepared | None = None) -
         kinds = tuple(system.kinds[kind] for kind, _ in numbers)
         changed = replace(system, kinds=kinds, groups=groups)
         on = tuple((group.name, tuple(sorted(own))) for group, own in zip(groups, setting, strict=True))
-        found, refusal = None, _no_slope(changed, sites)
+        analysis, refusal = None, _no_slope(changed, sites)
         if not refusal:
             try:
-                found = analyze(changed, prepared=replace(prepared, jacobians=sites))
+                analysis = analyze(changed, prepared=replace(prepared, jacobians=sites))
             except ApcError as error:
                 refusal = error.mistakes[0].sentence
-        if found is None:
+        if analysis is None:
             nan = float("nan")
             return ContactMode(name, on, "", None, nan, nan, 0.0, linearized=False, refusal=refusal)
         return ContactMode(
             name=name,
             on=on,
-            verdict=found.verdict,
-            stable=found.stable,
-            spectral_radius=found.spectral_radius,
-            spectral_radius_error=found.spectral_radius_error,
-            frequency_hz=found.modes[0].frequency_hz if found.modes else 0.0,
-            linearized=found.linearized,
+            verdict=analysis.verdict,
+            stable=analysis.stable,
+            spectral_radius=analysis.spectral_radius,
+            spectral_radius_error=analysis.spectral_radius_error,
+            frequency_hz=analysis.modes[0].frequency_hz if analysis.modes else 0.0,
+            linearized=analysis.linearized,
             refusal="",
-            beyond=found.beyond,
+            beyond=analysis.beyond,
         )
 
     modes = tuple(mode(name, setting) for setting, name in _settings(system, names, has).items())
@@ -194,13 +194,13 @@ def _settings(
 ) -> dict[_Setting, str]:
     """Return the modes of a scene with their names, each once; none where nothing switches."""
     nothing: frozenset[str] = frozenset()
-    found = {tuple(has): EVERYONE, tuple(nothing for _ in has): NOBODY} if names else {}
+    result = {tuple(has): EVERYONE, tuple(nothing for _ in has): NOBODY} if names else {}
     for place, group in enumerate(system.groups if names else ()):
         alone = tuple(own if g == place else nothing for g, own in enumerate(has))
-        found.setdefault(alone, f"on at {group.name} alone")
+        result.setdefault(alone, f"on at {group.name} alone")
     for name in names:
-        found.setdefault(tuple(own & {name} for own in has), f"{name} on alone")
-    return found
+        result.setdefault(tuple(own & {name} for own in has), f"{name} on alone")
+    return result
 
 
 def _no_slope(system: CompiledSystem, sites: Sequence[SiteJacobians]) -> str:

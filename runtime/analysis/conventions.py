@@ -154,18 +154,20 @@ def conventions(
     pairs = {pair: words for pair, words in DEPARTURES.items() if pair != ("act", "send") or carried}
     readings = [SENDER, NOTHING] if matters else [""]
 
-    def outcome(orders: Sequence[Order], start: str, found: Analysis | ApcError, frame_s: float) -> Outcome:
+    def outcome(
+        orders: Sequence[Order], start: str, analysis: Analysis | ApcError, frame_s: float
+    ) -> Outcome:
         departures = tuple(
             words
             for (a, b), words in pairs.items()
             if all(order.index(a) < order.index(b) for order in orders)
         )
-        if isinstance(found, ApcError):
-            nan, refusal = float("nan"), found.mistakes[0].sentence
+        if isinstance(analysis, ApcError):
+            nan, refusal = float("nan"), analysis.mistakes[0].sentence
             return Outcome(tuple(orders), departures, start, "", None, nan, nan, frame_s, refusal)
-        radius, error = found.spectral_radius, found.spectral_radius_error
-        answer = found.verdict, found.stable, radius, error, found.frame_s
-        return Outcome(tuple(orders), departures, start, *answer, refusal="", beyond=found.beyond)
+        radius, error = analysis.spectral_radius, analysis.spectral_radius_error
+        answer = analysis.verdict, analysis.stable, radius, error, analysis.frame_s
+        return Outcome(tuple(orders), departures, start, *answer, refusal="", beyond=analysis.beyond)
 
     def only(why: str) -> Conventions:
         first = replace(outcome([ORDER], readings[0], default, default.frame_s), departures=())
@@ -185,14 +187,14 @@ def conventions(
         return only(why)
     outcomes = []
     for orders, start in itertools.product(classes.values(), readings):
-        found: Analysis | ApcError = default
+        result: Analysis | ApcError = default
         if ORDER not in orders or start == NOTHING:
             changed = _prepared(system, prepared, orders[0], silent=start == NOTHING)
             try:
-                found = analyze(system, prepared=changed)
+                result = analyze(system, prepared=changed)
             except ApcError as refused:
-                found = refused
-        outcomes.append(outcome(orders, start, found, default.frame_s))
+                result = refused
+        outcomes.append(outcome(orders, start, result, default.frame_s))
     return Conventions(system.name, tuple(outcomes), matters, "")
 
 
@@ -233,8 +235,8 @@ def _meaning(schedule: Schedule, pattern: LinearSite) -> Hashable:
 
 def _holds(reading: Any) -> list[int]:
     """Return the holds that a matrix over them reads."""
-    found: list[int] = np.flatnonzero(np.asarray(reading).any(axis=0)).tolist()
-    return found
+    numbers: list[int] = np.flatnonzero(np.asarray(reading).any(axis=0)).tolist()
+    return numbers
 
 
 def _hearing_matters(site: SiteJacobians) -> bool:

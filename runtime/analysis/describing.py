@@ -96,9 +96,9 @@ def predict(system: CompiledSystem, groups: list[tuple[PeerGroup, tuple[Push, ..
         word = "unstable" if unstable else "stable"
         return f"no buzz: with contacts of any part of their stiffness it is {word}"
     gain = brentq(excess, below, below + 1 / CELLS, xtol=NEAR)
-    found = at(gain)
+    spectrum = at(gain)
     frequency = max(
-        (mode.frequency_hz for mode in found.modes if abs(mode.magnitude - 1) < MARGINAL), default=0.0
+        (mode.frequency_hz for mode in spectrum.modes if abs(mode.magnitude - 1) < MARGINAL), default=0.0
     )
     if not frequency:
         return f"no buzz: with contacts of {gain:.6g} of their stiffness it drifts away without swinging"

@@ -80,8 +80,8 @@ def _needs(system: CompiledSystem) -> Needs:
     exchange = build_exchange(system, numbers.timings)
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # the sizes count here, not the numbers
-            found = make_plan(system, prepared.jacobians, prepared.schedules, numbers, exchange)
-        method, systems, refused = found.method, found.systems, ""
+            plan = make_plan(system, prepared.jacobians, prepared.schedules, numbers, exchange)
+        method, systems, refused = plan.method, plan.systems, ""
     except ApcError as error:  # a scene that can't be analysed may still be run
         method, systems, refused = "", (), error.mistakes[0].sentence
     frame = prepared.schedules[0].frame_s

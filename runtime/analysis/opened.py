@@ -126,14 +126,14 @@ def contact_groups(
             return f"some force at {group.name} is not linear, or looks at each of the others by itself"
     exchange = build_exchange(system, numbers.timings)
     kinds = {id(site_jacobians): kind for kind, site_jacobians in enumerate(on)}
-    found = []
+    pairs = []
     for peers in peer_groups(system, on, prepared.schedules, numbers, exchange):
         kind = kinds[id(peers.jacobians)]
         pushes = (
             push_of(switched[kind], part, prepared.jacobians[kind], peers.parameters) for part in parts[kind]
         )
-        found.append((peers, tuple(push for push in pushes if isinstance(push, Push))))
-    return found
+        pairs.append((peers, tuple(push for push in pushes if isinstance(push, Push))))
+    return pairs
 
 
 def with_gain(group: PeerGroup, pushes: Sequence[Push], gain: Fraction) -> PeerGroup:
@@ -179,7 +179,7 @@ def open_loops(system: CompiledSystem, prepared: Prepared) -> list[OpenLoop] | s
     loops = loops_at_right_angles([item.group for item in opened], exchange, MOST_STATES)
     if isinstance(loops, str):
         return loops
-    found = []
+    result = []
     for loop in loops:
         listed = [of_site[id(site.lifting)] for site in loop.sites]
         size = loop.states + sum(len(opened.ticks) for opened in listed)
@@ -188,18 +188,18 @@ def open_loops(system: CompiledSystem, prepared: Prepared) -> list[OpenLoop] | s
         one_open = _open_loop(loop, listed)
         if isinstance(one_open, str):
             return one_open
-        found.append(one_open)
-    return found
+        result.append(one_open)
+    return result
 
 
 def _cut_open(group: PeerGroup, pushes: Sequence[Push]) -> Opened:
     """Cut the contacts of some peers open: their forces come from outside, and what they follow goes out."""
     schedule, bare = group.schedule, with_gain(group, pushes, Fraction(0))
     steps = step_durations(schedule)
-    found = discretize(bare.exact.a, bare.exact.b, [step * schedule.quantum for step in steps])
+    result = discretize(bare.exact.a, bare.exact.b, [step * schedule.quantum for step in steps])
     off = {
         step: with_radius(item.matrix, item.roundings * UNIT * item.size)
-        for step, item in zip(steps, found, strict=True)
+        for step, item in zip(steps, result, strict=True)
     }
     ticks: list[tuple[str, int]] = []
     slopes = []

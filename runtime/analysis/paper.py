@@ -503,9 +503,9 @@ def _periods(system: CompiledSystem, sites: Sequence[PeerGroup]) -> tuple[Fracti
     forces = dict.fromkeys(hold.clock for hold in holds)
     networks = dict.fromkeys(link_clock[way.link] for way in ways)
     missing = [text for group in {id(site.site): site for site in sites}.values() for text in _misfits(group)]
-    for what, found in (("clock of forces", forces), ("network clock", networks)):
-        if len(found) != 1:
-            listed = f"here are {' and '.join(found)}" if found else "here is none"
+    for what, result in (("clock of forces", forces), ("network clock", networks)):
+        if len(result) != 1:
+            listed = f"here are {' and '.join(result)}" if result else "here is none"
             missing.append(f"one {what} ({listed})")
     if missing:
         raise _not_of_the_form(system, missing)

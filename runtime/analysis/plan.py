@@ -123,24 +123,24 @@ def make_plan(
     if method == "dense":
         refuse_dense(groups, exchange)
         loops: tuple[Loop, ...] = (dense_loop(groups, exchange),)
-        found, notes = "dense", tuple[str, ...]()
+        text, notes = "dense", tuple[str, ...]()
     else:
         arranged = arrange(groups, exchange)
         if method == "modes" and arranged.method != "modes":
             raise cannot_serve(system, method, arranged.notes[0])
-        loops, found, notes = arranged.loops, arranged.method, arranged.notes
+        loops, text, notes = arranged.loops, arranged.method, arranged.notes
         packets = max(sum(sum(group.schedule.depths) for group in loop.sites) for loop in loops)
         held = max(sum(len(group.schedule.carried) for group in loop.sites) for loop in loops)
         if method == "determinant":
-            found = method
+            text = method
         elif method == "auto" and (
             max(sum(group.schedule.depths) for loop in loops for group in loop.sites) > LONG_LINES
             or (packets + held > LONG_LINES and max(loop.states for loop in loops) > MOST_STATES)
         ):
-            found = "determinant"
+            text = "determinant"
             on_the_way = f"{packets:,} packets are on their way at a time, none of which is made a state"
             notes = (*notes, on_the_way if packets > LONG_LINES else "one matrix of all is too large")
-    if found != "determinant":
+    if text != "determinant":
         for loop in loops:
             if loop.states > MOST_STATES:
                 raise too_large(exchange, f"{exchange.peers:,} peers", loop.states, auto=method == "auto")
@@ -153,7 +153,7 @@ def make_plan(
         sites = sum(len(loop.sites) for loop in loops)
         what = f"{len(loops):,} determinants of {sites:,} peers that differ"
     refuse_beyond(needed, "E804", Place(exchange.scene), what, "fewer peers that differ, or fewer states")
-    return Plan(found, groups, loops, _sizes(loops, found), notes)
+    return Plan(text, groups, loops, _sizes(loops, text), notes)
 
 
 def is_large_ring(groups: Sequence[PeerGroup], exchange: Exchange) -> bool:

@@ -137,12 +137,12 @@ class _Walk:
             _Step(casadi.SX(value), self.number(("constant", value)), False, False)
             for value in known.constants
         ]
-        found = walk(
+        result = walk(
             known,
             steps,
             lambda word: self.look if word == LOOK else functools.partial(self.apply, word),
         )
-        results = [found[place].expression for place in known.results[0]]
+        results = [result[place].expression for place in known.results[0]]
         column = casadi.SX(function.sparsity_out(0), casadi.vertcat(*results)) if results else casadi.SX(0, 1)
         return inputs, casadi.densify(column)
 
@@ -201,12 +201,12 @@ def varying_slopes(site: SiteJacobians) -> tuple[str, ...]:
     """
     if not site.timed:
         return ()
-    found: dict[str, None] = {}
+    result: dict[str, None] = {}
     for function in find_switches(site.kind).functions:
         *moving, _, t = function.inputs
         slopes = jacobian(function.output, casadi.vertcat(*moving))
-        found |= dict.fromkeys(function.names(slopes, t))
-    return tuple(found)
+        result |= dict.fromkeys(function.names(slopes, t))
+    return tuple(result)
 
 
 def switching_parts(switched: SwitchedKind, parameters: NDArray[np.float64]) -> tuple[SwitchingPart, ...]:
@@ -235,9 +235,9 @@ def switching_parts(switched: SwitchedKind, parameters: NDArray[np.float64]) -> 
                 f"at most {MOST_DECISIONS} are analysed piece by piece"
             )
             raise ApcError(Mistake("E863", Place(switched.kind.name), what))
-        found = _extremes(switched, places, parameters)
-        if found is not None:
-            parts.append(SwitchingPart(name, places, *found))
+        pair = _extremes(switched, places, parameters)
+        if pair is not None:
+            parts.append(SwitchingPart(name, places, *pair))
     return tuple(parts)
 
 
@@ -357,25 +357,25 @@ def _bound(switched: SwitchedKind, settings: Mapping[int, bool]) -> Kind:
     values = casadi.vertcat(
         *(casadi.SX(float(settings.get(place, False))) for place in range(len(switched.decisions)))
     )
-    found: dict[tuple[str, int, int], Any] = {}
+    result: dict[tuple[str, int, int], Any] = {}
     for function in switched.functions:
         output = (
             casadi.substitute(function.output, symbols, values) if switched.decisions else function.output
         )
-        found[function.where] = casadi.Function(
+        result[function.where] = casadi.Function(
             function.where[0], list(function.inputs), [casadi.sparsify(output)]
         )
     kind = switched.kind
     clocks = tuple(
         replace(
             partition,
-            tick=found["tick", p, 0],
+            tick=result["tick", p, 0],
             receives=tuple(
-                replace(receive, edge=found["edge", p, place]) if receive.edge is not None else receive
+                replace(receive, edge=result["edge", p, place]) if receive.edge is not None else receive
                 for place, receive in enumerate(partition.receives)
             ),
         )
         for p, partition in enumerate(kind.clocks)
     )
-    sends = tuple(replace(send, send=found["send", p, 0]) for p, send in enumerate(kind.sends))
-    return replace(kind, derivative=found["derivative", 0, 0], clocks=clocks, sends=sends)
+    sends = tuple(replace(send, send=result["send", p, 0]) for p, send in enumerate(kind.sends))
+    return replace(kind, derivative=result["derivative", 0, 0], clocks=clocks, sends=sends)

@@ -81,8 +81,8 @@ def switching(system: CompiledSystem, modes: ContactModes, *, prepared: Prepared
         reason = f"not known when {' or '.join(unknown)}" if unknown else modes.notes[0]
         return Switching(system.name, OPEN, reason)
     try:
-        found = open_loops(system, prepared or prepare(system))
-        return Switching(system.name, OPEN, found) if isinstance(found, str) else _judge(system.name, found)
+        text = open_loops(system, prepared or prepare(system))
+        return Switching(system.name, OPEN, text) if isinstance(text, str) else _judge(system.name, text)
     except ApcError as error:
         return Switching(system.name, OPEN, error.mistakes[0].sentence)
 

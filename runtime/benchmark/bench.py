@@ -209,18 +209,18 @@ def bench_analysis(system: CompiledSystem, *, rounds: int = ROUNDS) -> Compariso
         _measured(
             name,
             times[name],
-            error=truth.error_of(found.spectral_radius) if isinstance(truth, Truth) else None,
-            bound=found.spectral_radius_error,
+            error=truth.error_of(result.spectral_radius) if isinstance(truth, Truth) else None,
+            bound=result.spectral_radius_error,
             chosen=name == default.method,
         )
-        for name, found in results.items()
+        for name, result in results.items()
     ]
     balls = "the same equations in 512-bit balls, of the numbers as doubles: spectral radius"
     said = truth if isinstance(truth, str) else f"{balls} {truth.digits}"
     notes = [
-        f"{WRONG}: {name} says {found.verdict}, {default.method} {default.verdict}"
-        for name, found in results.items()
-        if found.stable is not None and default.stable is not None and found.verdict != default.verdict
+        f"{WRONG}: {name} says {result.verdict}, {default.method} {default.verdict}"
+        for name, result in results.items()
+        if result.stable is not None and default.stable is not None and result.verdict != default.verdict
     ]
     if default.stable is None:
         notes.append(f"{WRONG}: analyze leaves the verdict open: {default.verdict}")
@@ -238,11 +238,13 @@ def bench_analysis(system: CompiledSystem, *, rounds: int = ROUNDS) -> Compariso
     )
 
 
-def _not_proved(found: Analysis) -> str:
+def _not_proved(analysis: Analysis) -> str:
     """Return why an analysis that was to prove its verdict did not, "" if it did."""
-    if found.proof.startswith("proved"):
+    if analysis.proof.startswith("proved"):
         return ""
-    return "; ".join(note for note in found.notes if "not proved" in note) or f"not proved: {found.proof}"
+    return (
+        "; ".join(note for note in analysis.notes if "not proved" in note) or f"not proved: {analysis.proof}"
+    )
 
 
 def bench_simulation(

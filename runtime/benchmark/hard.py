@@ -115,8 +115,8 @@ def run_hard_cases(
             continue
         system = compile_topology(path)
         with single_threaded():
-            seconds, found = median_time(partial(solve, system), repeats, enough=ENOUGH)
-        cases.append(compare(system, found, truths[path.stem], seconds, path.stem))
+            seconds, result = median_time(partial(solve, system), repeats, enough=ENOUGH)
+        cases.append(compare(system, result, truths[path.stem], seconds, path.stem))
     if not cases:
         what = "holds no topology whose truth is known"
         raise ApcError(Mistake("E920", Place(str(folder)), what, hint=FOLDER))
@@ -124,13 +124,13 @@ def run_hard_cases(
 
 
 def compare(
-    system: CompiledSystem, found: Analysis, truth: Mapping[str, Any], seconds: float, name: str
+    system: CompiledSystem, analysis: Analysis, truth: Mapping[str, Any], seconds: float, name: str
 ) -> HardCase:
     """Compare an analysis with the truth.
 
     Parameters
     ----------
-    system, found
+    system, analysis
         The scene and its analysis.
     truth
         An entry of `truths.json`.
@@ -140,10 +140,10 @@ def compare(
         The name of the case.
     """
     radius = Fraction(truth["spectral_radius"])
-    bound = found.spectral_radius_error
+    bound = analysis.spectral_radius_error
     apart = None
-    if math.isfinite(found.spectral_radius):
-        apart = abs(Fraction(found.spectral_radius) - radius)
+    if math.isfinite(analysis.spectral_radius):
+        apart = abs(Fraction(analysis.spectral_radius) - radius)
     size = float(max(radius, Fraction(1)))
     wrong = []
     if apart is None:
@@ -152,23 +152,23 @@ def compare(
         wrong.append("the bound says nothing")
     elif apart > Fraction(bound):
         wrong.append("the bound does not hold")
-    if found.stable is None:
+    if analysis.stable is None:
         wrong.append(f"the verdict is left open: {truth['verdict']}")
-    elif found.verdict != truth["verdict"]:
+    elif analysis.verdict != truth["verdict"]:
         wrong.append(f"the verdict is wrong: {truth['verdict']}")
-    if found.rigid_modes != truth["rigid_modes"]:
-        wrong.append(f"{truth['rigid_modes']} rigid modes, not {found.rigid_modes}")
+    if analysis.rigid_modes != truth["rigid_modes"]:
+        wrong.append(f"{truth['rigid_modes']} rigid modes, not {analysis.rigid_modes}")
     return HardCase(
         name=name,
         about=system.about,
         peers=system.peers,
-        method=found.method + (" + proof" if found.proof else ""),
-        verdict=found.verdict,
+        method=analysis.method + (" + proof" if analysis.proof else ""),
+        verdict=analysis.verdict,
         radius=str(truth["spectral_radius"]),
         error=math.inf if apart is None else float(apart) / size,
         bound=bound / size,
         seconds=seconds,
-        undecided=found.stable is None,
+        undecided=analysis.stable is None,
         failed="; ".join(wrong),
     )
 
@@ -178,12 +178,12 @@ def _truths(folder: Path) -> dict[str, Any]:
     path = folder / TRUTHS
     place = Place(str(path))
     try:
-        found = json.loads(read_file(path, MAX_BYTES))
+        result = json.loads(read_file(path, MAX_BYTES))
     except RefusedError as refused:
         raise ApcError(Mistake("E920", place, refused.words, hint=FOLDER)) from None
     except ValueError as error:
         raise ApcError(Mistake("E920", place, f"is not JSON: {error}")) from error
-    listed: list[tuple[str, Any]] = list(found.items()) if isinstance(found, dict) else [("", None)]
+    listed: list[tuple[str, Any]] = list(result.items()) if isinstance(result, dict) else [("", None)]
     for name, truth in listed:
         try:
             Fraction(truth["spectral_radius"])
@@ -195,4 +195,4 @@ def _truths(folder: Path) -> dict[str, Any]:
             raise ApcError(
                 Mistake("E920", place, name or "the truths", expected, "something else")
             ) from error
-    return dict(found)
+    return dict(result)

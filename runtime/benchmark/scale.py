@@ -125,15 +125,15 @@ def _largest(path: Path) -> tuple[str, Scalar]:
     """Return the group with the most peers of a written count, and where that stands."""
     root = read_source(path).root
     groups = root.get("peers") if isinstance(root, Mapping) else None
-    found: list[tuple[int, str, Scalar]] = []
+    result: list[tuple[int, str, Scalar]] = []
     for key, value in groups.entries if isinstance(groups, Mapping) else ():
         number = value.get("count") if isinstance(value, Mapping) else None
         if isinstance(number, Scalar) and isinstance(number.value, int):
-            found.append((number.value, key.text, number))
-    if not found:
+            result.append((number.value, key.text, number))
+    if not result:
         what = "no group of this topology has a count that could grow"
         raise ApcError(Mistake("E921", Place(str(path)), what, hint="peers: {user: {count: 3}}"))
-    _, name, number = max(found, key=lambda item: item[0])
+    _, name, number = max(result, key=lambda item: item[0])
     return name, number
 
 
@@ -148,7 +148,7 @@ def _alone(measure: Callable[[Path, int], Found], path: Path, count: int) -> Fou
 def _measure(path: Path, count: int) -> ScaleRow:
     """Compile and analyse, in this process."""
     compiled, system = timed(partial(with_count, path, count))
-    analyzed, found = median_time(partial(analyze, system), REPEATS)
+    analyzed, result = median_time(partial(analyze, system), REPEATS)
     memory = _memory()
     truth = spectral_truth(system)
     return ScaleRow(
@@ -157,10 +157,10 @@ def _measure(path: Path, count: int) -> ScaleRow:
         compile_s=compiled,
         analyze_s=analyzed,
         memory=memory,
-        error=truth.error_of(found.spectral_radius) if isinstance(truth, Truth) else None,
-        bound=found.spectral_radius_error,
-        method=found.method,
-        verdict=found.verdict,
+        error=truth.error_of(result.spectral_radius) if isinstance(truth, Truth) else None,
+        bound=result.spectral_radius_error,
+        method=result.method,
+        verdict=result.verdict,
     )
 
 

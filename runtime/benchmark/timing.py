@@ -24,15 +24,15 @@ LEAST_ROUNDS = 3
 def timed(call: Callable[[], Result]) -> tuple[float, Result]:
     """Return the processor's seconds of a call, and what it returned."""
     began = time.process_time()
-    found = call()
-    return time.process_time() - began, found
+    result = call()
+    return time.process_time() - began, result
 
 
 def waited(call: Callable[[], Result]) -> tuple[float, Result]:
     """Return the seconds that a person waits for a call, the processes it starts included, and its result."""
     began = time.perf_counter()
-    found = call()
-    return time.perf_counter() - began, found
+    result = call()
+    return time.perf_counter() - began, result
 
 
 def median_time(call: Callable[[], Result], runs: int, *, enough: float = math.inf) -> tuple[float, Result]:
@@ -47,12 +47,12 @@ def median_time(call: Callable[[], Result], runs: int, *, enough: float = math.i
     enough
         Seconds of all runs together after which there is no further one.
     """
-    taken, found = timed(call)
+    taken, result = timed(call)
     times = [taken]
     while len(times) < runs and sum(times) < enough:
-        taken, found = timed(call)
+        taken, result = timed(call)
         times.append(taken)
-    return statistics.median(times), found
+    return statistics.median(times), result
 
 
 def take_turns(

@@ -74,10 +74,10 @@ def spectral_truth(system: CompiledSystem) -> Truth | str:
     last = None
     for bits in PRECISIONS:
         with precision(bits):
-            found = _radius(systems)
-            if last is not None and _agree(last, found):
-                return Truth(str(found.str(DIGITS, radius=False)) if found > LEAST else "0")
-            last = found
+            result = _radius(systems)
+            if last is not None and _agree(last, result):
+                return Truth(str(result.str(DIGITS, radius=False)) if result > LEAST else "0")
+            last = result
     return f"not certain to {DIGITS} digits at {PRECISIONS[-1]} bits"
 
 
@@ -103,18 +103,18 @@ def _loops(system: CompiledSystem) -> Sequence[Loop] | str:
 
 def _radius(systems: Sequence[ClosedSystem]) -> Any:
     """Return the largest magnitude of an eigenvalue that is not 1, at the present precision."""
-    found = flint.arb(0)
+    ball = flint.arb(0)
     for system in systems:
         matrix = flint.acb_mat(square(frame_balls(system)).mid())
         size = matrix.nrows()
         # Of a chain of equal eigenvalues each step of QR gains a few bits: as many steps as bits, each.
         values = matrix.eig(algorithm="approx", maxiter=flint.ctx.prec * size) if size else []
         off = abs(sum(values, flint.acb(0)) - sum((matrix[i, i] for i in range(size)), flint.acb(0))).mid()
-        found = max(
-            found, *(abs(value).mid() for value in values if abs(value - 1).mid() > RIGID), flint.arb(0)
+        ball = max(
+            ball, *(abs(value).mid() for value in values if abs(value - 1).mid() > RIGID), flint.arb(0)
         )
-        assert off < RIGID * max(found, flint.arb(1)), "QR did not converge"
-    return found
+        assert off < RIGID * max(ball, flint.arb(1)), "QR did not converge"
+    return ball
 
 
 def _agree(item: Any, other: Any) -> bool:

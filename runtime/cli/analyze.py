@@ -103,7 +103,7 @@ def analyze_command(
     ranges = _ranges(system, box)
     listed = sum(group.count for group in system.groups if group.columns)
     with at_work(f"analysing {system.peers:,} peers", about=SECONDS_A_PEER * listed):
-        found = answer(
+        result = answer(
             system,
             method=method,
             certify=certify,
@@ -113,12 +113,12 @@ def analyze_command(
             margins=margins,
             with_buzz=with_buzz,
         )
-    found = replace(found, nominal=nominal)
+    result = replace(result, nominal=nominal)
     if plot is not None:
         from apc.present.pictures import write_picture
 
-        write_picture(found.analysis.plot, plot)
-    print_result(found, as_json=as_json, written=[plot])
+        write_picture(result.analysis.plot, plot)
+    print_result(result, as_json=as_json, written=[plot])
 
 
 def _ranges(system: CompiledSystem, box: tuple[str, ...]) -> list[Range]:

@@ -73,28 +73,28 @@ def bench_command(
 
     system = open_scene(file, settings, {"--plot": plot}, told=note_aside)
     with at_work("measuring"):
-        found = bench(system)
-    print_result(found, as_json=as_json)
+        result = bench(system)
+    print_result(result, as_json=as_json)
     if plot is not None:  # what took minutes is printed already, should it be unable to be written
         from apc.present.bench import bench_picture
         from apc.present.pictures import write_picture
 
-        write_picture(lambda: bench_picture(found), plot)
+        write_picture(lambda: bench_picture(result), plot)
         if not as_json:
             tell(f"  {plot} is written")
-    if found.faults:
-        what = f"not everything came out right: {'; '.join(found.faults)}"
-        raise ApcError(Mistake("E922", Place(found.topology), what))
+    if result.faults:
+        what = f"not everything came out right: {'; '.join(result.faults)}"
+        raise ApcError(Mistake("E922", Place(result.topology), what))
 
 
 def _hard(folder: Path, as_json: bool) -> None:
     """Report the hard cases; a failure is exit code 1."""
     from apc.benchmark.hard import run_hard_cases
 
-    found = run_hard_cases(folder)
-    print_result(found, as_json=as_json)
-    if found.failures:
-        names = ", ".join(case.name for case in found.failures)
+    hard_report = run_hard_cases(folder)
+    print_result(hard_report, as_json=as_json)
+    if hard_report.failures:
+        names = ", ".join(case.name for case in hard_report.failures)
         raise ApcError(Mistake("E922", Place(str(folder)), f"not every hard case came out right: {names}"))
 
 
@@ -112,5 +112,5 @@ def _scale(path: Path, counts: str, as_json: bool) -> None:
     if not numbers or not all(number.is_integer() for number in numbers):
         expected = "numbers of peers like 3,30,300"
         raise ApcError(Mistake("E921", Place("--scale"), "the list", expected, counts[:80]))
-    found = scale(path, [int(number) for number in numbers])
-    print_result(found, as_json=as_json)
+    result = scale(path, [int(number) for number in numbers])
+    print_result(result, as_json=as_json)

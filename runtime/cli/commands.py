@@ -57,8 +57,8 @@ class Group(click.Group):
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Return the command of a name, whose module is loaded now; None if there is none."""
-        found: click.Command | None = getattr(cli, f"{cmd_name}{SUFFIX}", None)
-        return found
+        command: click.Command | None = getattr(cli, f"{cmd_name}{SUFFIX}", None)
+        return command
 
 
 @click.group(cls=Group, context_settings=CONTEXT)

@@ -83,10 +83,10 @@ def compare_command(
             refused[place] = error.mistakes[0].reason
         systems.append(system)
     with status_line() as told:
-        found = compare(systems, over=over, criterion=asked, at=at, refused=refused, told=told)
+        comparison = compare(systems, over=over, criterion=asked, at=at, refused=refused, told=told)
     if out is not None:
-        write_result(out, found, found.plot)
-    print_result(found, as_json=as_json, written=[out])
+        write_result(out, comparison, comparison.plot)
+    print_result(comparison, as_json=as_json, written=[out])
 
 
 def _compare_run(folder: Path, *, as_json: bool) -> None:

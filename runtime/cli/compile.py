@@ -35,8 +35,8 @@ def check_command(
     from apc.present.analysis import warning_lines
 
     path = find_input(file, compiled_too=False)
-    if found := check_definition(path):
-        tell(f"{path}: no mistakes. {found}.")
+    if text := check_definition(path):
+        tell(f"{path}: no mistakes. {text}.")
         return
     system = compile_topology(path)
     check_values(system)

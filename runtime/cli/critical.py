@@ -78,12 +78,12 @@ def critical_command(
         print_result(_over(system, path, (lower, upper), over, asked), as_json=as_json)
         return
     with status_line() as told:
-        found = critical(system, path, lower=lower, upper=upper, criterion=asked, told=told)
+        result = critical(system, path, lower=lower, upper=upper, criterion=asked, told=told)
     if plot is not None:
         from apc.present.pictures import write_picture
 
-        write_picture(found.plot, plot)
-    print_result(found, as_json=as_json, written=[plot])
+        write_picture(result.plot, plot)
+    print_result(result, as_json=as_json, written=[plot])
 
 
 def _over(

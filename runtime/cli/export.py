@@ -69,5 +69,5 @@ def export_command(
 
     chosen = format_of(to, out)
     system = open_scene(file, settings, {"--out": out}, told=note_aside)
-    found = export(system, chosen, Asked(cut, free, peer, device, method), out)
-    print_result(found, as_json=as_json, written=[out])
+    result = export(system, chosen, Asked(cut, free, peer, device, method), out)
+    print_result(result, as_json=as_json, written=[out])

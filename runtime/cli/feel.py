@@ -68,7 +68,7 @@ def feel_command(
     if nyquist and (out is None or out.suffix.lower() not in FORMATS):
         raise click.UsageError(f"--nyquist is for a picture: --out with {', '.join(FORMATS)}")
     system = open_scene(file, settings, {"--out": out}, told=note_aside)
-    found = feel(
+    result = feel(
         system,
         read_frequencies(system, frequencies, low, high, points),
         at=at or first if colon else at,
@@ -76,5 +76,5 @@ def feel_command(
         unstable=unstable,
     )
     if out is not None:
-        write_result(out, found, lambda: found.plot(kind="nyquist" if nyquist else "bode"))
-    print_result(found, as_json=as_json, written=[out])
+        write_result(out, result, lambda: result.plot(kind="nyquist" if nyquist else "bode"))
+    print_result(result, as_json=as_json, written=[out])

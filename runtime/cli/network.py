@@ -49,9 +49,9 @@ def network_command(
         if between <= 0:
             expected, hint = "a time above 0", '--interval "8 ms"'
             raise ApcError(Mistake("E207", Place("--interval"), "the interval", expected, interval, hint))
-    found = describe(recording, between)
+    network_recording = describe(recording, between)
     if out is not None:
         from apc.present.network import recording_table
 
-        write_text(out, recording_table(found))
-    print_result(found, as_json=as_json, written=[out])
+        write_text(out, recording_table(network_recording))
+    print_result(network_recording, as_json=as_json, written=[out])

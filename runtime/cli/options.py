@@ -172,13 +172,13 @@ class WholeNumber(click.IntRange):
 
 @part("print")
 def print_result(
-    found: Result, *, as_json: bool, written: Iterable[Path | None] = (), before: str | None = "\n"
+    result: Result, *, as_json: bool, written: Iterable[Path | None] = (), before: str | None = "\n"
 ) -> None:
     """Print a result, as one JSON document or in words, and which files of it are written.
 
     Parameters
     ----------
-    found
+    result
         The result.
     as_json
         Whether as JSON, which goes alone.
@@ -189,7 +189,7 @@ def print_result(
     """
     files = [path for path in written if path is not None]
     err = beside(*files)
-    tell(json_text(found.to_dict()) if as_json else str(found), err=err)
+    tell(json_text(result.to_dict()) if as_json else str(result), err=err)
     for path in () if as_json or before is None else files:
         tell(f"{before}{path} is written", err=err)
 

@@ -79,7 +79,7 @@ def region_command(
         open_scene(text, settings, {"--out": out}, hands=hands, told=note_aside) for text in (file, *compare)
     ]
     with status_line() as told:
-        found = compare_regions(
+        result = compare_regions(
             systems,
             x=x,
             y=y,
@@ -91,5 +91,5 @@ def region_command(
             told=told,
         )
     if out is not None:
-        write_result(out, found, found.plot)
-    print_result(found, as_json=as_json, written=[out])
+        write_result(out, result, result.plot)
+    print_result(result, as_json=as_json, written=[out])

@@ -61,9 +61,9 @@ def report_command(
         refuse_model(path, "report")
         check_topology_outputs(path, {"--out": out})
     with at_work("reporting"):
-        found = report(paths, settings)
-        save_report(found, out)
-    tell(str(found))
+        result = report(paths, settings)
+        save_report(result, out)
+    tell(str(result))
     tell(f"\n{out} is written")
 
 

@@ -73,8 +73,8 @@ def _show_parameters(file: str | None, wanted: str, out: Path | None) -> None:
 
     if wanted not in ("text", "json"):
         raise click.UsageError("--parameters is a table: --format text or json")
-    found = parameters(open_scene(file, (), {"--out": out}))
-    _print_or_write(json_text(found.to_dict()) if wanted == "json" else str(found), out)
+    result = parameters(open_scene(file, (), {"--out": out}))
+    _print_or_write(json_text(result.to_dict()) if wanted == "json" else str(result), out)
 
 
 @command

@@ -198,14 +198,14 @@ def _play_one(system: CompiledSystem, how: Settings, kept: _Kept, *, as_json: bo
 
         plot = partial_name(plot) if interrupted else plot
         write_picture(trajectory_of(simulation, keeper, summary, interrupted).plot, plot)
-    found = Played(
+    played = Played(
         topology=system.name,
         summary=summary,
         provenance=provenance_of(simulation),
         interrupted=interrupted,
         error=estimate,
     )
-    print_result(found, as_json=as_json, written=[out, plot, kept.still], before="  ")
+    print_result(played, as_json=as_json, written=[out, plot, kept.still], before="  ")
     if interrupted:
         until = f"{summary.end:g} s of {float(how.duration):g} s"
         tell(f"stopped at {until}; what was done is kept", err=True)

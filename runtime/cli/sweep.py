@@ -98,25 +98,25 @@ def sweep_command(
 def _seconds(patience: str | None) -> float | None:
     if patience is None:
         return None
-    found = float(option_value("--patience", patience, what="patience", unit="s"))
-    if found <= 0:
+    value = float(option_value("--patience", patience, what="patience", unit="s"))
+    if value <= 0:
         form = '--patience "10 min"'
         raise ApcError(Mistake("E889", Place("sweep"), "--patience", "more than 0 s", patience[:80], form))
-    return found
+    return value
 
 
 def _values(over: tuple[str, ...]) -> dict[str, str]:
     """Return the values of each parameter by its name as written."""
     form = "--over contact.stiffness='100 N/m:3000 N/m:30'"
-    found: dict[str, str] = {}
+    result: dict[str, str] = {}
     for text in over:
         name, equals, values = (part.strip() for part in text.partition("="))
         if not (equals and name and values):
             raise ApcError(Mistake("E880", Place("sweep"), "--over", "PATH=VALUES", text[:80], form))
-        if name in found:
+        if name in result:
             raise ApcError(Mistake("E883", Place("sweep"), f"{name[:80]} is swept twice"))
-        found[name] = values
-    return found
+        result[name] = values
+    return result
 
 
 @contextmanager

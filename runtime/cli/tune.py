@@ -127,15 +127,15 @@ def tune_command(
         print_result(weighed, as_json=as_json, written=[plot])
         return
     with status_line() as told:
-        found = tune(system, demands, seconds=read_seconds(time), told=told)
-    if write is not None and found.met:
-        _write(system, found, settings, write)
+        tuning = tune(system, demands, seconds=read_seconds(time), told=told)
+    if write is not None and tuning.met:
+        _write(system, tuning, settings, write)
     if plot is not None:
-        write_picture(found.plot, plot)
-    print_result(found, as_json=as_json, written=[write if found.met else None, plot])
+        write_picture(tuning.plot, plot)
+    print_result(tuning, as_json=as_json, written=[write if tuning.met else None, plot])
 
 
-def _write(system: CompiledSystem, found: Tuning, settings: Sequence[str], path: Path) -> None:
+def _write(system: CompiledSystem, tuning: Tuning, settings: Sequence[str], path: Path) -> None:
     """Write the topology with the gains, and with what else was set."""
     from apc.compiler.files import write_text
     from apc.compiler.words import with_unit
@@ -144,7 +144,7 @@ def _write(system: CompiledSystem, found: Tuning, settings: Sequence[str], path:
     from apc.frame.overrides import parse_override
 
     values = {parse_override(system, setting).free: setting.partition("=")[2].strip() for setting in settings}
-    for gain in found.gains:
+    for gain in tuning.gains:
         number = f"{float(gain.value):.12g}"
         values[find(system, gain.parameter)] = with_unit(number, gain.unit).removesuffix(" 1")
     (text,) = (text for name, text in system.origin.texts if name == system.origin.topology)

@@ -118,8 +118,8 @@ class Comparison(Result):
 
     def to_dataframe(self) -> pandas.DataFrame:
         """Return a table with a row a scheme, in SI."""
-        found: pandas.DataFrame = self._shown("table")
-        return found
+        result: pandas.DataFrame = self._shown("table")
+        return result
 
 
 @part("compare")

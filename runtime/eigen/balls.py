@@ -76,12 +76,12 @@ def rational_ball(value: Fraction | int) -> Any:
 def site_balls(system: ClosedSystem | Loop) -> list[LinearSite]:
     """Return the sites' matrices as balls at the present precision; equal sites are worked out once."""
     known: dict[int, LinearSite] = {}
-    found = []
+    linear_sites = []
     for group in system.sites:
         if id(group.site) not in known:
             known[id(group.site)] = entrywise(group.exact, rational_ball)
-        found.append(known[id(group.site)])
-    return found
+        linear_sites.append(known[id(group.site)])
+    return linear_sites
 
 
 def frame_steps(
@@ -191,18 +191,18 @@ def closed_frame(
 
 def weight_balls(system: ClosedSystem | Loop) -> Weights:
     """Return, way by way and site by site, whom it hears with what weight, the doubts included."""
-    found = {}
+    result = {}
     for way, rows in system.coupling.items():
         if way in system.surds:
-            found[way] = [[(0, _surd_ball(system.surds[way]))]]
+            result[way] = [[(0, _surd_ball(system.surds[way]))]]
             continue
         doubt = system.doubts.get(way, 0.0)
         spread = flint.arb(0, doubt) if doubt else 0
-        found[way] = [
+        result[way] = [
             [(h, rational_ball(weight) + spread) for h, weight in enumerate(row) if weight or doubt]
             for row in rows
         ]
-    return found
+    return result
 
 
 def _surd_ball(surd: Surd) -> Any:
@@ -235,17 +235,17 @@ def _exact(value: NDArray[Any]) -> Balls:
     """Return exact numbers as balls; 0 and 1 as the integers, what is written in balls as it is."""
     if value.dtype != np.float64:
         return value.astype(object)
-    found = np.empty(value.size, dtype=object)
-    found[:] = [int(item) if item in (0.0, 1.0) else flint.arb(item) for item in value.ravel().tolist()]
-    return found.reshape(value.shape)
+    values = np.empty(value.size, dtype=object)
+    values[:] = [int(item) if item in (0.0, 1.0) else flint.arb(item) for item in value.ravel().tolist()]
+    return values.reshape(value.shape)
 
 
 def _solve(matrix: Balls, right: Balls) -> Balls | None:
     try:
-        found = np.array(square(matrix).solve(square(right)).entries(), dtype=object)
+        values = np.array(square(matrix).solve(square(right)).entries(), dtype=object)
     except ZeroDivisionError:
         return None
-    return found.reshape(right.shape)
+    return values.reshape(right.shape)
 
 
 BALLS = Arithmetic(

@@ -115,16 +115,16 @@ def prove(system: ClosedSystem, free: RigidModes) -> Proof:
             if not searched and any(map(_may_vanish_at_one, polynomials)):
                 free, searched = find_rigid_modes(system), True
                 polynomials = _polynomials(matrix, free)
-            found = [root_discs(polynomial) for polynomial in polynomials]
-            verdicts = [discs.inside for discs in found] if _stands_still(matrix, free) else [None]
+            result = [root_discs(polynomial) for polynomial in polynomials]
+            verdicts = [discs.inside for discs in result] if _stands_still(matrix, free) else [None]
         centres, radii = (
-            np.concatenate([np.empty(0), *(getattr(discs, name) for discs in found)])
+            np.concatenate([np.empty(0), *(getattr(discs, name) for discs in result)])
             for name in ("centres", "radii")
         )
         inside = False if False in verdicts else None if None in verdicts else True
         if inside is not None or (doubtful and bits >= DOUBTFUL):
             break
-    beyond = [discs.beyond for discs in found] or [(-1.0, -1.0)]
+    beyond = [discs.beyond for discs in result] or [(-1.0, -1.0)]
     least, most = map(max, zip(*beyond, strict=True))
     return Proof(inside, bits, free, centres, radii, (least, most))
 

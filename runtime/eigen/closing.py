@@ -244,7 +244,7 @@ def feedback_of(loop: Loop | ClosedSystem, layout: StateLayout) -> list[Feedback
     # Few weights at many places: each is looked at once, and plain keys are found faster than packets.
     places = {(packet.site, packet.row, packet.lag): place for packet, place in layout.places.items()}
     known: dict[tuple[int, int, float], tuple[float, float]] = {}
-    found = []
+    feedbacks = []
     for g, group in enumerate(loop.sites):
         now = np.zeros((2, len(group.schedule.heard), starts[-1]))
         before = np.zeros((2, len(group.schedule.heard), len(layout.names)))
@@ -260,8 +260,8 @@ def feedback_of(loop: Loop | ClosedSystem, layout: StateLayout) -> list[Feedback
                 weights.append(known.get(key) or known.setdefault(key, bounded_weight(weight, doubt)))
             if columns:
                 (before if heard.lag else now)[:, line, columns] = np.array(weights).T
-        found.append(Feedback(now, before))
-    return found
+        feedbacks.append(Feedback(now, before))
+    return feedbacks
 
 
 def close(

@@ -96,10 +96,10 @@ def inverses(matrix: Matrix) -> Matrix:
 
 def pairs_to(matrix: Matrix, values: Complexes) -> Eigenpairs:
     """Return eigenvalues (n,) with the vectors that a matrix (n, n) has to the nearest of its own."""
-    found = eigenpairs(matrix)
-    distances = np.abs(values[:, None] - found.values)
+    result = eigenpairs(matrix)
+    distances = np.abs(values[:, None] - result.values)
     nearest = load_pool("scipy.optimize").linear_sum_assignment(distances)[1]
-    return Eigenpairs(values, found.right[:, nearest], found.left[nearest])
+    return Eigenpairs(values, result.right[:, nearest], result.left[nearest])
 
 
 def eigenvalues(matrix: Floats, slope: Floats) -> tuple[Complexes, Complexes]:
@@ -108,15 +108,15 @@ def eigenvalues(matrix: Floats, slope: Floats) -> tuple[Complexes, Complexes]:
     States that drive each other have eigenvalues of their own. A derivative that means nothing, of an
     eigenvalue near zero or one that is hardly simple, comes as 0.
     """
-    found = np.zeros((2, *matrix.shape[:2]), dtype=np.complex128)
+    values = np.zeros((2, *matrix.shape[:2]), dtype=np.complex128)
     for part in components((matrix != 0).any(axis=0) | (slope != 0).any(axis=0)):
         block = np.index_exp[:, part[:, None], part]
         pairs = eigenpairs(matrix[block])
         with np.errstate(all="ignore"):
             moves = pairs.slopes(slope[block])
             vague = (np.abs(pairs.values) < SMALL) | ~(pairs.condition < WORST) | ~np.isfinite(moves)
-        found[:, :, part] = pairs.values, np.where(vague, 0.0, moves)
-    return found[0], found[1]
+        values[:, :, part] = pairs.values, np.where(vague, 0.0, moves)
+    return values[0], values[1]
 
 
 def refined(matrix: Matrix, guess: Eigenpairs) -> Eigenpairs:

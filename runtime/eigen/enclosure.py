@@ -138,9 +138,9 @@ def _enclose_split(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure
         together = np.hstack([pairs.right[0, :, :large], basis[:, :small]])[None]
         values = np.concatenate([pairs.values[0, :large], np.diag(form)[:small]])[None]
         above = np.pad(np.triu(form[:small, :small], 1), [(large, 0)] * 2)
-        found = _bounds(matrix, error, replace(pairs, right=together), inverses(together), values, above)
-        low, high = max(low, float(found.low[0])), min(high, float(found.high[0]))
-        errors = np.minimum(errors, found.errors[0])
+        enclosure = _bounds(matrix, error, replace(pairs, right=together), inverses(together), values, above)
+        low, high = max(low, float(enclosure.low[0])), min(high, float(enclosure.high[0]))
+        errors = np.minimum(errors, enclosure.errors[0])
     vectors = Eigenpairs(pairs.values, pairs.right * scale[:, None], pairs.left / scale)
     # No estimate is farther from its eigenvalue than both are from zero.
     return vectors, Enclosure(min(low, high), high, np.minimum(errors, sizes + high))
@@ -214,9 +214,9 @@ def _scaling(over: Floats, above: Complexes) -> Floats:
     within = over[np.ix_(part, part)]
     if np.isfinite(within).all() and len(part):
         most = FARTHER * float(np.abs(np.linalg.eigvals(within)).max())
-        found = inverses(most * np.eye(len(part)) - within).sum(axis=1)
-        if (found > 0).all():
-            scale[part] = found / found.max()
+        result = inverses(most * np.eye(len(part)) - within).sum(axis=1)
+        if (result > 0).all():
+            scale[part] = result / result.max()
     return scale / scale[:, None]
 
 

@@ -154,9 +154,9 @@ def _numeric_modes(graph: Graph, n: int, *, mean: bool) -> tuple[GraphMode, ...]
         centre = complex(np.mean(values[cluster]))
         spread = doubt + float(np.abs(values[cluster] - centre).max())
         if exact_sum is not None and abs(centre - float(exact_sum)) <= spread:
-            found = _is_exact(graph, n, exact_sum, len(cluster), mean=mean)
+            is_exact = _is_exact(graph, n, exact_sum, len(cluster), mean=mean)
             modes.append(
-                GraphMode(exact_sum, Fraction(0), len(cluster), 0.0 if found else spread, common=True)
+                GraphMode(exact_sum, Fraction(0), len(cluster), 0.0 if is_exact else spread, common=True)
             )
         elif (simple := _simple(centre, spread)) is not None and _is_exact(
             graph, n, simple, len(cluster), mean=mean
@@ -173,8 +173,8 @@ def _numeric_modes(graph: Graph, n: int, *, mean: bool) -> tuple[GraphMode, ...]
 
 def _simple(value: complex, off: float) -> Fraction | None:
     """Return the one simple fraction that an eigenvalue may be, None if there is none."""
-    found = Fraction(value.real).limit_denominator(MOST_DENOMINATOR)
-    return found if abs(value - float(found)) <= off else None
+    number = Fraction(value.real).limit_denominator(MOST_DENOMINATOR)
+    return number if abs(value - float(number)) <= off else None
 
 
 def _clusters(values: NDArray[np.complex128], doubt: float) -> list[Integers]:

@@ -90,11 +90,11 @@ def arrange(groups: Sequence[PeerGroup], exchange: Exchange) -> Arrangement:
     reason = f"the peers on {named} differ" if len(groups) > 1 else common_graph(ways, exchange)
     if not reason:
         scale = graph_scale(groups[0], ways, exchange)
-        found = graph_modes(exchange.links[graphs[0]].graph, exchange.peers, mean=scale.by_mean)
-        if found is not None:
-            note = f"{len(found)} systems, one an eigenvalue of the graph of {named}"
+        modes = graph_modes(exchange.links[graphs[0]].graph, exchange.peers, mean=scale.by_mean)
+        if modes is not None:
+            note = f"{len(modes)} systems, one an eigenvalue of the graph of {named}"
             return Arrangement(
-                "modes", tuple(graph_loop(groups[0], graph_mode, scale) for graph_mode in found), (note,)
+                "modes", tuple(graph_loop(groups[0], graph_mode, scale) for graph_mode in modes), (note,)
             )
         reason = f"the graph of {named} has no full set of eigenvectors"
     parts = split_exchangeable(dense_loop(groups, exchange), exchange)
@@ -124,9 +124,9 @@ def loops_at_right_angles(
     if count > most:
         return f"{count:,} peers on a graph that is not complete are too many: {most} are the most"
     if len(groups) == 1 and all(exchange.links[link].graph.shape == "ring" for link in graphs):
-        found = arrange(groups, exchange)
-        if found.method == "modes":
-            return found.loops
+        arrangement = arrange(groups, exchange)
+        if arrangement.method == "modes":
+            return arrangement.loops
     return split_exchangeable(dense_loop(groups, exchange), exchange)
 
 
@@ -227,11 +227,11 @@ def split_exchangeable(loop: Loop, exchange: Exchange) -> tuple[Loop, ...]:
     classes: list[list[int]] = []
     for place in range(len(loop.sites)):
         alike = (members for members in classes if _are_exchangeable(loop, members[0], place))
-        found = next(alike, None)
-        if found is None:
+        numbers = next(alike, None)
+        if numbers is None:
             classes.append([place])
         else:
-            found.append(place)
+            numbers.append(place)
     if loop.doubts or len(classes) == len(loop.sites):
         return (loop,)
     sites = tuple(_together([loop.sites[place] for place in members], exchange) for members in classes)

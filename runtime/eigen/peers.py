@@ -377,26 +377,26 @@ class StartClasses:
         receive, edge = site.kind.clocks[p].receives[place], site.edges[p, place]
         x, u, m = start_values(site, self.parameters[g])
         inside = len(x) + len(u) + len(m[p])
-        found = {}
+        result = {}
         for h, _, _ in senders:
             sent = self.sent[h][receive.link][: edge.function.numel_in(3)]
             key = (id(edge), self.vectors[g].tobytes(), tuple(sent))
             if key not in self._edges:
                 arguments = [x, u, m[p], sent, self.parameters[g], [Fraction(0)]]
                 self._edges[key] = [Fraction(value) for value in evaluate_exact(edge.function, arguments)[0]]
-            found[h] = self._edges[key]
+            result[h] = self._edges[key]
         norm = self._norm(receive.operator, g, receive.link, senders)
         if receive.operator in ("sum", "mean"):
             taken = [(h, weight / norm) for h, weight, _ in senders]
         else:
             taken = [
-                (self._extreme(g, receive.name, receive.operator, receive.link, senders, found), Fraction(1))
+                (self._extreme(g, receive.name, receive.operator, receive.link, senders, result), Fraction(1))
             ]
-        value = sum((weight * found[h][0] for h, weight in taken), Fraction(0))
+        value = sum((weight * result[h][0] for h, weight in taken), Fraction(0))
         own = tuple(
-            sum((weight * found[h][1 + i] for h, weight in taken), Fraction(0)) for i in range(inside)
+            sum((weight * result[h][1 + i] for h, weight in taken), Fraction(0)) for i in range(inside)
         )
-        return value, own, {h: found[h][1 + inside :] for h, _ in taken}
+        return value, own, {h: result[h][1 + inside :] for h, _ in taken}
 
     def _extreme(
         self,
@@ -405,12 +405,12 @@ class StartClasses:
         operator: str,
         link: str,
         senders: Sequence[tuple[int, Fraction, int]],
-        found: Mapping[int, Sequence[Fraction]],
+        result: Mapping[int, Sequence[Fraction]],
     ) -> int:
         """Return the class of the one sender that is the largest, or smallest."""
         check_mean(self.exchange, self.peers[g], link, operator, bool(senders), Fraction(1))
-        best = (max if operator == "max" else min)(found[h][0] for h, _, _ in senders)
-        winners = [(h, number) for h, _, number in senders if found[h][0] == best]
+        best = (max if operator == "max" else min)(result[h][0] for h, _, _ in senders)
+        winners = [(h, number) for h, _, number in senders if result[h][0] == best]
         if sum(number for _, number in winners) > 1:
             peer = self.exchange.peer_name(self.peers[g])
             what = f"{name} of {peer}: {operator} over equal peers has no linearization"
@@ -490,13 +490,13 @@ def _by_matrices(
         for key, peers in _split(keys, numbers.rows[place]):
             members.setdefault(key, []).append((place, peers))
     check_size([jacobians[key[0]] for key in members], exchange)
-    found = []
+    peer_groups = []
     for number, (key, parts) in enumerate(members.items()):
         place, vector = rows[key]
         built = jacobians[key[0]]
         site = linearize(built, vector)
-        found.append(build_group(number, parts, vector, built, site, schedules[place], exchange))
-    return tuple(found)
+        peer_groups.append(build_group(number, parts, vector, built, site, schedules[place], exchange))
+    return tuple(peer_groups)
 
 
 def _by_start(
@@ -624,7 +624,7 @@ def _split(keys: Sequence[_Key], row_of: Integers) -> list[tuple[_Key, Peers]]:
 
 def _together(parts: Sequence[tuple[int, Peers]]) -> list[tuple[int, Peers]]:
     """Join the parts of each group of the scene."""
-    found: dict[int, list[Peers]] = {}
+    result: dict[int, list[Peers]] = {}
     for group, peers in parts:
-        found.setdefault(group, []).append(peers)
-    return [(group, joined(listed)) for group, listed in found.items()]
+        result.setdefault(group, []).append(peers)
+    return [(group, joined(listed)) for group, listed in result.items()]

@@ -74,8 +74,8 @@ def relative_bounded(matrix: Matrix, error: Floats, at: Relative) -> tuple[Matri
     """Return M_rr − W M_pr of matrices (…, n, n) known up to an error, and a bound on what that is off by."""
     if not len(at.held):
         return matrix, error
-    found = relative(with_radius(matrix, error), with_doubt(at), RADII)
-    return value_of(found), radius_of(found)
+    values = relative(with_radius(matrix, error), with_doubt(at), RADII)
+    return value_of(values), radius_of(values)
 
 
 def independent_places(rows: NDArray[Any]) -> NDArray[np.intp]:

@@ -37,13 +37,13 @@ def unrest(groups: Sequence[PeerGroup]) -> str:
     groups
         All peers of the scene, each group linearized where it starts.
     """
-    found = [value for group in groups for value in _moved(group, named=len(groups) > 1)]
+    result = [value for group in groups for value in _moved(group, named=len(groups) > 1)]
     for unit in FORCES:
-        pushed = [(size, what) for size, of, what in found if of == unit]
+        pushed = [(size, what) for size, of, what in result if of == unit]
         if pushed:
             size, what = max(pushed, key=lambda pair: pair[0])
             return f"the start is not at rest: {size:.4g} {unit} acts on {what}"
-    for size, unit, what in found:
+    for size, unit, what in result:
         return f"the start is not at rest: {what} changes by {with_unit(f'{size:.4g}', unit)} in a second"
     return ""
 
@@ -75,7 +75,7 @@ def _moved(group: PeerGroup, *, named: bool) -> list[tuple[float, str, str]]:
     added = np.abs(_column(kind.derivative(x, u, p, 0.0))) + np.abs(site.b) @ size
     added += np.abs(site.a) @ np.abs(np.array(x, dtype=np.float64))
     prefix = f"{group.name}." if named else ""
-    found = []
+    result = []
     for place in np.flatnonzero(np.abs(rates) > ROUNDED * added).tolist():
         name, rate = prefix + kind.states[place].name, abs(float(rates[place]))
         inverse, unit = max(
@@ -87,11 +87,11 @@ def _moved(group: PeerGroup, *, named: bool) -> list[tuple[float, str, str]]:
             default=(0.0, ""),
         )
         if inverse:
-            found.append((rate / inverse, unit, name.rpartition(".")[0]))
+            result.append((rate / inverse, unit, name.rpartition(".")[0]))
         else:
-            found.append((rate, kind.states[place].unit, name))
-    return found
+            result.append((rate, kind.states[place].unit, name))
+    return result
 
 
-def _column(found: Any) -> NDArray[np.float64]:
-    return np.asarray(found, dtype=np.float64).ravel()
+def _column(result: Any) -> NDArray[np.float64]:
+    return np.asarray(result, dtype=np.float64).ravel()

@@ -135,9 +135,9 @@ def what_stands(system: ClosedSystem | Loop, *, with_drifts: bool = True) -> Sta
     drifting = _echelon(ramps, moving)
     drifts = sum(pivot in moving for pivot, _ in drifting)
     standing = [*vectors, *(row[len(row) // 2 :] for _, row in drifting[drifts:])]
-    found = _echelon(standing, moving)
-    pivots = [pivot for pivot, _ in found if pivot in moving]
-    unfelt = [row for _, row in found[len(pivots) :]]
+    pairs = _echelon(standing, moving)
+    pivots = [pivot for pivot, _ in pairs if pivot in moving]
+    unfelt = [row for _, row in pairs[len(pivots) :]]
     return Standing(
         translations=sum(pivot not in turning for pivot in pivots),
         rotations=sum(pivot in turning for pivot in pivots),
@@ -173,13 +173,13 @@ def _shifted(names: Sequence[str], vector: Sequence[Fraction]) -> str:
 
 def _places(sites: Sequence[PeerGroup], units: Sequence[str]) -> list[int]:
     """Return the places in the state of what changes between the ticks and has one of some units."""
-    found, start = [], 0
+    numbers, start = [], 0
     ends = [states_of(group.schedule, group.jacobians) for group in sites]
     for group, size in zip(sites, ends, strict=True):
         states = group.jacobians.kind.states
-        found += [start + place for place, state in enumerate(states) if state.unit in units]
+        numbers += [start + place for place, state in enumerate(states) if state.unit in units]
         start += size
-    return found
+    return numbers
 
 
 def stays_rigid(system: ClosedSystem | Loop, others: Sequence[LinearSite]) -> bool:
@@ -213,13 +213,13 @@ def _standing_solutions(system: ClosedSystem | Loop) -> list[tuple[list[Fraction
     An output nobody reads may be free without being part of the state.
     """
     equations, states = _standing(system, [group.exact for group in system.sites])
-    found: list[tuple[list[Fraction], list[Fraction]]] = []
+    pairs: list[tuple[list[Fraction], list[Fraction]]] = []
     for solution in null_space(equations):
         state = _times(states, solution)
-        before = [numbers for _, numbers in found]
+        before = [numbers for _, numbers in pairs]
         if not null_space(np.array([*before, state], dtype=object).T) if before else any(state):
-            found.append((solution, state))
-    return found
+            pairs.append((solution, state))
+    return pairs
 
 
 def _times(matrix: Matrix, vector: Sequence[Fraction]) -> list[Fraction]:
@@ -287,11 +287,11 @@ def _standing(system: ClosedSystem | Loop, sites: Sequence[LinearSite]) -> tuple
 
 def _placed(size: int, rows: int, *blocks: tuple[Sequence[int], Matrix]) -> Matrix:
     """Return rows over all unknowns, with the columns of some blocks at their places."""
-    found = np.zeros((rows, size), dtype=object)
+    values = np.zeros((rows, size), dtype=object)
     for columns, block in blocks:
         for place, column in enumerate(columns):
-            found[:, column] += block[:, place]
-    return found
+            values[:, column] += block[:, place]
+    return values
 
 
 def _drifts(
@@ -309,11 +309,11 @@ def _drifts(
         return []
     unit = np.eye(count + len(standing[0]), dtype=np.int64).astype(object)
     try:
-        found = null_space_modulo(_ramp_equations(system, standing, unit, residue))
-        ramps = [vector for vector in found if any(vector[:count])]
-        if len(found) == count:
+        result = null_space_modulo(_ramp_equations(system, standing, unit, residue))
+        ramps = [vector for vector in result if any(vector[:count])]
+        if len(result) == count:
             return []
-        tried = np.array([[_rational(entry) for entry in vector] for vector in found], dtype=object).T
+        tried = np.array([[_rational(entry) for entry in vector] for vector in result], dtype=object).T
         sound = not _ramp_equations(system, standing, tried, _rational).any()
     except ValueError:  # the prime divides a denominator, or a residue has no simple fraction
         sound = False
@@ -375,8 +375,8 @@ def _rational(value: Fraction | float) -> Any:
 
 def _fractions(matrix: Matrix) -> Matrix:
     """Return a matrix of python-flint's rationals as fractions."""
-    found = np.zeros(matrix.shape, dtype=object)
+    values = np.zeros(matrix.shape, dtype=object)
     for place in np.argwhere(matrix != 0).tolist():
         entry = flint.fmpq(matrix[tuple(place)])
-        found[tuple(place)] = Fraction(int(entry.p), int(entry.q))
-    return found
+        values[tuple(place)] = Fraction(int(entry.p), int(entry.q))
+    return values

@@ -311,16 +311,18 @@ def _prove(system: ClosedSystem, estimate: _Solved) -> _Solved:
     if inside is None and not estimate.free.names:
         # Weights known as floats only can cost balls more than floats: their bound counts these, too.
         inside, bits = estimate.inside, 0 if estimate.inside is not None else bits
-    found = discs(proof.centres, proof.centres, proof.radii)
-    low, high = max(estimate.low, float(found.low)), min(estimate.high, float(found.high))
+    enclosure = discs(proof.centres, proof.centres, proof.radii)
+    low, high = max(estimate.low, float(enclosure.low)), min(estimate.high, float(enclosure.high))
     beyond = (max(estimate.beyond[0], proof.beyond[0]), min(estimate.beyond[1], proof.beyond[1]))
     proved = replace(estimate, low=low, high=high, inside=inside, bits=bits, beyond=beyond)
     # A radius that floats know as well: the other eigenvalues a proof knows far better.
-    if found.high - found.low > AS_SHARP * (estimate.high - estimate.low):
+    if enclosure.high - enclosure.low > AS_SHARP * (estimate.high - estimate.low):
         return proved
     order = descending(proof.centres)
     pairs = pairs_to(estimate.matrix, proof.centres[order])
-    return replace(proved, pairs=pairs, bounds=Enclosure(found.low, found.high, found.errors[order]))
+    return replace(
+        proved, pairs=pairs, bounds=Enclosure(enclosure.low, enclosure.high, enclosure.errors[order])
+    )
 
 
 def _modes(systems: Sequence[ClosedSystem], solved: Sequence[_Solved]) -> tuple[Mode, ...]:
@@ -356,14 +358,14 @@ def _motions(
     systems: Sequence[ClosedSystem], solved: Sequence[_Solved], places: Sequence[tuple[int, int]]
 ) -> tuple[Motion, ...]:
     """Describe some eigenvalues, given by their systems and rows."""
-    found: dict[tuple[int, int], Motion] = {}
+    result: dict[tuple[int, int], Motion] = {}
     with single_threaded(), np.errstate(all="ignore"):
         for s, (system, item) in enumerate(zip(systems, solved, strict=True)):
             rows = [row for own, row in places if own == s]
             if rows:
                 motions = _described(system, item, np.array(rows, dtype=np.intp))
-                found |= {(s, row): motion for row, motion in zip(rows, motions, strict=True)}
-    return tuple(found[place] for place in places)
+                result |= {(s, row): motion for row, motion in zip(rows, motions, strict=True)}
+    return tuple(result[place] for place in places)
 
 
 def _described(system: ClosedSystem, solved: _Solved, rows: Integers) -> list[Motion]:

@@ -136,15 +136,15 @@ class Words:
         """Show lines, as they are."""
         self.model.text = "".join(f"<p>{escape(line)}</p>" for line in lines)
 
-    def verdict(self, found: Plain) -> None:
+    def verdict(self, result: Plain) -> None:
         """Show a verdict, what limits it, and behind a lid all that `apc analyze` prints."""
-        kind = {True: "stable", False: "unstable"}.get(found["stable"], "")
+        kind = {True: "stable", False: "unstable"}.get(result["stable"], "")
         self.model.text = (
-            f"<p><strong class='{kind}'>{escape(found['verdict'])}</strong>, spectral radius "
-            f"{found['radius']:.9g} per frame</p><p>{escape(found['limits'])}</p>"
-            + "".join(f"<p>{escape(item)}</p>" for item in found["notes"])
+            f"<p><strong class='{kind}'>{escape(result['verdict'])}</strong>, spectral radius "
+            f"{result['radius']:.9g} per frame</p><p>{escape(result['limits'])}</p>"
+            + "".join(f"<p>{escape(item)}</p>" for item in result["notes"])
             + "<details><summary>All modes</summary>"
-            f"<pre tabindex='0'>{escape(found['text'])}</pre></details>"
+            f"<pre tabindex='0'>{escape(result['text'])}</pre></details>"
         )
 
     def table(self, text: str) -> None:
@@ -193,30 +193,30 @@ class RegionFigure:
         _legend_below(self.plot)
         self.words = Words("region-words")
 
-    def show(self, found: Plain) -> None:
+    def show(self, result: Plain) -> None:
         """Draw a region."""
         self.plot.visible = True
-        outlines = [np.asarray(item) for item in found["outlines"]]
+        outlines = [np.asarray(item) for item in result["outlines"]]
         rings = {
             axis: [[[outline[:, n] for outline in outlines]]] if outlines else []
             for n, axis in enumerate(("xs", "ys"))
         }
         self.inside.data = rings
         self.boundary.data = {
-            "xs": [item[:, 0] for item in found["curves"]],
-            "ys": [item[:, 1] for item in found["curves"]],
+            "xs": [item[:, 0] for item in result["curves"]],
+            "ys": [item[:, 1] for item in result["curves"]],
         }
         for axis, span, which in (
-            (self.plot.xaxis, self.plot.x_range, found["x"]),
-            (self.plot.yaxis, self.plot.y_range, found["y"]),
+            (self.plot.xaxis, self.plot.x_range, result["x"]),
+            (self.plot.yaxis, self.plot.y_range, result["y"]),
         ):
             label, unit, low, high = which
             axis.axis_label = axis_label(label, unit)
             span.update(start=low, end=high)
         steps = (
-            ("Between the edges of its cells the boundary is drawn straight.",) if found["stepped"] else ()
+            ("Between the edges of its cells the boundary is drawn straight.",) if result["stepped"] else ()
         )
-        self.words.say(f"Stable in {100 * found['share']:.3g} % of what is shown.", *steps, *found["notes"])
+        self.words.say(f"Stable in {100 * result['share']:.3g} % of what is shown.", *steps, *result["notes"])
 
     def clear(self, why: str) -> None:
         """Show no region, and why."""
@@ -264,21 +264,21 @@ class RootsFigure:
         self.words, self.way_words = Words("roots-words"), Words("way-words")
         self.way_words.say("Move a slider: dots show the way the eigenvalues take.")
 
-    def show(self, found: Plain) -> None:
+    def show(self, result: Plain) -> None:
         """Draw the eigenvalues of an analysis."""
-        self.now.data = {"x": found["real"], "y": found["imag"], "name": found["names"]}
-        size = BEYOND * float(np.hypot(found["real"], found["imag"]).max(initial=0.0))
+        self.now.data = {"x": result["real"], "y": result["imag"], "name": result["names"]}
+        size = BEYOND * float(np.hypot(result["real"], result["imag"]).max(initial=0.0))
         reach = max(ROUND, size)
         self.plot.x_range.update(start=-reach, end=reach)
         self.plot.y_range.update(start=-reach, end=reach)
-        outside = int((np.hypot(found["real"], found["imag"]) > 1).sum())
-        self.words.say(f"{counted(len(found['real']), 'eigenvalue')}, {outside} outside the unit circle.")
+        outside = int((np.hypot(result["real"], result["imag"]) > 1).sum())
+        self.words.say(f"{counted(len(result['real']), 'eigenvalue')}, {outside} outside the unit circle.")
 
-    def way_of(self, found: Plain) -> None:
+    def way_of(self, result: Plain) -> None:
         """Draw where the eigenvalues go as a slider goes through all its values."""
-        self.way.data = {"x": found["real"], "y": found["imag"], "name": found["name"]}
+        self.way.data = {"x": result["real"], "y": result["imag"], "name": result["name"]}
         self.way_words.say(
-            f"Dots: where they are for {found['slider']} from {found['from']} to {found['to']}."
+            f"Dots: where they are for {result['slider']} from {result['from']} to {result['to']}."
         )
 
 
@@ -475,17 +475,17 @@ class FeelFigure:
         self.plot.yaxis.minor_tick_line_color = None  # over less than a decade they lie on each other
         self.words = Words("feel-words")
 
-    def show(self, found: Plain) -> None:
+    def show(self, result: Plain) -> None:
         """Draw what is felt."""
         self.plot.visible = self.phase.visible = True
-        self.source.data = {name: found[name] for name in ("frequency", "magnitude", "phase")}
-        f, size = found["frequency"], found["magnitude"]
+        self.source.data = {name: result[name] for name in ("frequency", "magnitude", "phase")}
+        f, size = result["frequency"], result["magnitude"]
         self.plot.x_range.update(start=f[0], end=f[-1])
         self.plot.y_range.update(start=size.min() / (1 + ROOM), end=size.max() * (1 + ROOM))
         self.words.say(
-            f"At {found['at']}: {size[0]:.4g} N·s/m at {f[0]:.3g} Hz,"
+            f"At {result['at']}: {size[0]:.4g} N·s/m at {f[0]:.3g} Hz,"
             f" {size[-1]:.4g} N·s/m at {f[-1]:.3g} Hz.",
-            *found["notes"],
+            *result["notes"],
         )
 
     def clear(self, why: str) -> None:

@@ -160,8 +160,8 @@ def scene_of(system: CompiledSystem, settings: Sequence[str], text: str | None) 
         E980 a number without a slider; those of `overrides.parse_override` and `overrides.apply`.
     """
     sliders = sliders_of(system)
-    found = [set_to(system, sliders, setting) for setting in settings]
-    apply(system, [Override(sliders[place].free, value) for place, value in found])
+    pairs = [set_to(system, sliders, setting) for setting in settings]
+    apply(system, [Override(sliders[place].free, value) for place, value in pairs])
     return Scene(system, model_bytes(system), sliders, tuple(settings), text)
 
 
@@ -202,8 +202,8 @@ class Page:
 
     def _axes_at_first(self) -> list[int]:
         """Return the sliders on the axes of the region, those the scene studies first; none without two."""
-        found = [place for place, slider in enumerate(self.sliders) if slider.span is not None]
-        return found[:2] if len(found) > 1 else []
+        numbers = [place for place, slider in enumerate(self.sliders) if slider.span is not None]
+        return numbers[:2] if len(numbers) > 1 else []
 
     def _take_link(self, arguments: Mapping[str, list[bytes]]) -> None:
         """Set the sliders as the link says."""
@@ -352,9 +352,9 @@ class Page:
         self.tune.disabled = asked is None
         self.tuned.say(NO_AXES if asked is None else TUNES.format(*reversed(names)) if asked[0] else STUDIED)
 
-    def _save_numbers(self, found: Plain) -> None:
+    def _save_numbers(self, result: Plain) -> None:
         values = {slider.label: slider.texts[place] for slider, place in self._pairs()}
-        told = {"topology": self.system.name, "apc": program_version(), "set": values, **found}
+        told = {"topology": self.system.name, "apc": program_version(), "set": values, **result}
         self.out.data = {"name": [f"{self.system.name}.json"], "text": [json_text(told)]}
 
     @property
@@ -524,38 +524,38 @@ class Page:
 
     def _deliver(self, section: str, told: Told) -> None:
         """Show what a section tells."""
-        found = told.found
+        result = told.found
         if section == "verdict" and self.linear is None:
-            self.linear = found is not None and found["linear"]
-            self.at_once = found is not None and found["at_once"]
+            self.linear = result is not None and result["linear"]
+            self.at_once = result is not None and result["at_once"]
             self._ask_region(self._overrides)
         if section == "region" and self.modes is not None:
             self._later(lambda: self.roots.show(self.modes), FRAMES)
-        if found is None:
+        if result is None:
             clearing = {"region": self.region.clear, "feel": self.feel.clear, "motion": self.motion.clear}
             clearing.get(section, self._words(section).nothing)(told.why)
             return
         match section:
             case "verdict":
-                self.verdict.verdict(found)
-                self.modes = found
+                self.verdict.verdict(result)
+                self.modes = result
                 if self.desks[REGION].busy is None:
-                    self.roots.show(found)
+                    self.roots.show(result)
             case "roots":
-                self.roots.way_of(found)
+                self.roots.way_of(result)
             case "region":
-                self.region.show(found)
+                self.region.show(result)
             case "motion":
-                self.motion.show(found["motion"])
+                self.motion.show(result["motion"])
             case "feel":
-                self.feel.show(found)
-                self.held = found["names"]
+                self.feel.show(result)
+                self.held = result["names"]
                 if len(self.held) > 1:
-                    self.at.update(options=self.held, value=found["at"], visible=True)
+                    self.at.update(options=self.held, value=result["at"], visible=True)
             case "numbers":
-                self._save_numbers(found)
+                self._save_numbers(result)
             case _:
-                self._words(section).table(found["text"])
+                self._words(section).table(result["text"])
 
     def _words(self, section: str) -> Words:
         words = {"verdict": self.verdict, "roots": self.roots.way_words}

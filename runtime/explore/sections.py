@@ -99,20 +99,20 @@ def compute(model: bytes, task: Task) -> Told:
 
 
 def _verdict(system: CompiledSystem, prepared: Prepared, _: None) -> Plain:
-    found = analyze(system, prepared=prepared)
-    values = np.array([mode.eigenvalue for mode in found.modes], dtype=np.complex128)
+    analysis = analyze(system, prepared=prepared)
+    values = np.array([mode.eigenvalue for mode in analysis.modes], dtype=np.complex128)
     return {
-        "verdict": found.verdict + (", linearized" if found.linearized else ""),
-        "stable": found.stable,
-        "linear": not found.linearized,
-        "at_once": not found.linearized or prepare_at_start(system, prepared) is not None,
-        "radius": found.spectral_radius,
-        "limits": _limits(found),
-        "notes": found.left_out,
-        "text": str(found),
+        "verdict": analysis.verdict + (", linearized" if analysis.linearized else ""),
+        "stable": analysis.stable,
+        "linear": not analysis.linearized,
+        "at_once": not analysis.linearized or prepare_at_start(system, prepared) is not None,
+        "radius": analysis.spectral_radius,
+        "limits": _limits(analysis),
+        "notes": analysis.left_out,
+        "text": str(analysis),
         "real": values.real,
         "imag": values.imag,
-        "names": [_named(mode) for mode in found.modes],
+        "names": [_named(mode) for mode in analysis.modes],
     }
 
 
@@ -121,29 +121,29 @@ def _named(mode: Mode) -> str:
     return f"{mode.shape}{at}"
 
 
-def _limits(found: Analysis) -> str:
+def _limits(analysis: Analysis) -> str:
     """Return in a sentence which motion decides the verdict."""
-    if not found.modes:
+    if not analysis.modes:
         return "Nothing moves."
-    leading = found.modes[0]
+    leading = analysis.modes[0]
     parts = sorted(leading.participation, key=lambda pair: -pair[1])[:2]
     moves = " and ".join(name for name, _ in parts)
     changes = "grows" if leading.magnitude > 1 else "dies out most slowly"
-    times = f"by {leading.magnitude:.6g} each {found.frame_s * 1e3:.6g} ms"
+    times = f"by {leading.magnitude:.6g} each {analysis.frame_s * 1e3:.6g} ms"
     return f"{_named(leading)[0].upper()}{_named(leading)[1:]} {changes}, {times}: mostly {moves}."
 
 
 def _region(system: CompiledSystem, prepared: Prepared, asked: tuple[Range, Range, str]) -> Plain:
     x, y, criterion = asked
-    found = region(system, (x, y), tolerance=DRAWN, criterion=criterion, prepared=prepared)
+    result = region(system, (x, y), tolerance=DRAWN, criterion=criterion, prepared=prepared)
     return {
-        "outlines": stable_outlines(found),
-        "curves": [drawn_points(found, number) for number in range(len(found.curves))],
+        "outlines": stable_outlines(result),
+        "curves": [drawn_points(result, number) for number in range(len(result.curves))],
         "x": (x.free.label, x.unit, float(x.low), float(x.high)),
         "y": (y.free.label, y.unit, float(y.low), float(y.high)),
-        "share": found.stable_area / float(found.rectangle.width.prod()),
-        "notes": found.left_out,
-        "stepped": found.stepped,
+        "share": result.stable_area / float(result.rectangle.width.prod()),
+        "notes": result.left_out,
+        "stepped": result.stepped,
     }
 
 
@@ -154,11 +154,11 @@ def _roots(system: CompiledSystem, prepared: Prepared, asked: tuple[Free, tuple[
     some = _thinned(values, FEW_ROOTS if slow else ROOTS)
     with finite_equations(system.name):
         places, rows = eigenvalues_at(system, free, some, prepared=prepared)
-    found = np.concatenate([EMPTY, *rows])
+    result = np.concatenate([EMPTY, *rows])
     texts = [text_of(number, unit_of(system, free.name)) for number in some]
     return {
-        "real": found.real,
-        "imag": found.imag,
+        "real": result.real,
+        "imag": result.imag,
         "name": [texts[place] for place, row in zip(places, rows, strict=True) for _ in row],
         "slider": free.label,
         "from": texts[0],
@@ -192,14 +192,14 @@ def _feel(system: CompiledSystem, prepared: Prepared, at: str) -> Plain:
     """Return what is felt at a device, the first there is if it isn't said, and what else may be held."""
     frequencies = read_frequencies(system, None, LOWEST, None, FREQUENCIES)
     names = held_names(system, prepared)
-    found = feel(system, frequencies, at=at or next(iter(names), ""), beside=(), prepared=prepared)
+    result = feel(system, frequencies, at=at or next(iter(names), ""), beside=(), prepared=prepared)
     return {
         "names": names,
-        "at": found.at,
-        "frequency": found.frequency_hz,
-        "magnitude": np.abs(found.impedance),
-        "phase": np.degrees(np.angle(found.impedance)),
-        "notes": (*found.notes, *found.left_out),
+        "at": result.at,
+        "frequency": result.frequency_hz,
+        "magnitude": np.abs(result.impedance),
+        "phase": np.degrees(np.angle(result.impedance)),
+        "notes": (*result.notes, *result.left_out),
     }
 
 

@@ -80,7 +80,7 @@ def sliders_of(system: CompiledSystem) -> tuple[Slider, ...]:
     """
     starts = start_names(system)
     studied = {axis.parameter: (axis.low, axis.high) for axis in system.region}
-    found = []
+    sliders = []
     for free in free_parameters(system):
         parameter = parameter_of(system, free)
         if free.name in starts and parameter.value == 0:
@@ -91,12 +91,12 @@ def sliders_of(system: CompiledSystem) -> tuple[Slider, ...]:
             values = _decades(parameter.number, low, high)
         else:
             values = _even(parameter.number, *_within(span, parameter.number), low, high)
-        found.append(_slider(system, free, PARAMETERS, parameter.about, values, parameter.number, span))
+        sliders.append(_slider(system, free, PARAMETERS, parameter.about, values, parameter.number, span))
     couplers = coupler_parameters(system)
     couplers.sort(key=lambda coupler: unit_of(system, coupler.name) not in STIFFNESSES)
     listed = [*studied, *(coupler.label for coupler in couplers)]
-    found.sort(key=lambda slider: listed.index(slider.label) if slider.label in listed else len(listed))
-    return (*found, *_times(system, studied), *_people(system))
+    sliders.sort(key=lambda slider: listed.index(slider.label) if slider.label in listed else len(listed))
+    return (*sliders, *_times(system, studied), *_people(system))
 
 
 def _slider(
@@ -198,7 +198,7 @@ def _times(system: CompiledSystem, studied: dict[str, tuple[Fraction, Fraction]]
     phases = {clock.phase: clock for clock in system.clocks}
     now = {timing.name: timing.value for timing in system.timings}
     longest = max((now[name] for name in periods), default=Fraction(1))
-    found = []
+    sliders = []
     for timing in named_times(system):
         free, value = Free(timing.name), timing.value
         if timing.formula is not None:
@@ -216,8 +216,8 @@ def _times(system: CompiledSystem, studied: dict[str, tuple[Fraction, Fraction]]
             about = _about(system, timing.name)
             span = studied.get(timing.name, (Fraction(0), _nice(max(ROOM * value, 4 * longest))))
             values = _even(value, *_within(span, value), Fraction(0), None)
-        found.append(_slider(system, free, TIMES, about, values, value, span))
-    return sorted(found, key=lambda slider: (slider.span is None, slider.free.name in phases))
+        sliders.append(_slider(system, free, TIMES, about, values, value, span))
+    return sorted(sliders, key=lambda slider: (slider.span is None, slider.free.name in phases))
 
 
 def _about(system: CompiledSystem, name: str) -> str:
@@ -245,7 +245,7 @@ def _frame(periods: Sequence[Fraction]) -> Fraction:
 
 def _people(system: CompiledSystem) -> list[Slider]:
     """Return the sliders of how many peers groups have, where that is no list of their own numbers."""
-    found = []
+    sliders = []
     for group in system.groups:
         free = Free(group_count(group.name))
         parameter = parameter_of(system, free)
@@ -256,8 +256,8 @@ def _people(system: CompiledSystem) -> list[Slider]:
         values = [Fraction(k) for k in range(least, most + 1)]
         span = (Fraction(least), Fraction(most))
         about = f"how many peers {group.name} has"
-        found.append(_slider(system, free, PEOPLE, about, values, Fraction(group.count), span))
-    return found
+        sliders.append(_slider(system, free, PEOPLE, about, values, Fraction(group.count), span))
+    return sliders
 
 
 def is_number(value: Any) -> bool:
@@ -291,11 +291,11 @@ def set_to(system: CompiledSystem, sliders: Sequence[Slider], text: str) -> tupl
     ApcError
         E980 what is set has no slider; and those of `overrides.parse_override`.
     """
-    found = parse_override(system, text)
+    override = parse_override(system, text)
     for place, slider in enumerate(sliders):
-        if slider.free == found.free:
-            return place, found.value
-    what = f"{found.free.label} has no slider: it follows from other numbers, or differs from peer to peer"
+        if slider.free == override.free:
+            return place, override.value
+    what = f"{override.free.label} has no slider: it follows from other numbers, or differs from peer to peer"
     raise ApcError(Mistake("E980", Place("explore"), what))
 
 
@@ -318,7 +318,7 @@ def overrides_of(sliders: Sequence[Slider], places: Sequence[int]) -> list[Overr
 
 def axes_of(sliders: Sequence[Slider], places: Sequence[int], chosen: tuple[int, int]) -> tuple[Range, Range]:
     """Return the axes of a region over two sliders: their spans, wide enough for their values."""
-    found = []
+    intervals = []
     for number in chosen:
         slider, value = sliders[number], sliders[number].values[places[number]]
         assert slider.span is not None
@@ -326,5 +326,5 @@ def axes_of(sliders: Sequence[Slider], places: Sequence[int], chosen: tuple[int,
         room = (high - low) / 10
         low = low if value >= low else value - room
         high = high if value <= high else _nice(value + room)
-        found.append(Range(slider.free, slider.unit, low, high))
-    return found[0], found[1]
+        intervals.append(Range(slider.free, slider.unit, low, high))
+    return intervals[0], intervals[1]

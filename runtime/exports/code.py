@@ -62,8 +62,10 @@ def peer_code(system: CompiledSystem, *, peer: str = "", device: str = "", metho
         what = "--peer: the peers differ, and a text of C is of one"
         hint = f'--peer "{plan.exchange.peer_name(0)}"'
         raise ApcError(Mistake("E963", Place(system.origin.topology), what, hint=hint))
-    found = peer_of(plan, number_of(plan.exchange, peer, "--peer") if peer else 0, how, device=device or None)
-    return Code(system.name, found, str(how))
+    result = peer_of(
+        plan, number_of(plan.exchange, peer, "--peer") if peer else 0, how, device=device or None
+    )
+    return Code(system.name, result, str(how))
 
 
 def scene_unit(system: CompiledSystem, *, peer: str = "", method: str = "") -> Unit:
@@ -81,13 +83,13 @@ def _plan(system: CompiledSystem, method: str) -> tuple[Method, Plan]:
         return how, plan_of(system, how)
 
 
-def write_code(path: Path, found: Code) -> None:
+def write_code(path: Path, code: Code) -> None:
     """Write a peer's code, its header beside it, and a driver. Raises ApcError (E601) if it can't be."""
     include = f"{path.stem}.h"
     write_texts(
         {
-            path.with_suffix(".h"): header(found.code),
-            path: source(found.code, include),
-            path.with_name(f"{path.stem}_test.c"): driver(found.code, include),
+            path.with_suffix(".h"): header(code.code),
+            path: source(code.code, include),
+            path.with_name(f"{path.stem}_test.c"): driver(code.code, include),
         }
     )

@@ -106,16 +106,16 @@ def format_of(to: str | None, out: Path | None, *, option: str = "--") -> Format
             )
         suffix = check_suffix(out, [item.suffix for item in FORMATS], written)
         return next(item for item in FORMATS if item.suffix == suffix)
-    found = next((item for item in FORMATS if item.name == to), None)
-    if found is None:
+    result = next((item for item in FORMATS if item.name == to), None)
+    if result is None:
         near = nearest(to, names) or names[0]
         place = Place("--to" if option == "--" else "to")
         raise ApcError(
             Mistake("E952", place, "a format", f"one of {', '.join(names)}", to[:40], f"{place} {near}")
         )
     if out is not None:
-        check_suffix(out, [found.suffix], written)
-    return found
+        check_suffix(out, [result.suffix], written)
+    return result
 
 
 def export(system: CompiledSystem, chosen: Format, asked: Asked, out: Path | None = None) -> Result:
@@ -143,7 +143,7 @@ def export(system: CompiledSystem, chosen: Format, asked: Asked, out: Path | Non
             raise ApcError(Mistake("E953", Place(f"--{name}"), what, hint=f"--to {able}" if able else ""))
     refuse_range(system)
     make, write = _makers(chosen.name)
-    found = make(system, **{name: getattr(asked, name) for name in chosen.takes})
+    parameter = make(system, **{name: getattr(asked, name) for name in chosen.takes})
     if out is not None:
-        write(out, found)
-    return found
+        write(out, parameter)
+    return parameter

@@ -110,13 +110,13 @@ def written(
 
     def rule(word: str) -> Callable[..., Text]:
         def operation(*operands: Any) -> Text:
-            found = _SPECIAL[word](*operands) if word in _SPECIAL else _formed(word, *operands)
-            return keep(found) if next(again) and len(found.text) > LONGEST else found
+            text = _SPECIAL[word](*operands) if word in _SPECIAL else _formed(word, *operands)
+            return keep(text) if next(again) and len(text.text) > LONGEST else text
 
         return operation
 
-    found = walk(plain, values, rule)
-    return [found[place] for place in plain.results[0]]
+    result = walk(plain, values, rule)
+    return [result[place] for place in plain.results[0]]
 
 
 def _real(operand: Text) -> Text:

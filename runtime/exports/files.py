@@ -25,51 +25,51 @@ if TYPE_CHECKING:
 LARGEST_MAT = 2**31 - 2**20  # bytes: a variable of a MAT-file of version 5 is less than 2 GiB
 
 
-def as_control(found: StateSpace) -> Any:
+def as_control(state_space: StateSpace) -> Any:
     """Return a state space as `control.StateSpace`. Raises ApcError (E875) without python-control."""
     control = need("control", "control")
     return control.StateSpace(
-        *(found.a, found.b, found.c, found.d, found.frame_s),
-        name=identifier(found.topology),
-        states=words(found.states),
-        inputs=words(found.inputs),
-        outputs=words(found.outputs),
+        *(state_space.a, state_space.b, state_space.c, state_space.d, state_space.frame_s),
+        name=identifier(state_space.topology),
+        states=words(state_space.states),
+        inputs=words(state_space.inputs),
+        outputs=words(state_space.outputs),
     )
 
 
-def write_script(path: Path, found: StateSpace) -> None:
+def write_script(path: Path, state_space: StateSpace) -> None:
     """Write a Python script that makes a `control.StateSpace`. Raises ApcError (E601)."""
     text = filled(
         "control.jinja",
-        found=found,
+        state_space=state_space,
         module=path.stem if path.stem.isidentifier() else "this_file",
-        named=_named(found),
+        named=_named(state_space),
         words=words,
-        name=identifier(found.topology),
+        name=identifier(state_space.topology),
     )
     write_text(path, text.rstrip("\n"))
 
 
-def write_mat(path: Path, found: StateSpace) -> None:
+def write_mat(path: Path, state_space: StateSpace) -> None:
     """Write a MAT-file. Raises ApcError: E601 where it can't be, E951 where it is too large."""
-    if max(matrix.nbytes for matrix in found.matrices) > LARGEST_MAT:
+    if max(matrix.nbytes for matrix in state_space.matrices) > LARGEST_MAT:
         what = "a variable of a MAT-file holds less than 2 GiB, and A is larger"
         raise ApcError(Mistake("E951", Place(str(path)), what, hint="--to npz"))
     from scipy.io import savemat
 
     variables = {
         name: np.array(item, dtype=object).reshape(-1, 1) if isinstance(item, list) else item
-        for name, item in _variables(found).items()
+        for name, item in _variables(state_space).items()
     }
     # The name has another suffix until the file is whole, and SciPy would add its own.
     write_file(path, lambda temporary: savemat(temporary, variables, appendmat=False, do_compression=True))
 
 
-def write_npz(path: Path, found: StateSpace) -> None:
+def write_npz(path: Path, state_space: StateSpace) -> None:
     """Write an archive of arrays, without pickles. Raises ApcError (E601)."""
     arrays: dict[str, Any] = {
         name: np.array(item, dtype=np.str_) if isinstance(item, list | str) else np.asarray(item)
-        for name, item in _variables(found).items()
+        for name, item in _variables(state_space).items()
     }
 
     def write(temporary: Path) -> None:
@@ -79,22 +79,22 @@ def write_npz(path: Path, found: StateSpace) -> None:
     write_file(path, write)
 
 
-def _named(found: StateSpace) -> list[tuple[str, tuple[Port, ...]]]:
+def _named(state_space: StateSpace) -> list[tuple[str, tuple[Port, ...]]]:
     """Return what a state space has by names, under the word for it."""
-    return [("states", found.states), ("inputs", found.inputs), ("outputs", found.outputs)]
+    return [("states", state_space.states), ("inputs", state_space.inputs), ("outputs", state_space.outputs)]
 
 
-def _variables(found: StateSpace) -> dict[str, Any]:
+def _variables(state_space: StateSpace) -> dict[str, Any]:
     """Return what a file of arrays holds, by name."""
-    variables: dict[str, Any] = dict(zip("ABCD", found.matrices, strict=True))
-    variables["dt"] = found.frame_s
-    for name, ports in _named(found):
+    variables: dict[str, Any] = dict(zip("ABCD", state_space.matrices, strict=True))
+    variables["dt"] = state_space.frame_s
+    for name, ports in _named(state_space):
         variables[name] = [port.name for port in ports]
         variables[f"{name.removesuffix('s')}_units"] = [port.unit for port in ports]
-    variables["cut"], variables["notes"] = found.cut, [found.meaning, *found.notes]
-    variables["provenance"] = found.made_by
-    if found.free:
-        variables["free"] = [port.name for port in found.free]
-        variables["free_units"] = [port.unit for port in found.free]
-        variables["casadi_function"] = found.function.serialize()
+    variables["cut"], variables["notes"] = state_space.cut, [state_space.meaning, *state_space.notes]
+    variables["provenance"] = state_space.made_by
+    if state_space.free:
+        variables["free"] = [port.name for port in state_space.free]
+        variables["free_units"] = [port.unit for port in state_space.free]
+        variables["casadi_function"] = state_space.function.serialize()
     return variables

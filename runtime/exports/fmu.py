@@ -95,8 +95,8 @@ def compile_texts(texts: Mapping[str, str], options: Sequence[str], place: Place
     ApcError
         E962 there is no compiler, or it doesn't take them.
     """
-    found = compiler()
-    if found is None:
+    pair = compiler()
+    if pair is None:
         what = "no C compiler answers to cc, gcc or clang, or to what the variable CC says"
         raise ApcError(
             Mistake("E962", place, what, hint="gcc or clang installed, or --to c, which needs none")
@@ -106,16 +106,16 @@ def compile_texts(texts: Mapping[str, str], options: Sequence[str], place: Place
         for item, text in texts.items():
             (folder / item).write_text(text, encoding="utf-8")
         listed = [text for text in texts if text.endswith(".c")]
-        command = [found[0], *options, *listed, "-o", "built", "-lm"]
+        command = [pair[0], *options, *listed, "-o", "built", "-lm"]
         try:
             done = subprocess.run(
                 command, cwd=folder, capture_output=True, text=True, timeout=PATIENCE, check=False
             )
         except (OSError, subprocess.SubprocessError) as error:
-            raise ApcError(Mistake("E962", place, f"{found[0]} can't be run: {error}")) from None
+            raise ApcError(Mistake("E962", place, f"{pair[0]} can't be run: {error}")) from None
         if done.returncode:
             said = (done.stderr.strip().splitlines() or ["nothing"])[0][:200]
-            what = f"{found[0]} doesn't compile it, and says: {said}"
+            what = f"{pair[0]} doesn't compile it, and says: {said}"
             raise ApcError(Mistake("E962", place, what))
         return (folder / "built").read_bytes()
 

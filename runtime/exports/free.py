@@ -61,9 +61,9 @@ def state_space_of(system: CompiledSystem, *, cut: str = "", free: Sequence[str]
         E622 no such parameter; E954 a time, or a scene whose start decides its slopes; and those of
         `lifted.state_space`.
     """
-    found = state_space(system, cut=cut)
+    space = state_space(system, cut=cut)
     if not free:
-        return found
+        return space
     frees = _frees(system, free)
     ports = tuple(Port(free.label, unit_of(system, free.name)) for free in frees)
     symbols = [casadi.SX.sym(word) for word in words(ports)]
@@ -85,7 +85,7 @@ def state_space_of(system: CompiledSystem, *, cut: str = "", free: Sequence[str]
     function = casadi.Function(
         "state_space", symbols, [*map(_matrix, blocks)], words(ports), ["A", "B", "C", "D"]
     )
-    return replace(found, free=ports, function=function)
+    return replace(space, free=ports, function=function)
 
 
 def _frees(system: CompiledSystem, names: Sequence[str]) -> list[Free]:
@@ -149,12 +149,12 @@ def _step(moving: Matrix, now: Matrix, seconds: float) -> Matrix:
     size = float(np.abs(now).sum(axis=1).max(initial=0.0)) * seconds
     halvings = max(0, math.ceil(math.log2(max(size * SPAN, 1.0))))
     small = generator / 2**halvings
-    found = casadi.SX.eye(width)
+    expression = casadi.SX.eye(width)
     for term in range(TERMS, 0, -1):
-        found = casadi.SX.eye(width) + casadi.mtimes(small, found) / term
+        expression = casadi.SX.eye(width) + casadi.mtimes(small, expression) / term
     for _ in range(halvings):
-        found = casadi.mtimes(found, found)
-    return _array(found[:n, :])
+        expression = casadi.mtimes(expression, expression)
+    return _array(expression[:n, :])
 
 
 def _plain(item: Any) -> Any:
@@ -165,19 +165,19 @@ def _plain(item: Any) -> Any:
 
 def _array(matrix: Any) -> Matrix:
     """Return CasADi's matrix as an array whose constants are floats."""
-    found = np.zeros(matrix.shape, dtype=object)
+    values = np.zeros(matrix.shape, dtype=object)
     for row, column in zip(*matrix.sparsity().get_triplet(), strict=True):
-        found[row, column] = _plain(matrix[row, column])
-    return found
+        values[row, column] = _plain(matrix[row, column])
+    return values
 
 
 def _matrix(block: Matrix) -> Any:
     """Return an array as CasADi's matrix, sparse where it is zero."""
-    found = casadi.SX(*block.shape)
+    expression = casadi.SX(*block.shape)
     for place in np.ndindex(block.shape):
         if isinstance(block[place], casadi.SX) or block[place]:
-            found[place] = block[place]
-    return found
+            expression[place] = block[place]
+    return expression
 
 
 SYMBOLS = Arithmetic(

@@ -143,8 +143,8 @@ def steps_in_floats(
     columns = np.zeros((len(group.exact.a), count), dtype=object)
     for place, push in enumerate(forces):
         columns[list(push.velocities), place] = push.inverses
-    found = discretize(group.exact.a, np.concatenate([group.exact.b, columns], axis=1), durations)
-    return [step.matrix for step in found]
+    steps = discretize(group.exact.a, np.concatenate([group.exact.b, columns], axis=1), durations)
+    return [step.matrix for step in steps]
 
 
 IN_FLOATS = Numbers(
@@ -309,27 +309,27 @@ def _remembering(group: PeerGroup) -> Schedule:
 
 def _instants(schedule: Schedule) -> dict[int, list[int]]:
     """Return when in a frame each clock partition ticks, in quanta."""
-    found: dict[int, list[int]] = {}
+    result: dict[int, list[int]] = {}
     for now, event in timed_events(schedule):
         if isinstance(event, Tick):
-            found.setdefault(event.partition, []).append(now)
-    return found
+            result.setdefault(event.partition, []).append(now)
+    return result
 
 
 def _masses(system: CompiledSystem, group: PeerGroup) -> tuple[list[Push], list[str]]:
     """Return what of a peer has a mass, and so can be pushed, each axis by itself; and why what can't."""
     unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
     known: dict[str, Device | str | None] = {}
-    found = [
+    result = [
         find_push(group.jacobians, group.parameters, unit_of, group.listening, place, known)
         for place, state in enumerate(group.jacobians.kind.states)
         if state.unit == "m"
     ]
     pushes: dict[str, Push] = {}
-    for push in found:
+    for push in result:
         if isinstance(push, Push):
             pushes.setdefault(push.part, push)
-    refused = dict.fromkeys(f"no force of its own: {text}" for text in found if isinstance(text, str))
+    refused = dict.fromkeys(f"no force of its own: {text}" for text in result if isinstance(text, str))
     return list(pushes.values()), list(refused)
 
 
@@ -484,12 +484,12 @@ def _heard_ports(heard: Sequence[Heard], link: str, units: Mapping[str, str]) ->
 
 def _units(kind: Kind) -> dict[str, str]:
     """Return the units of what a peer has: of its states, of what is computed and sent, by their names."""
-    found = {state.name: state.unit for state in kind.states}
+    result = {state.name: state.unit for state in kind.states}
     for clock in kind.clocks:
-        found |= zip(clock.outputs, clock.units, strict=True)
+        result |= zip(clock.outputs, clock.units, strict=True)
     for send in kind.sends:
-        found |= zip(send.channels, send.units, strict=True)
-    return found
+        result |= zip(send.channels, send.units, strict=True)
+    return result
 
 
 def _unit(units: Mapping[str, Mapping[str, str]], name: str) -> str:

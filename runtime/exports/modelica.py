@@ -78,9 +78,9 @@ class ModelicaModel(Result):
     clocks: tuple[str, ...]
 
 
-def write_modelica(path: Path, found: ModelicaModel) -> None:
+def write_modelica(path: Path, modelica_model: ModelicaModel) -> None:
     """Write a model to a file. Raises ApcError (E601)."""
-    write_text(path, found.text)
+    write_text(path, modelica_model.text)
 
 
 def modelica(system: CompiledSystem) -> ModelicaModel:

@@ -285,7 +285,7 @@ def _settable(kind: Kind) -> tuple[int, ...]:
 def sites_of(plan: Plan) -> tuple[int, ...]:
     """Return of every peer the first one of its group and numbers that hears others by the same weights."""
     first: dict[Any, int] = {}
-    found = []
+    numbers = []
     graphs = [link for link in plan.exchange.links if not plan.exchange.is_complete(link)]
     for number in range(plan.exchange.peers):
         heard = tuple(
@@ -293,8 +293,8 @@ def sites_of(plan: Plan) -> tuple[int, ...]:
             for link in graphs
         )
         key = plan.exchange.group_of(number), _parameters(plan, number).tobytes(), heard
-        found.append(first.setdefault(key, number))
-    return tuple(found)
+        numbers.append(first.setdefault(key, number))
+    return tuple(numbers)
 
 
 def refused(system: CompiledSystem, what: str, hint: str = "", code: str = "E960") -> ApcError:
@@ -386,7 +386,7 @@ def _forces(
     slopes = jacobian(kind.derivative(x, u, p, t), u)
     varying = casadi.vertcat(x, u, t)
     numbers = start_arguments(site, exact_numbers(kind, vector), Fraction, None)
-    found = []
+    forces = []
     for row in sorted(outside):
         if not _is_position(kind, site, row):
             continue
@@ -406,8 +406,8 @@ def _forces(
         values = evaluate_exact(function, [numbers[0], numbers[1], numbers[4], numbers[5]])[0]
         terms = tuple((h, float(value / device.inverse)) for h, value in enumerate(values) if value)
         part, _, own = state.rpartition(".")
-        found.append(Force(f"{part}.f{own.removeprefix(whole_and_index(own)[0])}", terms))
-    return tuple(found)
+        forces.append(Force(f"{part}.f{own.removeprefix(whole_and_index(own)[0])}", terms))
+    return tuple(forces)
 
 
 # ---- what moves inside
@@ -460,14 +460,14 @@ def _instants(schedule: Schedule) -> tuple[tuple[Instant, ...], tuple[int, ...]]
     """Return the instants of a frame, and the lengths of time between them in quanta."""
     lengths = sorted({event.duration for event in schedule.events if isinstance(event, frames.Propagate)})
     ticked: Counter[int] = Counter()
-    found = []
+    instants = []
     for _, group in groupby(timed_events(schedule), itemgetter(0)):  # each ends with a length of time
         *listed, move = (event for _, event in group)
         assert isinstance(move, frames.Propagate), "an instant is over when time goes on"
         ticks = tuple(tick.partition for tick in listed if isinstance(tick, frames.Tick))
         ticked.update(ticks)
         acts = [(act.hold, act.value) for act in listed if isinstance(act, frames.Act)]
-        found.append(
+        instants.append(
             Instant(
                 tuple(send.partition for send in listed if isinstance(send, frames.Send)),
                 ticks,
@@ -475,7 +475,7 @@ def _instants(schedule: Schedule) -> tuple[tuple[Instant, ...], tuple[int, ...]]
                 lengths.index(move.duration),
             )
         )
-    return tuple(found), tuple(lengths)
+    return tuple(instants), tuple(lengths)
 
 
 # ---- what is heard
@@ -568,12 +568,12 @@ def heard_of(
 
 def computing(kind: Kind) -> list[tuple[Any, str, str, str]]:
     """Return all that a peer computes at instants: each function, when, what it gives, over which link."""
-    found = [
+    result = [
         (clock.tick, f"at a tick of {clock.clock} ", ", ".join(clock.outputs), "") for clock in kind.clocks
     ]
     edges = [each.edge for clock in kind.clocks for each in clock.receives if each.edge is not None]
-    found += [(edge, "", "a look at others", "") for edge in edges]
-    return [*found, *((send.send, "", ", ".join(send.channels), f" of {send.link}") for send in kind.sends)]
+    result += [(edge, "", "a look at others", "") for edge in edges]
+    return [*result, *((send.send, "", ", ".join(send.channels), f" of {send.link}") for send in kind.sends)]
 
 
 def has_edge(kind: Kind, partition: int, receive: int) -> bool:

@@ -39,9 +39,9 @@ def pushed(system: CompiledSystem) -> CompiledSystem:
         kind = system.kinds[group.kind]
         if kinds[group.kind] is not kind or not kind.clocks:
             continue
-        found = find_devices(jacobians(kind), numbers.parameters[place][0], unit_of, direct=direct)
+        result = find_devices(jacobians(kind), numbers.parameters[place][0], unit_of, direct=direct)
         devices = {
-            f"{FORCE_ON}{device.part}": device for device in found.values() if isinstance(device, Device)
+            f"{FORCE_ON}{device.part}": device for device in result.values() if isinstance(device, Device)
         }
         fastest = min(range(len(kind.clocks)), key=lambda number: periods[kind.clocks[number].clock])
         if devices:
@@ -64,10 +64,10 @@ def _pushed(kind: Kind, devices: dict[str, Device], fastest: int) -> Kind:
 
     def rates(x: Any, u: Any, p: Any, t: Any) -> Any:
         old = x, u[:held], p[:own], t
-        found = casadi.vertsplit(kind.derivative(*old))
+        result = casadi.vertsplit(kind.derivative(*old))
         for device, force in zip(devices.values(), casadi.vertsplit(u[held:]), strict=True):
-            found[device.velocity] += device.symbolic(*old) * force
-        return casadi.vertcat(*found)
+            result[device.velocity] += device.symbolic(*old) * force
+        return casadi.vertcat(*result)
 
     larger = replace(kind, parameters=(*kind.parameters, *devices), holds=(*kind.holds, *holds))
     whole = rewritten(larger, kind, lambda x, p: x, rates)

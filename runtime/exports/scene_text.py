@@ -127,21 +127,21 @@ def one_peer(plan: Plan, number: int, method: Method) -> CScene:
 
 def _looked_at(peer: Peer, member: str, prefix: str) -> list[Variable]:
     """Return what can be looked at of a peer that a member of `model` is."""
-    found = []
+    variables = []
     for signal in peer.signals:
         began = ("state", peer.start[signal.place[0]]) if signal.role == "state" else ()
         own = f"{member}.{memory(peer, signal)}"
         if not signal.name.startswith(FORCE_ON):
-            found.append(Variable(prefix + signal.name, signal.unit, own, *began))
+            variables.append(Variable(prefix + signal.name, signal.unit, own, *began))
     units = parameter_units(peer)
     for k, place in enumerate(peer.settable):
         name, start, own = peer.kind.parameters[place], float(peer.parameters[place]), f"{member}.p[{k}]"
         if name.startswith(FORCE_ON):
             name = f"{FORCE_ON}{prefix}{name.removeprefix(FORCE_ON)}"
-            found.append(Variable(name, "N", own, "input", start))
+            variables.append(Variable(name, "N", own, "input", start))
         else:
-            found.append(Variable(prefix + name, units[name], own, "parameter", start))
-    return found
+            variables.append(Variable(prefix + name, units[name], own, "parameter", start))
+    return variables
 
 
 def c_scene(plan: Plan, method: Method) -> CScene:
@@ -188,7 +188,7 @@ def _links(plan: Plan, quantum: Fraction) -> tuple[Link, ...]:
             used.setdefault(line.link, {}).update(dict.fromkeys(line.channels))
             ways.setdefault(line.link, []).extend((sender.peer, peer) for sender in line.senders)
     clocks = {clock.name: clock for clock in plan.system.clocks}
-    found = []
+    links = []
     for name, (link, channels) in zip(unique(map(identifier, used)), used.items(), strict=True):
         clock = clocks[exchange.links[link].clock]
         period, phase = (int(timings[text] / quantum) for text in (clock.period, clock.phase))
@@ -203,7 +203,7 @@ def _links(plan: Plan, quantum: Fraction) -> tuple[Link, ...]:
         ]
         kept = max((luck.kept(route) for luck, route in lucks), default=0)
         latest = int(max(delays, default=Fraction(0)) / quantum)
-        found.append(
+        links.append(
             Link(
                 link=link,
                 name=f"sent_{name}",
@@ -219,7 +219,7 @@ def _links(plan: Plan, quantum: Fraction) -> tuple[Link, ...]:
                 kept=kept,
             )
         )
-    return tuple(found)
+    return tuple(links)
 
 
 def shared(scene: CScene) -> dict[str, Any]:

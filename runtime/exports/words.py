@@ -36,18 +36,18 @@ def words(ports: Sequence[Port]) -> list[str]:
 
 def identifier(name: str) -> str:
     """Return a name as programs have it: letters, digits and _, no word of C."""
-    found = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_") or "n"
-    return f"n{found}" if found[0].isdigit() else f"{found}_" if found in RESERVED else found
+    text = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_") or "n"
+    return f"n{text}" if text[0].isdigit() else f"{text}_" if text in RESERVED else text
 
 
 def unique(names: Iterable[str], taken: Iterable[str] = ()) -> tuple[str, ...]:
     """Return names of which none is equal to another or taken: a repeated one gets a number behind."""
-    used, found = set(taken), []
+    used, texts = set(taken), []
     for base in names:
         name, count = base, 1
         while name in used:
             count += 1
             name = f"{base}_{count}"
         used.add(name)
-        found.append(name)
-    return tuple(found)
+        texts.append(name)
+    return tuple(texts)

@@ -114,7 +114,7 @@ def _ages(
     phase = {name: timings[clock_of[name].phase] % period[name] for name in names}
     own = period[partition.clock]
     late = {link: timings[_only_delay(system, exchange, number, link)] for link in links}
-    found = []
+    result = []
     for tick in range(int(common_multiple(period.values()) / own)):
         now = phase[partition.clock] + tick * own
         ages = []
@@ -125,8 +125,8 @@ def _ages(
             if not waited and rank("tick") < rank("deliver"):
                 waited = period[clock]
             ages.append((link, late[link] + waited + missed))
-        found.append(tuple(ages))
-    return tuple(found)
+        result.append(tuple(ages))
+    return tuple(result)
 
 
 def _only_delay(system: CompiledSystem, exchange: Exchange, number: int, link: str) -> str:
@@ -166,8 +166,8 @@ def _with_ages(partition: ClockPartition, ages: Sequence[_Ages]) -> ClockPartiti
     rows: list[list[_Row]] = [[] for _ in different]  # by variant
     for receive in partition.receives:
         places: dict[Fraction, int] = {}
-        for own, found in zip(rows, different, strict=True):
-            age = dict(found).get(receive.link, Fraction(0))
+        for own, pairs in zip(rows, different, strict=True):
+            age = dict(pairs).get(receive.link, Fraction(0))
             alone = float(age) if receive.age == "alone" else None
             if receive.age == "edge":
                 alone = _of_itself(receive, age, x, u, m, p, t)

@@ -82,7 +82,7 @@ def turns(
     states, values
         Which entry of z is followed (k,), and the eigenvalues (k,).
     """
-    found = np.full(len(values), np.nan)
+    result = np.full(len(values), np.nan)
     start, heard = _real_where_real(start, heard, values)
     one_site = _of_one(site)
     swing = _fastest(site.a)
@@ -105,10 +105,10 @@ def turns(
             course = _courses(mine, schedule, points, start[some], heard[some], states[some])
             angle, known = followed_closely(course, values[some], again=doubled > 0)
             known |= states[some] >= len(site.kind.states)
-            found[some[known]] = _of_eigenvalue(angle[known], values[some[known]])
+            result[some[known]] = _of_eigenvalue(angle[known], values[some[known]])
             agreed[first : first + chunk] = known
         left = left[~agreed]
-    return found
+    return result
 
 
 def _real_where_real(start: Complexes, heard: Complexes, values: Complexes) -> tuple[Complexes, Complexes]:
@@ -310,5 +310,5 @@ def _directions(phases: NDArray[Any], size: Floats) -> NDArray[Any]:
 def _of_eigenvalue(turned: Floats, values: Complexes) -> Floats:
     """Return the angles of eigenvalues with a motion's whole turns, NaN where the motion is another's."""
     principal = np.where(values.imag == 0, np.where(values.real < 0, np.pi, 0.0), np.angle(values))
-    found = principal + 2 * np.pi * np.round((turned - principal) / (2 * np.pi))
-    return np.where(np.abs(turned - found) <= OFF, found, np.nan)
+    result = principal + 2 * np.pi * np.round((turned - principal) / (2 * np.pi))
+    return np.where(np.abs(turned - result) <= OFF, result, np.nan)

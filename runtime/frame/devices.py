@@ -98,12 +98,12 @@ def find_device(
     kind = site.kind
     if not _is_plain(site):
         return f"{kind.name} has a nonlinear loop"
-    found = find_devices(site, parameters, unit_of, listening, part=part, direct=direct)
-    if not found:
+    result = find_devices(site, parameters, unit_of, listening, part=part, direct=direct)
+    if not result:
         return None
-    if len(found) > 1 and any(isinstance(item, Device) for item in found.values()):
-        return f"a hand may hold any of {', '.join(found)} ({kind.name})"
-    text = next(iter(found.values()))
+    if len(result) > 1 and any(isinstance(item, Device) for item in result.values()):
+        return f"a hand may hold any of {', '.join(result)} ({kind.name})"
+    text = next(iter(result.values()))
     return f"{text} ({kind.name})" if isinstance(text, str) else text
 
 
@@ -144,7 +144,7 @@ def find_devices(
     x, u, _, _, p, t = start_arguments(site, exact_numbers(kind, parameters), Fraction, listening)
     peers = kind.parameters.index(PEERS) if PEERS in kind.parameters else None
     over = masses if peers is None else (*masses, peers)
-    found: dict[str, Device | str] = {}
+    result: dict[str, Device | str] = {}
     for place, state in enumerate(kind.states):
         driven = np.flatnonzero(site.pattern.a[place])
         own = _part(state.name)
@@ -172,10 +172,10 @@ def find_devices(
                 continue
             shared = peers if copied[at] else None
             symbolic = _inverse(kind, velocity, masses[mass], at, shared)
-            found[own] = Device(own, place, velocity, inverse, symbolic)
+            result[own] = Device(own, place, velocity, inverse, symbolic)
         elif inverses:
-            found[own] = f"{own} moves with masses that move otherwise, and a hand may hold any of them"
-    return found
+            result[own] = f"{own} moves with masses that move otherwise, and a hand may hold any of them"
+    return result
 
 
 @functools.lru_cache(maxsize=64)
@@ -266,10 +266,10 @@ def find_push(
     for part in (_part(name), name):
         if part not in known:
             known[part] = find_device(site, parameters, unit_of, listening, part=part)
-        found = known[part]
-        if isinstance(found, Device):
-            return Push(found.part, (found.velocity,), (found.inverse,), found.symbolic)
-        why = found
+        text = known[part]
+        if isinstance(text, Device):
+            return Push(text.part, (text.velocity,), (text.inverse,), text.symbolic)
+        why = text
     driven = np.flatnonzero(site.pattern.a[position])
     masses = [
         place
@@ -352,17 +352,17 @@ def devices_of(system: CompiledSystem, *, option: str) -> dict[int, Device]:
     """
     unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
     numbers, direct = resolve(system), coupled_directly(system.kinds)
-    found: dict[int, Device] = {}
+    result: dict[int, Device] = {}
     for place, group in enumerate(system.groups):
         site = jacobians(system.kinds[group.kind])
         device = find_device(site, numbers.parameters[place][0], unit_of, direct=direct)
         if isinstance(device, str):
             raise ApcError(Mistake("E931", Place(system.origin.topology), f"{option}: {device}"))
         if device is not None:
-            found.setdefault(group.kind, device)
-    if not found:
+            result.setdefault(group.kind, device)
+    if not result:
         raise no_device(system, option)
-    return found
+    return result
 
 
 def directions_of(system: CompiledSystem) -> dict[str, CompiledSystem]:
@@ -380,10 +380,10 @@ def directions_of(system: CompiledSystem) -> dict[str, CompiledSystem]:
     wanted: dict[str, None] = {}
     for place, group in enumerate(system.groups):
         site = jacobians(system.kinds[group.kind])
-        found = find_devices(site, numbers.parameters[place][0], unit_of, direct=direct)
-        axes = {own: device for own, device in found.items() if isinstance(device, Device)}
+        result = find_devices(site, numbers.parameters[place][0], unit_of, direct=direct)
+        axes = {own: device for own, device in result.items() if isinstance(device, Device)}
         wholes = {whole_and_index(own)[0] if own.endswith("]") else "" for own in axes}
-        if len(axes) == len(found) > 1 and len(wholes) == 1 and "" not in wholes:
+        if len(axes) == len(result) > 1 and len(wholes) == 1 and "" not in wholes:
             wanted |= dict.fromkeys(own.rpartition(".")[2] for own in axes)
     return {axis: _along(system, [text for text in wanted if text != axis]) for axis in wanted}
 
@@ -442,9 +442,9 @@ def without_hands(system: CompiledSystem, option: str) -> CompiledSystem:
     unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
     kinds = tuple(_without_hands(kind, tuple(map(unit_of.get, kind.parameters))) for kind in system.kinds)
     bare = tuple(item or kind for item, kind in zip(kinds, system.kinds, strict=True))
-    found = replace(system, kinds=bare)
-    refuse_hands(found, option)
-    return found
+    compiled_system = replace(system, kinds=bare)
+    refuse_hands(compiled_system, option)
+    return compiled_system
 
 
 @functools.lru_cache(maxsize=64)
@@ -463,10 +463,10 @@ def _without_hands(kind: Kind, units: tuple[str | None, ...]) -> Kind | None:
                 numbers[place] = casadi.SX(0)
         return kind.derivative(x, u, casadi.vertcat(*numbers), t)
 
-    found = rewritten(replace(kind, hands=()), kind, lambda x, p: x, rates)
-    x, u, p, t = found.derivative.sx_in()
-    left = casadi.depends_on(found.derivative(x, u, p, t), casadi.vertcat(*(p[place] for place in own)))
-    return None if left else found
+    result = rewritten(replace(kind, hands=()), kind, lambda x, p: x, rates)
+    x, u, p, t = result.derivative.sx_in()
+    left = casadi.depends_on(result.derivative(x, u, p, t), casadi.vertcat(*(p[place] for place in own)))
+    return None if left else result
 
 
 def _is_of(name: str, hand: str) -> bool:
@@ -583,11 +583,11 @@ def _without(kind: Kind, position: int, velocity: int) -> Kind:
     start = kind.parameters.index(kind.states[position].start)
 
     def whole(x: Any, p: Any) -> Any:
-        found = [casadi.SX(0)] * len(kind.states)
+        expressions = [casadi.SX(0)] * len(kind.states)
         for number, place in enumerate(kept):
-            found[place] = x[number]
-        found[position] = p[start]
-        return casadi.vertcat(*found)
+            expressions[place] = x[number]
+        expressions[position] = p[start]
+        return casadi.vertcat(*expressions)
 
     def rates(x: Any, u: Any, p: Any, t: Any) -> Any:
         rate = kind.derivative(x, u, p, t)
@@ -658,28 +658,28 @@ def published(name: str) -> dict[str, tuple[str, str, str]]:
     from apc.compiler.components.library import Library
 
     known = Library()
-    found = {
+    result = {
         component_name: ranges
         for component_name in known.component_names
         if (ranges := _ranges(known.component(component_name)))
     }
-    if name not in found:
-        listed = (*HANDS, *found)
+    if name not in result:
+        listed = (*HANDS, *result)
         got = f"{name[:40]} are no hands" if name.strip() else "no hands are named"
         what = f"{got} ({', '.join(listed)})"
         near = nearest(name, listed)
         raise ApcError(Mistake("E930", Place("--hands"), what, hint=f"--hands {near or CLAMPED}"))
-    return found[name]
+    return result[name]
 
 
 def _ranges(component: Component | None) -> dict[str, tuple[str, str, str]]:
     """Return the bounds and defaults of a hand's mass, damping and stiffness, nothing if they have none."""
     numbers = {} if component is None else {number.name: number for number in component.numbers}
-    found = {}
+    result = {}
     for name, unit, _ in _NUMBERS:
         number = numbers.get(name)
         if number is None or number.minimum is None or number.maximum is None or number.default is None:
             return {}
         low, high, usual = (f"{float(v)!r} {unit}" for v in (number.minimum, number.maximum, number.default))
-        found[f"{HAND}.{name}"] = low, high, usual
-    return found
+        result[f"{HAND}.{name}"] = low, high, usual
+    return result

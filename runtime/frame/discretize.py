@@ -173,9 +173,9 @@ def _steps(a: NDArray[Any], b: NDArray[Any], durations: Sequence[Fraction]) -> l
         E806 as `discretize`; E812 too many for balls where floats say too little.
     """
     if len(a) > FEW_TOGETHER:
-        found = _balanced_steps(_floats(a), _floats(b), durations)
-        if found is not None:
-            return found
+        steps = _balanced_steps(_floats(a), _floats(b), durations)
+        if steps is not None:
+            return steps
         if len(a) > MOST_TOGETHER:
             what = (
                 f"{len(a)} states of one peer move together in continuous time, so fast that floats lose "
@@ -190,7 +190,7 @@ def _steps(a: NDArray[Any], b: NDArray[Any], durations: Sequence[Fraction]) -> l
 def _balanced_steps(a: Floats, b: Floats, durations: Sequence[Fraction]) -> list[Step] | None:
     """Return the steps in floats; None where one may be off by much more than composing it rounds."""
     allowed = 2.0 if len(a) <= MOST_TOGETHER else DOUBTFUL
-    found = []
+    steps = []
     for duration in durations:
         with np.errstate(all="ignore"):
             step, units = exponential(a, b, float(duration), rounded=3)
@@ -198,8 +198,8 @@ def _balanced_steps(a: Floats, b: Floats, durations: Sequence[Fraction]) -> list
             largest = np.abs(matrix).max()
             if not size.max() <= allowed * largest < np.inf:
                 return None
-            found.append(Step(units * matrix, units * size + UNDERFLOW, step.roundings))
-    return found
+            steps.append(Step(units * matrix, units * size + UNDERFLOW, step.roundings))
+    return steps
 
 
 def exponential(
@@ -357,14 +357,14 @@ def _whole(step: Matrix) -> Matrix:
 def _phi(x: Matrix) -> Matrix:
     """Return φ₁(X) = I + X/2! + X²/3! + … up to a power."""
     diagonal = np.arange(x.shape[-1])
-    found = x / (TERMS + 1)
+    values = x / (TERMS + 1)
     for term in range(TERMS - 1, -1, -1):
         # In place: a sum with a matrix of mostly zeros takes as long as a product.
-        found[..., diagonal, diagonal] += 1
+        values[..., diagonal, diagonal] += 1
         if term:
-            found = x @ found
-            found /= term + 1
-    return np.asarray(found)
+            values = x @ values
+            values /= term + 1
+    return np.asarray(values)
 
 
 def moved_together(a: NDArray[Any]) -> Iterator[Integers]:
@@ -376,14 +376,14 @@ def moved_together(a: NDArray[Any]) -> Iterator[Integers]:
     left = dict.fromkeys(range(len(a)))
     while left:
         waiting = [next(iter(left))]
-        found = set(waiting)
+        result = set(waiting)
         while waiting:
-            new = neighbours[waiting.pop()] - found
-            found |= new
+            new = neighbours[waiting.pop()] - result
+            result |= new
             waiting += new
-        for item in found:
+        for item in result:
             del left[item]
-        yield np.array(sorted(found), np.int64)
+        yield np.array(sorted(result), np.int64)
 
 
 def step_balls(a: NDArray[Any], b: NDArray[Any], duration: Fraction) -> NDArray[Any]:
@@ -421,10 +421,10 @@ def _generator(a: NDArray[Any], b: NDArray[Any]) -> Any:
 
 def _floats(matrix: NDArray[Any]) -> Floats:
     """Return a matrix of which most is zero in floats."""
-    found = np.zeros(matrix.shape)
+    values = np.zeros(matrix.shape)
     filled = matrix.astype(np.bool_)
-    found[filled] = [float(value) for value in matrix[filled]]
-    return found
+    values[filled] = [float(value) for value in matrix[filled]]
+    return values
 
 
 def _rational(value: Any) -> Any:

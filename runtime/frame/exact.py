@@ -66,9 +66,9 @@ def _row_angle(y: Any, x: Any) -> Any:
 
 def _step(value: Any, slope: Any) -> Any:
     """Return a complex step: a product with 1j would spoil the value where the slope is infinite."""
-    found = np.empty(np.broadcast_shapes(np.shape(value), np.shape(slope)), dtype=np.complex128)
-    found.real, found.imag = value, slope
-    return found
+    values = np.empty(np.broadcast_shapes(np.shape(value), np.shape(slope)), dtype=np.complex128)
+    values.real, values.imag = value, slope
+    return values
 
 
 def _of_real(rule: Callable[..., Any]) -> Callable[..., Any]:
@@ -158,8 +158,8 @@ def evaluate_exact(
         for entry in _of_size(argument, size)
     ]
     constants = map(own.get("const", number), known.constants)
-    found = walk(known, [*entries, *constants], own.__getitem__)
-    return [[found[place] for place in places] for places in known.results]
+    result = walk(known, [*entries, *constants], own.__getitem__)
+    return [[result[place] for place in places] for places in known.results]
 
 
 def _of_size(argument: Sequence[Any], size: int) -> Sequence[Any]:
@@ -195,13 +195,13 @@ def _rules_of(
 ) -> dict[str, Callable[..., Any]]:
     """Return the operations of a kind of number that computes as Python's do."""
     power = functools.partial(_power, number)
-    found: dict[str, Callable[..., Any]] = {**_SHORT, "pow": power, "constpow": power}
-    found["interpolate"] = lambda table, at: table.value(at, number)
-    found["slope"] = lambda table, at: table.slope(at, number)
+    result: dict[str, Callable[..., Any]] = {**_SHORT, "pow": power, "constpow": power}
+    result["interpolate"] = lambda table, at: table.value(at, number)
+    result["slope"] = lambda table, at: table.slope(at, number)
     for name, of_float in ROUNDED.items():
         own = functools.partial(_rounded, number, of_float)
-        found[name] = own if rounded is None else functools.partial(rounded, name)
-    return found
+        result[name] = own if rounded is None else functools.partial(rounded, name)
+    return result
 
 
 def _rounded(number: Callable[[float], Any], of_float: Callable[..., float], *values: Any) -> Any:

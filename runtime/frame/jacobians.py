@@ -50,20 +50,20 @@ def guards_of(expression: Any, moving: Any, *, tables: bool = True) -> list[Any]
     tables
         Whether the rows of tables are told, too.
     """
-    found = []
+    result = []
     for node in _nodes(expression):
         parts = [node.dep(i) for i in range(node.n_dep())]
         code = node.op()
         if code in _BINARY:
-            found.append(parts[0] - parts[1])
+            result.append(parts[0] - parts[1])
         elif code in _UNARY:
-            found.append(parts[0])
+            result.append(parts[0])
         elif code in _STEPS:
             # Changes sign at each whole number, and again half-way, where nothing is split in vain.
-            found.append(_whole(parts[0]))
+            result.append(_whole(parts[0]))
     if tables:
-        found += [_whole(function_of(table.positions())(at)) for table, at in lookups_of(expression)]
-    return [item for item in found if casadi.depends_on(item, moving)]
+        result += [_whole(function_of(table.positions())(at)) for table, at in lookups_of(expression)]
+    return [item for item in result if casadi.depends_on(item, moving)]
 
 
 def lookups_of(expression: Any) -> list[tuple[Interpolation, Any]]:
@@ -200,14 +200,14 @@ def jacobians(kind: Kind) -> SiteJacobians:
 def _patterns(kind: Kind, blocks: Sequence[Any]) -> list[NDArray[np.bool_]]:
     """Return the pattern of each block; of a clock's, of all its variants together."""
     heights = [0, 0, *(len(clock.outputs) for clock in kind.clocks for _ in range(4))]
-    found = []
+    masks = []
     for block, height in itertools.zip_longest(blocks, heights, fillvalue=0):
         pattern = structural_pattern(block)
         if height:
             variants = pattern.reshape(len(pattern) // height, height, pattern.shape[1])
             pattern = np.logical_or.reduce(variants, axis=0)
-        found.append(pattern)
-    return found
+        masks.append(pattern)
+    return masks
 
 
 def edge_name(partition: ClockPartition, receive: Receive) -> str:

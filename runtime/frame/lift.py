@@ -84,8 +84,8 @@ def lift(
     check_packets(schedule)
     durations = step_durations(schedule)
     exact = site if exact is None else exact
-    found = discretize(exact.a, exact.b, [duration * schedule.quantum for duration in durations])
-    return composed_bounded(site, schedule, dict(zip(durations, found, strict=True)))
+    steps = discretize(exact.a, exact.b, [duration * schedule.quantum for duration in durations])
+    return composed_bounded(site, schedule, dict(zip(durations, steps, strict=True)))
 
 
 def check_packets(schedule: Schedule) -> None:
@@ -221,24 +221,24 @@ def _play_again(
 
     def after(later: Matrix, earlier: Matrix) -> Matrix:
         """Return (T, R) of one number of times after another."""
-        found = numbers.multiply(later[..., :n_y], earlier)
-        found[..., n_y:] = numbers.add(found[..., n_y:], later[..., n_y:])
-        return found
+        values = numbers.multiply(later[..., :n_y], earlier)
+        values[..., n_y:] = numbers.add(values[..., n_y:], later[..., n_y:])
+        return values
 
     y = _over(at.moving[..., :n_x, :], [row_of(at, value, 0) for value in needed])
     whole = _often(step, again.count, after)
-    found = numbers.multiply(whole[..., :n], y)
+    values = numbers.multiply(whole[..., :n], y)
     if received is None:
-        heard = found.shape[-1] - n_r
-        found[..., heard:] = numbers.add(found[..., heard:], whole[..., n:])
+        heard = values.shape[-1] - n_r
+        values[..., heard:] = numbers.add(values[..., heard:], whole[..., n:])
     else:
-        found = numbers.add(found, numbers.multiply(whole[..., n:], received))
-    at.moving[..., :n_x, :] = found[..., :n_x, :]
+        values = numbers.add(values, numbers.multiply(whole[..., n:], received))
+    at.moving[..., :n_x, :] = values[..., :n_x, :]
     for place, value in enumerate(again.entering, n_x):
         if value.partition == HELD:
-            at.moving[..., n_x + value.output, :] = found[..., place, :]
+            at.moving[..., n_x + value.output, :] = values[..., place, :]
         else:
-            at.value[named_at(value, again.count)] = found[..., place, :]
+            at.value[named_at(value, again.count)] = values[..., place, :]
 
 
 def _often(step: Matrix, count: int, after: Callable[[Matrix, Matrix], Matrix]) -> Matrix:
@@ -421,11 +421,11 @@ def _beside(*blocks: Matrix) -> Matrix:
 def _over(block: Matrix, rows: Sequence[Matrix]) -> Matrix:
     """Return a block (…, n, columns) over rows (columns,) or (k, columns)."""
     *many, height, columns = block.shape
-    found = np.empty((*many, height + len(rows), columns), dtype=block.dtype)
-    found[..., :height, :] = block
+    values = np.empty((*many, height + len(rows), columns), dtype=block.dtype)
+    values[..., :height, :] = block
     for place, row in enumerate(rows, height):
-        found[..., place, :] = row
-    return found
+        values[..., place, :] = row
+    return values
 
 
 def _received(

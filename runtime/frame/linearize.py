@@ -302,8 +302,8 @@ def linearize_rows(site: SiteJacobians, parameters: NDArray[np.float64]) -> NDAr
     count, function = len(parameters), site.function
     width, places = _output(function)
     rows = np.zeros((count, width))
-    (found,) = of_rows(function, {4: parameters})
-    rows[:, places] = found + 0.0  # −0 and 0 are one number
+    (values,) = of_rows(function, {4: parameters})
+    rows[:, places] = values + 0.0  # −0 and 0 are one number
     return rows
 
 
@@ -340,9 +340,9 @@ def of_rows(function: Any, given: Mapping[int, NDArray[np.float64]]) -> list[NDA
     """
     count = len(next(iter(given.values())))
     sizes, stored = _layout(function)
-    found = [np.empty((count, number)) for number in stored]
-    if not any(values.size for values in found):
-        return found
+    result = [np.empty((count, number)) for number in stored]
+    if not any(values.size for values in result):
+        return result
     # Evaluated where the numbers stand: CasADi's own matrices are copied entry by entry.
     buffer, evaluate = _of_many(function, count).buffer()
     numbers = [np.zeros(max(1, count * size)) for size in sizes]
@@ -350,10 +350,10 @@ def of_rows(function: Any, given: Mapping[int, NDArray[np.float64]]) -> list[NDA
         numbers[place] = np.array(rows, dtype=np.float64, order="C").ravel()
     for place, number in enumerate(numbers):
         buffer.set_arg(place, number.data)
-    for place, rows in enumerate(found):
+    for place, rows in enumerate(result):
         buffer.set_res(place, rows.reshape(-1).data)
     evaluate()
-    return found
+    return result
 
 
 def site_of(site: SiteJacobians, numbers: NDArray[Any]) -> LinearSite:
@@ -362,10 +362,10 @@ def site_of(site: SiteJacobians, numbers: NDArray[Any]) -> LinearSite:
     return assemble(site.kind, site.affine, cut(numbers, site.shapes), channels)
 
 
-def site_of_entries(site: SiteJacobians, found: Sequence[Any], zero: Any) -> LinearSite:
+def site_of_entries(site: SiteJacobians, result: Sequence[Any], zero: Any) -> LinearSite:
     """Return the site of a function's output over another kind of number (see `exact`), with its zero."""
     sparsity = site.function.sparsity_out(0)
     entries = np.empty(sparsity.numel(), dtype=object)
     entries[:] = [zero]
-    entries[sparsity.row()] = found
+    entries[sparsity.row()] = result
     return site_of(site, entries)

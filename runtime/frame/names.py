@@ -154,14 +154,14 @@ def find(system: CompiledSystem, name: str, place: Place = OVERRIDE, *, counts: 
     return Free(name, group)
 
 
-def _of_one_peer(system: CompiledSystem, found: re.Match[str], place: Place) -> ApcError:
+def _of_one_peer(system: CompiledSystem, result: re.Match[str], place: Place) -> ApcError:
     """Return what is told of a value for one peer of a group: `user[1].device.x`."""
-    group, rest = next(group for group in system.groups if group.name == found["group"]), found["rest"]
-    what = f"{found[0]} is of one peer, and a setting is of all or of one group: a list gives each its own"
+    group, rest = next(group for group in system.groups if group.name == result["group"]), result["rest"]
+    what = f"{result[0]} is of one peer, and a setting is of all or of one group: a list gives each its own"
     parameter = next(parameter for parameter in system.parameters if parameter.name == rest)
     own = next((value for value in group.values if value.name == rest), parameter)
     value = with_unit(f"{own.value:.12g}", own.unit)
-    values = [GIVEN if k == int(found["peer"]) else value for k in range(1, group.count + 1)]
+    values = [GIVEN if k == int(result["peer"]) else value for k in range(1, group.count + 1)]
     hint = f"peers: {{{group.name}: {{count: {group.count}, set: {{{rest}: [{', '.join(values)}]}}}}}}"
     if group.count > MOST_LISTED:
         hint = f"peers: {{{group.name}: {{table: users.csv}}}}, a row a peer, and a column of {rest}"
@@ -221,13 +221,13 @@ def notes_for_all_groups(system: CompiledSystem, frees: Iterable[Free]) -> list[
     """Say what groups have now of each parameter that is set for all of them though they differ in it."""
     notes = []
     for free in frees:
-        found = values_by_group(system, free)
-        if free.group is not None or not found:
+        pairs = values_by_group(system, free)
+        if free.group is not None or not pairs:
             continue
         unit = unit_of(system, free.name)
         own = [
             f"{'several values' if value is None else with_unit(f'{value:.6g}', unit)} at {group}"
-            for group, value in found
+            for group, value in pairs
         ]
         notes.append(f"{free.name} is one value for all groups here; the scene has {', '.join(own)}")
     return notes

@@ -62,13 +62,13 @@ def parse_override(system: CompiledSystem, text: str) -> Override:
         ) from None
     unit = unit_of(system, free.name)
     try:
-        found = quantity(value, OVERRIDE, what=name, unit=unit)
+        result = quantity(value, OVERRIDE, what=name, unit=unit)
     except ApcError as error:  # what is to be written is a setting, too
         mistakes = [
             replace(mistake, hint=mistake.hint.replace(f"{name}: ", f"{name}=")) for mistake in error.mistakes
         ]
         raise ApcError(mistakes) from None
-    return Override(free, found.value)
+    return Override(free, result.value)
 
 
 def apply(system: CompiledSystem, overrides: Sequence[Override]) -> CompiledSystem:
@@ -120,7 +120,7 @@ def apply(system: CompiledSystem, overrides: Sequence[Override]) -> CompiledSyst
                 ),
             )
         )
-    found = replace(
+    compiled_system = replace(
         system,
         origin=system.origin.after(*((override.free.label, str(override.value)) for override in overrides)),
         parameters=tuple(_renewed(parameter, common, everywhere) for parameter in system.parameters),
@@ -129,9 +129,9 @@ def apply(system: CompiledSystem, overrides: Sequence[Override]) -> CompiledSyst
         within=tuple(axis for axis in system.within if axis.parameter not in everywhere),
     )
     if counts:
-        found = recounted(found, counts, OVERRIDE)
-    _check_bounds(found)
-    return found
+        compiled_system = recounted(compiled_system, counts, OVERRIDE)
+    _check_bounds(compiled_system)
+    return compiled_system
 
 
 def _counts(system: CompiledSystem, everywhere: Mapping[str, Fraction]) -> dict[str, Fraction]:
@@ -142,8 +142,8 @@ def _counts(system: CompiledSystem, everywhere: Mapping[str, Fraction]) -> dict[
     if scope.needed(wanted).isdisjoint(everywhere):
         return {}
     changed = scope.follow(everywhere, exact_value, lambda name: scope.holder[name].number, wanted)
-    found = {name: changed.get(group_count(name), count) for name, count in now.items()}
-    return found if found != now else {}
+    result = {name: changed.get(group_count(name), count) for name, count in now.items()}
+    return result if result != now else {}
 
 
 def _changed(scope: Scope, given: Mapping[str, Fraction]) -> dict[str, Fraction]:

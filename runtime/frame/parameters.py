@@ -58,12 +58,12 @@ class Scope:
             The names asked for: what none of them follows from is left out. None for all.
         """
         needed = self.formulas.keys() if wanted is None else self.needed(wanted)
-        found = dict(given)
+        result = dict(given)
         for name, formula in self.formulas.items():
-            if name in needed and name not in given and not found.keys().isdisjoint(formula.names):
-                values = [found[name] if name in found else now(name) for name in formula.names]
-                found[name] = compute(name, formula, values)
-        return found
+            if name in needed and name not in given and not result.keys().isdisjoint(formula.names):
+                values = [result[name] if name in result else now(name) for name in formula.names]
+                result[name] = compute(name, formula, values)
+        return result
 
     def needed(self, wanted: Collection[str]) -> set[str]:
         """Return some names, and all that these follow from."""
@@ -130,13 +130,13 @@ def columns_of(
     scope = scope_of(system, group.values, fixed=given)
 
     def compute(name: str, formula: Formula, values: list[Any]) -> Floats:
-        found = np.asarray(_rows(name, formula, values), dtype=np.float64)
-        wrong = np.flatnonzero(~np.isfinite(found))
+        result = np.asarray(_rows(name, formula, values), dtype=np.float64)
+        wrong = np.flatnonzero(~np.isfinite(result))
         if len(wrong):
             where = f"{group.name}[{int(wrong[0]) + (peer or 0) + 1}]"
             what = f"{name} = {formula.text[:80]} has no finite value for {where}"
             raise ApcError(Mistake("E331", OVERRIDE, what))
-        return found
+        return result
 
     return scope.follow(given, compute, lambda name: float(scope.holder[name].value), wanted)
 
@@ -157,10 +157,10 @@ class Numbers:
 
 def resolve(system: CompiledSystem) -> Numbers:
     """Return the numbers of a system. Raises ApcError as `columns_of`."""
-    found = [_different_rows(system, group) for group in system.groups]
+    pairs = [_different_rows(system, group) for group in system.groups]
     return Numbers(
-        parameters=tuple(parameters for parameters, _ in found),
-        rows=tuple(rows for _, rows in found),
+        parameters=tuple(parameters for parameters, _ in pairs),
+        rows=tuple(rows for _, rows in pairs),
         timings={timing.name: timing.value for timing in system.timings},
     )
 
@@ -263,5 +263,5 @@ def free_values(
         with np.errstate(all="ignore"):
             return computed(formula, values_of, rule)
 
-    found = scope.follow(given, compute, now, wanted)
-    return [found[name] if name in found else now(name) for name in wanted]
+    result = scope.follow(given, compute, now, wanted)
+    return [result[name] if name in result else now(name) for name in wanted]

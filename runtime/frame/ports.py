@@ -231,14 +231,14 @@ def _with_clocks(site: LinearSite, kind: Kind, inputs: int, readings: Matrix) ->
 
 def _stopping(schedule: Schedule, at: set[int]) -> list[tuple[int, Event]]:
     """Return a frame's events, each with its instant in quanta, so that propagation stops at some."""
-    found: list[tuple[int, Event]] = []
+    pairs: list[tuple[int, Event]] = []
     now = 0
     for event in schedule.events:
         if not isinstance(event, Propagate):
-            found.append((now, event))
+            pairs.append((now, event))
             continue
         end = now + event.duration
         for stop in sorted({number for number in at if now < number < end} | {end}):
-            found.append((now, Propagate(stop - now)))
+            pairs.append((now, Propagate(stop - now)))
             now = stop
-    return found
+    return pairs

@@ -61,9 +61,9 @@ def common_shape(*shapes: tuple[int, ...]) -> tuple[int, ...]:
 def with_radius(value: Matrix, radius: Matrix) -> Matrix:
     """Return matrices (…, n, m) with their radii (…, 2, n, m)."""
     shape = common_shape(value.shape, radius.shape)
-    found = np.empty((*shape[:-2], 2, *shape[-2:]), dtype=value.dtype)
-    found[..., 0, :, :], found[..., 1, :, :] = value, radius
-    return found
+    values = np.empty((*shape[:-2], 2, *shape[-2:]), dtype=value.dtype)
+    values[..., 0, :, :], values[..., 1, :, :] = value, radius
+    return values
 
 
 def rounded(value: Matrix) -> Matrix:
@@ -111,8 +111,8 @@ def _multiply(left: Matrix, right: Matrix) -> Matrix:
         terms += sides + 2
     charge = (terms + 2) * UNIT / (1 - (terms + 2) * UNIT)
     many = common_shape(a.shape[:-2], b.shape[:-2])
-    found = np.empty((*many, 2 + sides, a.shape[-2], b.shape[-1]), dtype=kind)
-    np.matmul(a, b, out=value_of(found))
+    values = np.empty((*many, 2 + sides, a.shape[-2], b.shape[-1]), dtype=kind)
+    np.matmul(a, b, out=value_of(values))
     # Each radius is as much larger as adding it up may have rounded it down. Of many matrices writing and
     # fetching their numbers takes longer than computing them: nothing is written twice.
     size = np.abs(b)
@@ -120,10 +120,10 @@ def _multiply(left: Matrix, right: Matrix) -> Matrix:
     if sides:
         spread_a, spread_b = spread_of(left), spread_of(right)
         weight += charge * spread_b
-        first = np.matmul(a[..., None, :, :], slopes_of(right), out=slopes_of(found))
+        first = np.matmul(a[..., None, :, :], slopes_of(right), out=slopes_of(values))
         first += slopes_of(left) @ b[..., None, :, :]
     weight += off_b
-    off = np.matmul(np.abs(a), weight, out=radius_of(found))
+    off = np.matmul(np.abs(a), weight, out=radius_of(values))
     if sides:
         off_b = off_b + spread_b
         off += spread_a @ (charge * size + off_b)
@@ -131,19 +131,19 @@ def _multiply(left: Matrix, right: Matrix) -> Matrix:
         size += off_b
         off += off_a @ size
     off *= 1 + 8 * charge
-    return found
+    return values
 
 
 def _added(left: Matrix, right: Matrix, values: Callable[[Matrix, Matrix], Matrix]) -> Matrix:
     """Return the sum or difference of matrices with their radii."""
-    found = values(left, right)  # the radii are added up below
-    value, off = value_of(found), radius_of(found)
+    result = values(left, right)  # the radii are added up below
+    value, off = value_of(result), radius_of(result)
     np.add(radius_of(left), radius_of(right), out=off)
     off += UNIT * np.abs(value)
-    if found.shape[-3] > 2:
-        off += UNIT * spread_of(found)
-    off *= 1 + (found.shape[-3] + 4) * UNIT
-    return found
+    if result.shape[-3] > 2:
+        off += UNIT * spread_of(result)
+    off *= 1 + (result.shape[-3] + 4) * UNIT
+    return result
 
 
 def _exact(value: Matrix) -> Matrix:
@@ -173,11 +173,11 @@ def solve(matrix: Matrix, right: Matrix, numbers: Arithmetic | None = None) -> M
         inverse = np.linalg.inv(value_of(matrix))
     except np.linalg.LinAlgError:
         return None
-    exact, found = numbers.exact(inverse), numbers.exact(inverse @ value_of(right))
-    moved = right[..., 2:, :, :] - matrix[..., 2:, :, :] @ value_of(found)[..., None, :, :]
-    found[..., 2:, :, :] = inverse[..., None, :, :] @ moved
+    exact, values = numbers.exact(inverse), numbers.exact(inverse @ value_of(right))
+    moved = right[..., 2:, :, :] - matrix[..., 2:, :, :] @ value_of(values)[..., None, :, :]
+    values[..., 2:, :, :] = inverse[..., None, :, :] @ moved
     wrong = numbers.subtract(numbers.exact(np.eye(n)), numbers.multiply(exact, matrix))
-    left = numbers.multiply(exact, numbers.subtract(right, numbers.multiply(matrix, found)))
+    left = numbers.multiply(exact, numbers.subtract(right, numbers.multiply(matrix, values)))
     off = _most(left) + np.finfo(np.float64).tiny
     size = _most(wrong) * (1 + n * UNIT)
     try:
@@ -186,14 +186,14 @@ def solve(matrix: Matrix, right: Matrix, numbers: Arithmetic | None = None) -> M
     except np.linalg.LinAlgError:
         return None
     serves = (bound > 0) & ((off + size @ bound) * (1 + (n + 4) * UNIT) <= bound)
-    radius_of(found)[...] = bound
-    return found if serves.all() else None
+    radius_of(values)[...] = bound
+    return values if serves.all() else None
 
 
 def _most(matrix: Matrix) -> Matrix:
     """Return the largest magnitudes of entries (…, n, m) within their radii, wherever in a cell."""
-    found = np.abs(value_of(matrix)) + radius_of(matrix).real + spread_of(matrix)
-    return np.asarray(found * (1 + matrix.shape[-3] * UNIT))
+    result = np.abs(value_of(matrix)) + radius_of(matrix).real + spread_of(matrix)
+    return np.asarray(result * (1 + matrix.shape[-3] * UNIT))
 
 
 def _solve_floats(matrix: Matrix, right: Matrix) -> Matrix | None:

@@ -40,12 +40,12 @@ def remembered(values: Iterable[Value], ticks: Sequence[int]) -> tuple[Value, ..
     A value read at index −j is, one frame before, the value of index n − j; if that is negative too, it is
     remembered as well.
     """
-    found: set[Value] = set()
+    result: set[Value] = set()
     for value in values:
         while value.index < 0:
-            found.add(value)
+            result.add(value)
             value = shifted(value, ticks)
-    return tuple(sorted(found))
+    return tuple(sorted(result))
 
 
 @dataclass(frozen=True, slots=True, order=True)

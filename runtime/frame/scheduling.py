@@ -519,15 +519,15 @@ def _longest_run(forms: Sequence[Hashable]) -> tuple[int, int, int]:
             for place, form in enumerate(forms)
         ]
     )
-    best, found = 0, (0, 1, 1)
+    best, result = 0, (0, 1, 1)
     for length in range(1, min(len(codes) // 2, MOST_REPEATED) + 1):
         same = np.concatenate([[False], codes[length:] == codes[:-length], [False]])
         edges = np.flatnonzero(same[1:] != same[:-1])
         for start, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
             count = (end - start) // length + 1
             if (count - 1) * length > best:
-                best, found = (count - 1) * length, (start, length, count)
-    return found
+                best, result = (count - 1) * length, (start, length, count)
+    return result
 
 
 def _value_name(pattern: LinearSite, value: Value, times: Times) -> str:

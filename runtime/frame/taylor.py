@@ -52,8 +52,8 @@ def taylor(parameters: int) -> Arithmetic:
     def bounded(value: Matrix, off: Matrix) -> Matrix:
         return within(with_radius(value, off), parameters)
 
-    found = replace(RADII, exact=exact, bounded=bounded)
-    return replace(found, solve=lambda matrix, right: solve(matrix, right, found))
+    arithmetic = replace(RADII, exact=exact, bounded=bounded)
+    return replace(arithmetic, solve=lambda matrix, right: solve(matrix, right, arithmetic))
 
 
 def arithmetic_of(matrix: Matrix) -> Arithmetic:
@@ -76,11 +76,11 @@ def entrywise(left: Matrix, right: Matrix) -> Matrix:
     a, b, off_a, off_b = value_of(left), value_of(right), radius_of(left), radius_of(right)
     spread_a, spread_b, size_a, size_b = spread_of(left), spread_of(right), np.abs(a), np.abs(b)
     first = slopes_of(left) * b[..., None, :, :], a[..., None, :, :] * slopes_of(right)
-    found = np.concatenate([(a * b)[..., None, :, :]] * 2 + [first[0] + first[1]], axis=-3)
+    values = np.concatenate([(a * b)[..., None, :, :]] * 2 + [first[0] + first[1]], axis=-3)
     off = spread_a * spread_b + (size_a + spread_a) * off_b + off_a * (size_b + spread_b + off_b)
     off += (count + 2) * UNIT * (size_a * size_b + spread_a * size_b + size_a * spread_b)
-    radius_of(found)[...] = off * (1 + (count + 8) * UNIT)
-    return found
+    radius_of(values)[...] = off * (1 + (count + 8) * UNIT)
+    return values
 
 
 def within(matrix: Matrix, parameters: int) -> Matrix:
@@ -99,11 +99,11 @@ def hull(matrix: Matrix) -> Matrix:
 
 def corners(matrix: Matrix) -> list[Matrix]:
     """Return matrices over cells at each corner of these, with their radii (…, 2, n, m)."""
-    found = [matrix[..., :2, :, :]]
+    result = [matrix[..., :2, :, :]]
     for by in range(2, matrix.shape[-3]):
         slope = RADII.exact(matrix[..., by, :, :])
-        found = [turn(values, slope) for values in found for turn in (RADII.add, RADII.subtract)]
-    return found
+        result = [turn(values, slope) for values in result for turn in (RADII.add, RADII.subtract)]
+    return result
 
 
 def reciprocal(number: Matrix) -> Matrix:
@@ -114,13 +114,13 @@ def reciprocal(number: Matrix) -> Matrix:
     1/x = 1/v − (x − v)/v² + (x − v)²/(v² x).
     """
     value, spread = np.abs(value_of(number)), spread_of(number) + radius_of(number)
-    found = number / -np.square(value_of(number))[..., None, :, :]
-    value_of(found)[...] = 1 / value_of(number)
+    values = number / -np.square(value_of(number))[..., None, :, :]
+    value_of(values)[...] = 1 / value_of(number)
     apart = value - spread * (1 + 8 * UNIT)
     off = radius_of(number) + spread * np.where(apart > 0, spread / apart, np.inf)
-    off = off / np.square(value) + 8 * UNIT * (1 / value + spread_of(found))
-    radius_of(found)[...] = off * (1 + 64 * UNIT)
-    return found
+    off = off / np.square(value) + 8 * UNIT * (1 / value + spread_of(values))
+    radius_of(values)[...] = off * (1 + 64 * UNIT)
+    return values
 
 
 def step_over(a: Matrix, b: Matrix, seconds: float) -> Matrix:
@@ -159,7 +159,7 @@ def step_over(a: Matrix, b: Matrix, seconds: float) -> Matrix:
 
 def _scaled(matrix: Matrix, factor: float) -> Matrix:
     """Return matrices over cells times a number that is off by one rounding."""
-    found = matrix * factor
-    radius_of(found)[...] += 2 * UNIT * (np.abs(value_of(found)) + spread_of(found))
-    radius_of(found)[...] *= 1 + (found.shape[-3] + 4) * UNIT
-    return found
+    values = matrix * factor
+    radius_of(values)[...] += 2 * UNIT * (np.abs(value_of(values)) + spread_of(values))
+    radius_of(values)[...] *= 1 + (values.shape[-3] + 4) * UNIT
+    return values

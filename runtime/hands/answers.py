@@ -82,8 +82,8 @@ def responses(system: CompiledSystem, prepared: Prepared, port: Port, other: Por
             named = item.part or (port.part if along else "")
             held[item] = device = _held_device(system, prepared, group, named, unit_of)
         if device is None:
-            found = find_device(group.jacobians, group.parameters, unit_of, group.listening, direct=direct)
-            device = found if isinstance(found, Device) else None
+            result = find_device(group.jacobians, group.parameters, unit_of, group.listening, direct=direct)
+            device = result if isinstance(result, Device) else None
         _check_kicks(system, group)
         own, site = open_site(group, device)
         opened.append(own)
@@ -138,10 +138,10 @@ def held_names(system: CompiledSystem, prepared: Prepared) -> list[str]:
     return [
         f"{group.name}[1].{part}"
         for place, group in enumerate(system.groups)
-        for part, found in find_devices(
+        for part, result in find_devices(
             prepared.jacobians[group.kind], numbers.parameters[place][0], unit_of, direct=direct
         ).items()
-        if isinstance(found, Device)
+        if isinstance(result, Device)
     ]
 
 
@@ -244,19 +244,19 @@ class Responses:
         turns = s.imag * self.frame / (2 * np.pi)
         near = (np.abs(turns - np.round(turns)) < NEAR) & (turns > 0.5)
         near = near & self.drifting if near.any() else near
-        found = [(np.zeros(len(s), np.complex128), np.zeros(len(s))) for _ in range(len(aliases) + 2)]
+        pairs = [(np.zeros(len(s), np.complex128), np.zeros(len(s))) for _ in range(len(aliases) + 2)]
         if not near.all():
-            for (value, off), (own, doubt) in zip(found, self.at(s[~near], aliases), strict=True):
+            for (value, off), (own, doubt) in zip(pairs, self.at(s[~near], aliases), strict=True):
                 value[~near], off[~near] = own, doubt
         around = ASIDE * np.exp(2j * np.pi * (np.arange(AROUND) + 0.5) / AROUND)
         for place in np.flatnonzero(near):
             circles = self.at(s[place] + np.concatenate([2 * around, around]), aliases)
-            for (value, off), (own, doubt) in zip(found, circles, strict=True):
+            for (value, off), (own, doubt) in zip(pairs, circles, strict=True):
                 inner = own[AROUND:]
                 pole = abs((inner * around).mean()) / ASIDE
                 value[place] = inner.mean()
                 off[place] = abs(own[:AROUND].mean() - value[place]) + pole + doubt.max()
-        return found
+        return pairs
 
     def at(self, s: Complex, aliases: Sequence[int] = (0,), *, apart: bool = True) -> list[Carried]:
         """Return the velocity here at each alias, the velocity there, and the copy's error (k,).
@@ -265,7 +265,7 @@ class Responses:
         """
         asked = [(self.velocity, alias) for alias in aliases]
         asked += [(self.arriving, 0), (self.error if apart else ({}, {}), 0)]
-        found: list[Matrix] = [np.zeros((len(s), 2, 1, 1), np.complex128) for _ in asked]
+        matrices: list[Matrix] = [np.zeros((len(s), 2, 1, 1), np.complex128) for _ in asked]
         for part, (number, site, share) in enumerate(self.parts):
             rows = [
                 (of, (*place, alias), weight)
@@ -275,10 +275,10 @@ class Responses:
             moved = spectra(self.loops[number], site, [row for _, row, _ in rows], s)
             for (of, _, weight), matrix in zip(rows, moved, strict=True):
                 by = np.array([[weight * share]])
-                found[of] = RADII.add(
-                    found[of], RADII.multiply(matrix, with_radius(by, 8 * UNIT * np.abs(by)))
+                matrices[of] = RADII.add(
+                    matrices[of], RADII.multiply(matrix, with_radius(by, 8 * UNIT * np.abs(by)))
                 )
-        return [(matrix[:, 0, 0, 0], matrix[:, 1, 0, 0].real) for matrix in found]
+        return [(matrix[:, 0, 0, 0], matrix[:, 1, 0, 0].real) for matrix in matrices]
 
     @property
     def velocity(self) -> Weights:

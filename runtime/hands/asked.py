@@ -151,16 +151,16 @@ def next_peer(system: CompiledSystem, port: Port) -> int:
     return (port.peer + 1) % sum(group.count for group in system.groups)
 
 
-def check_frequencies(system: CompiledSystem, found: Floats) -> None:
+def check_frequencies(system: CompiledSystem, values: Floats) -> None:
     """Refuse frequencies that no response is told of: ApcError E935."""
     most = _fastest(system) / 2
     place = Place(system.origin.topology)
     hint = f"{no_more(most)} Hz at most"
-    if not found.size or not np.isfinite(found).all() or found.min() <= 0:
-        got = "none" if not found.size else f"{found.min():.6g} Hz"
+    if not values.size or not np.isfinite(values).all() or values.min() <= 0:
+        got = "none" if not values.size else f"{values.min():.6g} Hz"
         raise ApcError(Mistake("E935", place, "a frequency", "above 0 Hz", got, "0.1 Hz"))
-    if found.max() > most:
-        what = f"{found.max():.6g} Hz is beyond half the fastest clock: samples take it for a slower one"
+    if values.max() > most:
+        what = f"{values.max():.6g} Hz is beyond half the fastest clock: samples take it for a slower one"
         raise ApcError(Mistake("E935", place, what, hint=hint))
 
 

@@ -182,18 +182,18 @@ def feel(
         E931 a peer without a device; E934 an unstable scene; E935 a frequency beyond half the fastest clock,
         or none above 0; E936 a name that means nothing; E933 a scene too large.
     """
-    found = np.asarray(frequencies, dtype=np.float64).ravel()
+    result = np.asarray(frequencies, dtype=np.float64).ravel()
     prepared = prepared or prepare(system)
     named = [] if at else held_names(system, prepared)
     port = find_port(system, at or next(iter(named), ""), "--at")
     other = find_port(system, between, "--between") if between else Port(next_peer(system, port), "")
-    check_frequencies(system, found)
+    check_frequencies(system, result)
     verdict = judge(system, prepared=prepared)
     if verdict.stable is False and not unstable:
         raise _unstable(system, verdict.spectral_radius)
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         answers = responses(system, prepared, port, other)
-        s = np.asarray(2j * np.pi * found, dtype=np.complex128)
+        s = np.asarray(2j * np.pi * result, dtype=np.complex128)
         own, *aliases, across, error = answers.steady(s, ALIASES)
         values = 1 / own[0]
         alias = np.max([np.abs(value) for value, _ in aliases], axis=0) / np.abs(own[0])
@@ -203,7 +203,7 @@ def feel(
         steady = verdict.stable is not False
         slow = _slow(answers) if "low_frequency" in beside else None
         viscosity = _viscosity(system, slow, port, other) if slow and "network_viscosity" in beside else None
-        hinf = _extremes(answers, found) if "hinf" in beside else ()
+        hinf = _extremes(answers, result) if "hinf" in beside else ()
         h2 = _noise(system, answers) if steady and "h2" in beside else ()
     linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
     here, there = (
@@ -227,7 +227,7 @@ def feel(
         at=here,
         between="" if there == here else there,
         copy=answers.copy,
-        frequency_hz=found,
+        frequency_hz=result,
         impedance=values,
         transmitted_admittance=across[0],
         error_per_force=error[0],
@@ -282,22 +282,22 @@ def _slow(felt: Responses) -> Slow | None:
         (velocity, off), *_ = felt.at(s, apart=False)
         values, powers = s / velocity, radius ** np.arange(3)
         doubt = float((np.abs(values) * off / np.abs(velocity)).max())
-        found = np.array([(values / s**power).mean().real for power in range(3)])
+        result = np.array([(values / s**power).mean().real for power in range(3)])
         if before is not None:
             inside = max(abs((values * (s / radius) ** power).mean()) for power in (1, 2, 3))
-            off = np.abs(found - before) + (doubt + inside) / powers
+            off = np.abs(result - before) + (doubt + inside) / powers
             # At this speed, none matters that is far smaller than the largest.
-            share = float((off * powers).max() / np.abs(found * powers).max())
+            share = float((off * powers).max() / np.abs(result * powers).max())
             if share < least and inside <= DOUBTED * doubt:
-                least, (k, b, m), (off_k, off_b, off_m) = share, found.tolist(), off.tolist()
+                least, (k, b, m), (off_k, off_b, off_m) = share, result.tolist(), off.tolist()
                 best = Slow(m, b, k, (off_m, off_b, off_k))
-        before, radius = found, radius / 2
+        before, radius = result, radius / 2
     return best
 
 
 def _extremes(felt: Responses, frequency_hz: Floats) -> tuple[Extremes, ...]:
     """Return the H∞ norms, and gains at frequencies (k,), of the modes that the pushed peer is in."""
-    found, copy = [], felt.copies[felt.own]
+    result, copy = [], felt.copies[felt.own]
     for number, site, _ in felt.parts:
         loop, basis = felt.loops[number], felt.bases[number]
         rows = [("velocity", felt.device.velocity)]
@@ -305,8 +305,8 @@ def _extremes(felt: Responses, frequency_hz: Floats) -> tuple[Extremes, ...]:
             rows.append(("error", copy[1]))
         for name, row in rows:
             own = (loop, site, site, row, basis)
-            found.append(Extremes(loop.name, name, tick_peak(*own), *sampled_data_peak(*own, frequency_hz)))
-    return tuple(found)
+            result.append(Extremes(loop.name, name, tick_peak(*own), *sampled_data_peak(*own, frequency_hz)))
+    return tuple(result)
 
 
 def _noise(system: CompiledSystem, felt: Responses) -> tuple[Noise, ...]:
@@ -314,13 +314,13 @@ def _noise(system: CompiledSystem, felt: Responses) -> tuple[Noise, ...]:
     ticks = ticks_in(system, felt.frame)
     if ticks is None:
         return ()
-    found = []
+    noises = []
     for source, sensors in (("hands", False), ("sensors", True)):
         velocity = _variance(felt, ticks, felt.velocity, sensors=sensors)
         error = _variance(felt, ticks, felt.error, sensors=sensors)
         (error_m, error_off), (velocity_m_s, velocity_off) = map(_rms, (error, velocity))
-        found.append(Noise(source, error_m, velocity_m_s, (error_off, velocity_off)))
-    return tuple(found)
+        noises.append(Noise(source, error_m, velocity_m_s, (error_off, velocity_off)))
+    return tuple(noises)
 
 
 def _rms(variance: tuple[float, float] | None) -> tuple[float, float] | tuple[None, None]:
@@ -347,8 +347,8 @@ def _variance(
         sources = {site: share} if number else {place: 1 / felt.members[place] for place in held}
         if outputs:
             loop, basis = felt.loops[number], felt.bases[number]
-            found = noise_variance(loop, ticks, sources, outputs, basis, sensors=sensors)
-            if found is None:
+            pair = noise_variance(loop, ticks, sources, outputs, basis, sensors=sensors)
+            if pair is None:
                 return None
-            total, off = total + found[0], off + found[1]
+            total, off = total + pair[0], off + pair[1]
     return total, off + 2 * UNIT * total

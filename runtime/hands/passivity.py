@@ -282,22 +282,22 @@ def loop_growths(system: CompiledSystem, prepared: Prepared, *, bounded: bool = 
         return [growth for part in parts for growth in part]
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         loops = port_loops(system, prepared, option=OPTION)
-        found, scale = [(-np.inf, -np.inf, -np.inf)], 1.0
+        result, scale = [(-np.inf, -np.inf, -np.inf)], 1.0
         if not isinstance(loops, str):
-            found = [
+            result = [
                 _bounds(loop)[:3] if bounded else (-np.inf if circulates(loop) else _least(loop)[0],) * 3
                 for loop in loops
             ]
             scale = max(float(damping) for loop in loops for damping in loop.dampings) or 1.0
-    worst = min(found)
+    worst = min(result)
     if (
         bounded
         and np.isneginf(worst[0])
-        and not np.isneginf(min(most for *_, most in found))
+        and not np.isneginf(min(most for *_, most in result))
         and analyze(clamped(system, option=OPTION)).stable is False
     ):
-        found.append((-np.inf, -np.inf, -np.inf))  # floats alone said so
-    return [_growth(scale, *item) for item in found]
+        result.append((-np.inf, -np.inf, -np.inf))  # floats alone said so
+    return [_growth(scale, *item) for item in result]
 
 
 def _growth(scale: float, *spare: float) -> Growth:
@@ -429,13 +429,13 @@ def frequency_of(loop: PortLoop, angle: float) -> float:
     """
     moved = _worst(loop, complex(np.exp(1j * angle))) * np.sqrt(loop.seconds)
     most = round(loop.frame_s / float(loop.seconds.min()) / 2) + 1
-    found = sorted(angle + 2 * np.pi * turn for turn in range(-most, most + 1))
-    found.sort(key=abs)  # of two that can't be told apart, the slower
+    values = sorted(angle + 2 * np.pi * turn for turn in range(-most, most + 1))
+    values.sort(key=abs)  # of two that can't be told apart, the slower
     # A device moves evenly through each interval: how much of that is at a frequency, over all devices.
     middles, device = loop.starts + loop.seconds / 2, np.cumsum(loop.starts == 0) - 1
     each = device == np.arange(device[-1] + 1)[:, None]
-    turned = np.outer(found, middles) / loop.frame_s
-    shares = np.sinc(np.outer(found, loop.seconds) / (2 * np.pi * loop.frame_s))
+    turned = np.outer(values, middles) / loop.frame_s
+    shares = np.sinc(np.outer(values, loop.seconds) / (2 * np.pi * loop.frame_s))
     fits = np.linalg.norm((np.exp(-1j * turned) * shares * moved) @ each.T, axis=1)
-    best = next(value for value, fit in zip(found, fits, strict=True) if fit >= max(fits) * (1 - ALIKE))
+    best = next(value for value, fit in zip(values, fits, strict=True) if fit >= max(fits) * (1 - ALIKE))
     return abs(best) / (2 * np.pi * loop.frame_s)

@@ -148,13 +148,13 @@ def port_loops(system: CompiledSystem, prepared: Prepared, *, option: str) -> tu
     if not touched:
         raise no_device(system, option)
     loops, weighted = _loops(system, ported, exchange, option=option)
-    found = []
+    result = []
     for loop in loops:
         # A loop in which nothing is held is one of the scene with its devices clamped.
         if any(id(site.schedule) in touched for site in loop.sites):
             together = weighted and len(loop.sites) > 1
-            found.append(_port_loop(loop, touched, together=together, place=place, option=option))
-    return tuple(found)
+            result.append(_port_loop(loop, touched, together=together, place=place, option=option))
+    return tuple(result)
 
 
 def _felt_velocity(group: PeerGroup, device: Device, heard: Set[tuple[str, int]]) -> str:
@@ -208,7 +208,7 @@ def _touched(group: PeerGroup, device: Device) -> _Touched:
 
 def _boundaries(site: LinearSite, schedule: Schedule, device: Device) -> list[int]:
     """Return the instants, in quanta, at which a device is sampled or a force on it switches, and 0."""
-    found, now, counts = {0}, 0, False
+    numbers, now, counts = {0}, 0, False
     for event in schedule.events:
         match event:
             case Propagate(duration):
@@ -220,8 +220,8 @@ def _boundaries(site: LinearSite, schedule: Schedule, device: Device) -> list[in
             case Act(hold, _):
                 counts = bool(site.b[device.velocity, hold])
         if not isinstance(event, Propagate) and counts and now < schedule.frame:
-            found.add(now)
-    return sorted(found)
+            numbers.add(now)
+    return sorted(numbers)
 
 
 def _driven(site: LinearSite, device: Device) -> LinearSite:
@@ -235,12 +235,12 @@ def _driven(site: LinearSite, device: Device) -> LinearSite:
         ticks=tuple(replace(tick, x=tick.x[:, kept]) for tick in site.ticks),
         sends=tuple(replace(send, x=send.x[:, kept]) for send in site.sends),
     )
-    found = with_holds(smaller, np.zeros((len(kept), 1), dtype=site.b.dtype))
-    for tick, whole in zip(found.ticks, site.ticks, strict=True):
+    linear_site = with_holds(smaller, np.zeros((len(kept), 1), dtype=site.b.dtype))
+    for tick, whole in zip(linear_site.ticks, site.ticks, strict=True):
         tick.u[:, -1] = whole.x[:, device.position]
-    for send, sent in zip(found.sends, site.sends, strict=True):
+    for send, sent in zip(linear_site.sends, site.sends, strict=True):
         send.u[:, -1] = sent.x[:, device.position]
-    return found
+    return linear_site
 
 
 def _loops(
@@ -371,16 +371,16 @@ def reciprocal(static: Matrix, counts: Sequence[int]) -> Floats:
     """
     value = value_of(static)
     felt = np.abs(value) > radius_of(static)
-    found = np.zeros(len(counts))
+    values = np.zeros(len(counts))
     for start, count in enumerate(counts):
-        if found[start]:
+        if values[start]:
             continue
-        found[start], waiting = count, [start]
+        values[start], waiting = count, [start]
         while waiting:
             g = waiting.pop()
-            for h in np.flatnonzero(felt[g] & felt[:, g] & (found == 0)).tolist():
+            for h in np.flatnonzero(felt[g] & felt[:, g] & (values == 0)).tolist():
                 ratio = value[g, h] / value[h, g]
-                found[h] = found[g] * ratio if ratio > 0 else counts[h]
+                values[h] = values[g] * ratio if ratio > 0 else counts[h]
                 waiting.append(h)
-    even = found * counts[0] / found[0] / counts
-    return np.array(counts, dtype=np.float64) if np.abs(even - 1).max() <= EVEN else found
+    even = values * counts[0] / values[0] / counts
+    return np.array(counts, dtype=np.float64) if np.abs(even - 1).max() <= EVEN else values

@@ -106,8 +106,8 @@ def open_site(group: PeerGroup, device: Device | None) -> tuple[PeerGroup, Site]
     (site, exact), full, ports = with_ports(sites, schedule, n_x + 1, at, readings, at)
     check_packets(full)
     durations = step_durations(full)
-    found = discretize(group.exact.a, group.exact.b, [duration * full.quantum for duration in durations])
-    kicked = [_with_kicks(step, n_x) for step in found]
+    steps = discretize(group.exact.a, group.exact.b, [duration * full.quantum for duration in durations])
+    kicked = [_with_kicks(step, n_x) for step in steps]
     lifted = composed_bounded(site, full, dict(zip(durations, kicked, strict=True)))
     charge = COEFFICIENT_ROUNDINGS * UNIT
     push = np.zeros((2, n_x))
@@ -210,11 +210,11 @@ def spectra(loop: Pushed, pushed: int, wanted: Sequence[tuple[int, int, int]], s
         kicks[:, :, loop.kicks[pushed][place, :-1]] = turned
     state = _steady(loop.m, _exponential(s, loop.frame), RADII.multiply(loop.k, kicks))
     read = RADII.add(RADII.multiply(loop.c, state), RADII.multiply(loop.d, kicks))
-    found = {
+    result = {
         (of, alias): _motion(loop, of, read, s, alias, pushed=of == pushed)
         for of, alias in {(of, alias) for of, _, alias in wanted}
     }
-    return [found[of, alias][:, :, row, None] for of, row, alias in wanted]
+    return [result[of, alias][:, :, row, None] for of, row, alias in wanted]
 
 
 def _motion(loop: Pushed, of: int, read: Matrix, s: Complex, alias: int, *, pushed: bool) -> Matrix:
@@ -266,10 +266,10 @@ def _kick(site: Site, seconds: Fraction, s: Complex) -> Matrix:
     lanes = with_radius(step.matrix[0, :n, n:], step.roundings * UNIT * step.size[0, :n, n:])
     powers = ((s * time)[:, None] ** np.arange(terms))[..., None]
     doubt = (3 * np.arange(terms)[:, None] + 4) * UNIT * np.abs(powers)
-    found = RADII.multiply(lanes, with_radius(powers, doubt))
+    values = RADII.multiply(lanes, with_radius(powers, doubt))
     left = term * np.exp(size) * np.abs(value_of(lanes)[:, 0]) * (1 + np.abs(value_of(site.a) * time).sum())
-    found[:, 1, :, 0] += left
-    return found
+    values[:, 1, :, 0] += left
+    return values
 
 
 def force_lanes(site: Site, seconds: float, count: int) -> Step:
@@ -297,15 +297,15 @@ def force_lanes(site: Site, seconds: float, count: int) -> Step:
 def _steady(matrix: Matrix, at: Matrix, driven: Matrix) -> Matrix:
     """Return x (k, 2, n, 1) of (z − M) x = driven, for z (k, 2, 1, 1) and M (2, n, n) with their radii."""
     n = matrix.shape[-1]
-    found = None
+    values = None
     if len(at) * n**2 <= TOGETHER or len(at) == 1:
-        found = solve(RADII.subtract(at * np.eye(n), matrix), driven)
-    if found is None and len(at) > 1:
+        values = solve(RADII.subtract(at * np.eye(n), matrix), driven)
+    if values is None and len(at) > 1:
         half = len(at) // 2
-        found = np.concatenate(
+        values = np.concatenate(
             [_steady(matrix, at[own], driven[own]) for own in (slice(half), slice(half, None))]
         )
-    if found is None:  # z is an eigenvalue, for all that is known
-        found = np.full(driven.shape, np.nan + 0j)
-        found[:, 1] = np.inf
-    return np.asarray(found)
+    if values is None:  # z is an eigenvalue, for all that is known
+        values = np.full(driven.shape, np.nan + 0j)
+        values[:, 1] = np.inf
+    return np.asarray(values)

@@ -89,8 +89,8 @@ def parts_in(
     """
     shape = function.transfer.shape
     exponents = np.concatenate([np.arange(function.smooth.shape[1] - len(function.lags)), function.lags])
-    found = RADII.multiply(powers(points, reach, exponents), function.smooth).swapaxes(0, 1)
-    series, hearing = np.split(found.astype(np.complex128), 2, axis=-1)
+    values = RADII.multiply(powers(points, reach, exponents), function.smooth).swapaxes(0, 1)
+    series, hearing = np.split(values.astype(np.complex128), 2, axis=-1)
     answer = series.reshape(len(points), 3, *shape)
     add_fractions(function.transfer, answer, points, reach, bounded=bounded)
     return answer, hearing.reshape(len(points), 3, *shape[::-1])
@@ -125,8 +125,8 @@ def characteristic_ball(function: Characteristic, points: Complexes, reach: Floa
         The discs (z,).
     """
     with np.errstate(all="ignore"):
-        found = matrices_in(function, points, reach)
-    return determinant_ball(found[:, 0], found[:, 2], found[:, 1].real, np.ones(len(points)))
+        matrix = matrices_in(function, points, reach)
+    return determinant_ball(matrix[:, 0], matrix[:, 2], matrix[:, 1].real, np.ones(len(points)))
 
 
 def refine(
@@ -134,7 +134,7 @@ def refine(
     starts: Sequence[complex] | Complexes,
     *,
     poles: Complexes,
-    found: Complexes | None = None,
+    zeros: Complexes | None = None,
 ) -> Complexes:
     """Return zeros of f by Newton's method from many starts; where it does not arrive, NaN.
 
@@ -147,7 +147,7 @@ def refine(
     poles
         Poles of f to take out (m,), with their conjugates: Newton's method on Π (ζ − p) f, which they no
         longer turn away.
-    found
+    zeros
         Zeros that are known, taken out with their conjugates (Maehly), so that others are found.
     """
     points = np.array(starts, dtype=np.complex128)
@@ -155,7 +155,7 @@ def refine(
     active = np.flatnonzero(np.isfinite(points))
     farthest = FARTHEST * float(np.abs(poles).max(initial=1.0))
     out, known = (
-        _whole(np.zeros(0, np.complex128) if values is None else values) for values in (poles, found)
+        _whole(np.zeros(0, np.complex128) if values is None else values) for values in (poles, zeros)
     )
     with np.errstate(all="ignore"):
         for _ in range(STEPS):
@@ -188,8 +188,8 @@ def _whole(upper: Complexes) -> Complexes:
 
 def _log_rate(function: Characteristic, points: Complexes) -> Complexes:
     """Return f′/f = tr((I − T W)⁻¹ (I − T W)′), infinite at a zero."""
-    found = matrices_in(function, points, np.full(len(points), POINT), bounded=False)
-    matrix, change = found[:, 0], found[:, 2] / POINT
+    result = matrices_in(function, points, np.full(len(points), POINT), bounded=False)
+    matrix, change = result[:, 0], result[:, 2] / POINT
     sign, _ = np.linalg.slogdet(matrix)
     fine = np.abs(sign) > 0.5
     # A zero to the last digit is arrived at; on a pole nothing is known.

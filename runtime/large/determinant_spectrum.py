@@ -162,15 +162,15 @@ def _delay_starts(function: Characteristic) -> Complexes:
 
 def _common_starts(members: Sequence[Member]) -> Complexes:
     """Return the eigenvalues of populations of copies of one peer, for some peers: all moving alike."""
-    found = [np.zeros(0, np.complex128)]
+    result = [np.zeros(0, np.complex128)]
     for member in members:
         few = np.unique(np.linspace(0, len(member.sites.counts) - 1, SAMPLES).astype(np.int64))
         some = member.sites.maps.mapped(lambda block, few=few: block[few])
         alike = hear_themselves(some, member.schedule, member.alike, 0 * member.alike)
         values = np.linalg.eigvals(value_of(alike.p)).astype(np.complex128).ravel()
         kept = (values.imag >= 0) & (np.abs(values) > LEAST_START) & (np.abs(values - 1) > SAME_START)
-        found.append(values[kept])
-    return np.concatenate(found)
+        result.append(values[kept])
+    return np.concatenate(result)
 
 
 def _own_mode(members: Sequence[Member], zero: Zero) -> Mode:
@@ -318,17 +318,17 @@ def _waiting(
         The oldest, and of which row of s.
     """
     ages = np.arange(1, depth + 1)
-    found = np.zeros((depth, len(felt)), np.complex128)
+    values = np.zeros((depth, len(felt)), np.complex128)
     for lag, weight in weights.items():
-        found[:lag] += (value ** (ages[:lag] - lag - 1.0))[:, None] * (felt @ weight[:, row])
-    return found
+        values[:lag] += (value ** (ages[:lag] - lag - 1.0))[:, None] * (felt @ weight[:, row])
+    return values
 
 
 def _with_conjugates(modes: Iterable[Mode]) -> tuple[Mode, ...]:
     """Return modes with the conjugate of each that is complex."""
-    found = []
+    result = []
     for mode in modes:
-        found.append(mode)
+        result.append(mode)
         if mode.eigenvalue.imag:
-            found.append(replace(mode, eigenvalue=mode.eigenvalue.conjugate()))
-    return tuple(found)
+            result.append(replace(mode, eigenvalue=mode.eigenvalue.conjugate()))
+    return tuple(result)

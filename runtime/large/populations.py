@@ -98,7 +98,7 @@ def populations(
     needed = ENTRY * sum(len(rows) * n**2 for rows, n in zip(numbers.parameters, states, strict=True))
     what = f"{sum(map(len, numbers.parameters)):,} different peers of up to {max(states)} states"
     refuse_beyond(needed, "E804", Place(system.origin.topology), what, "fewer peers that differ")
-    found = []
+    result = []
     for place, (group, schedule) in enumerate(zip(system.groups, schedules, strict=True)):
         site, parameters = jacobians[group.kind], numbers.parameters[place]
         matrices = linearize_rows(site, parameters)
@@ -108,8 +108,8 @@ def populations(
         ]
         rows = numbers.rows[place]
         counts = np.bincount(rows, minlength=len(parameters)).astype(np.float64)
-        found.append(Population(group.name, place, site, schedule, parameters, joined(parts), rows, counts))
-    return tuple(found)
+        result.append(Population(group.name, place, site, schedule, parameters, joined(parts), rows, counts))
+    return tuple(result)
 
 
 def joined(parts: Sequence[FrameMap]) -> FrameMap:
@@ -156,12 +156,12 @@ def hear_themselves(maps: FrameMap, schedule: Schedule, own: Floats, others: Flo
 
 def lines_of(schedule: Schedule) -> dict[int, Floats]:
     """Return which of its own packets each line of r hears if a site hears itself: by lag, (n_r, n_s)."""
-    found: dict[int, Floats] = {}
+    result: dict[int, Floats] = {}
     for line, heard in enumerate(schedule.heard):
         if heard.sent in schedule.sent:
-            picked = found.setdefault(heard.lag, np.zeros((len(schedule.heard), len(schedule.sent))))
+            picked = result.setdefault(heard.lag, np.zeros((len(schedule.heard), len(schedule.sent))))
             picked[line, schedule.sent.index(heard.sent)] = 1.0
-    return found
+    return result
 
 
 def turned_by(

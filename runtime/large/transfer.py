@@ -199,10 +199,10 @@ def _split(
     diagonal[:, large:, large:] = small
     exact = RADII.exact(basis)
     left = RADII.subtract(RADII.multiply(maps.p, exact), RADII.multiply(exact, RADII.exact(diagonal)))
-    found = solve(exact, np.concatenate([left, maps.q], axis=-1))
-    if found is None:  # vectors that are nearly one another: nothing is known
-        found = np.full((sites, 2, n, n + n_r), np.inf, np.complex128)
-    change, b = _size(found[..., :n]), found[..., n:]
+    result = solve(exact, np.concatenate([left, maps.q], axis=-1))
+    if result is None:  # vectors that are nearly one another: nothing is known
+        result = np.full((sites, 2, n, n + n_r), np.inf, np.complex128)
+    change, b = _size(result[..., :n]), result[..., n:]
     a = RADII.multiply(maps.s, exact)
     residues = RADII.multiply(
         np.moveaxis(a, -1, 1)[:, :large, ..., None], np.moveaxis(b, -2, 1)[:, :large, ..., None, :]
@@ -282,8 +282,8 @@ def _block_series(row: Matrix, column: Matrix, small: Complexes, radius: float) 
         power, terms = RADII.multiply(power, power), 2 * terms
         size = norms(_size(power)) * radius**-terms
     block *= np.where(size < 0.5, (1 + 1e-6) / (1 - np.minimum(size, 0.5)), np.inf)
-    found = RADII.multiply(row, column)
-    real = with_radius(value_of(found).real, radius_of(found).real + np.abs(value_of(found).imag))
+    values = RADII.multiply(row, column)
+    real = with_radius(value_of(values).real, radius_of(values).real + np.abs(value_of(values).imag))
     real = np.moveaxis(real.reshape(*real.shape[:-1], terms, n_r), -2, 2)
     real[:, 1, 0] += ends * (size * block)[:, None, None]
     return real, block
@@ -349,23 +349,23 @@ def add_fractions(
     for fraction in transfer.fractions:
         for some in _pieces(fraction, len(points)):
             inverse, radius = 1.0 / (points[some, None, None] - fraction.poles), reach[some, None, None]
-            found = np.zeros((len(inverse), 3, len(fraction.rows), len(fraction.lines)), np.complex128)
-            found[:, 0] = _by_poles(inverse, fraction.residues, found)
+            values = np.zeros((len(inverse), 3, len(fraction.rows), len(fraction.lines)), np.complex128)
+            values[:, 0] = _by_poles(inverse, fraction.residues, values)
             if bounded:
                 moved = radius * (far := np.abs(inverse))
                 with np.errstate(all="ignore"):
                     near = far / (1 - moved)  # 1/(|ζ − p| − ρ), negative where a pole is in the disc
                     near[near.min(axis=(1, 2), initial=0.0) < 0] = np.nan
-                found[:, 1] = _by_poles(near, fraction.errors, found) + _reaction(
+                values[:, 1] = _by_poles(near, fraction.errors, values) + _reaction(
                     fraction, near, nearest[some]
                 )
                 moved *= moved
                 moved += rounded
                 moved *= near
-                found[:, 1] += _by_poles(moved, fraction.sizes, found)
+                values[:, 1] += _by_poles(moved, fraction.sizes, values)
             inverse *= inverse
-            found[:, 2] = -radius * _by_poles(inverse, fraction.residues, found)
-            total[some, :, fraction.rows[:, None], fraction.lines] += found
+            values[:, 2] = -radius * _by_poles(inverse, fraction.residues, values)
+            total[some, :, fraction.rows[:, None], fraction.lines] += values
     total[~(nearest >= transfer.innermost), 1] = np.nan
 
 

@@ -101,5 +101,5 @@ def _any_peer(population: Population) -> LinearSite | None:
     for place in np.flatnonzero((numbers != numbers[0]).any(axis=0)):
         vector[place] = Fraction(random.randrange(1, LARGEST), LARGEST)
     arguments = [[Fraction(0)] * size for size in map(built.function.numel_in, range(4))]
-    found = evaluate_exact(built.function, [*arguments, vector, [Fraction(0)]])[0]
-    return site_of_entries(built, found, 0)
+    result = evaluate_exact(built.function, [*arguments, vector, [Fraction(0)]])[0]
+    return site_of_entries(built, result, 0)

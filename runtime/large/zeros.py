@@ -142,9 +142,9 @@ def count_from(
         near = max(radius + step, function.innermost * INMOST)
         if rigid and abs(near - 1) <= rigid_radius:
             near = 1 + 2 * rigid_radius
-        found = beyond(function, near, rigid)
-        if found is not None and found >= 0:
-            return near, found
+        number = beyond(function, near, rigid)
+        if number is not None and number >= 0:
+            return near, number
         step *= WIDER
     return radius + step, -1
 
@@ -168,9 +168,9 @@ def bracket(
     inmost = function.innermost * INMOST
     outer, radius, step = float(np.inf), max(high, low, inmost), 1e-6
     for _ in range(MOST_COUNTS):
-        near, found = count_from(function, radius, BESIDE * radius, rigid, rigid_radius)
-        if found >= 0 and near < outer:
-            low, outer = (low, near) if found == 0 else (max(low, near), outer)
+        near, number = count_from(function, radius, BESIDE * radius, rigid, rigid_radius)
+        if number >= 0 and near < outer:
+            low, outer = (low, near) if number == 0 else (max(low, near), outer)
         elif np.isfinite(outer):
             break  # what can't be counted here is left between the two
         if outer <= max(low, inmost) * (1 + BRACKETED):
@@ -281,8 +281,8 @@ def find_zeros(
             continue
         more = _search(function, high, zeros, poles, rigid_radius)
         zeros = _distinct(np.concatenate([zeros, more]), rigid_radius)
-    found = [Zero(zero, error_of(zero), 1) for zero in zeros[:listed].tolist()]
-    known = [zero for zero in (*found, *exact) if np.isfinite(zero.error)]
+    result = [Zero(zero, error_of(zero), 1) for zero in zeros[:listed].tolist()]
+    known = [zero for zero in (*result, *exact) if np.isfinite(zero.error)]
     every = sorted(known, key=lambda zero: -abs(zero.value))[:listed]
     low = max([low, *(abs(zero.value) - zero.error for zero in every)])
     if beyond or not high - low <= WIDEST * high:
@@ -311,8 +311,10 @@ def _rigid_radius(function: Characteristic, rigid: int, radii: Sequence[float], 
     """
     if not rigid:
         return 0.0
-    found = (radius for radius in radii if radius < 2 * WIDEST and _held_in(function, 1.0, radius) == rigid)
-    return next(found, known or WIDEST)
+    generator = (
+        radius for radius in radii if radius < 2 * WIDEST and _held_in(function, 1.0, radius) == rigid
+    )
+    return next(generator, known or WIDEST)
 
 
 def _held_poles(function: Characteristic) -> list[Zero]:
@@ -340,7 +342,7 @@ def _cancelled_poles(
 
     Of all the largest few.
     """
-    found: list[Zero] = []
+    result: list[Zero] = []
     taken = [*zeros.tolist(), *(zero.value for zero in known)]
     poles = function.transfer.poles
     outside = (np.abs(poles.values) >= beyond * (1 - SAME)) & (poles.values.imag >= 0)
@@ -352,8 +354,8 @@ def _cancelled_poles(
         taken.append(pole)
         error, many = held_around(function, pole)
         if np.isfinite(error) and not any(abs(pole - zero) <= 2 * error for zero in zeros.tolist()):
-            found.append(_own(function, place, error, many))
-    return found
+            result.append(_own(function, place, error, many))
+    return result
 
 
 def _distinct(zeros: Complexes, rigid_radius: float) -> Complexes:
@@ -379,8 +381,8 @@ def _search(
     rings = [scale * radius * np.exp(1j * angles) for scale in (1.0, 1.03, 1.3)]
     starts = np.concatenate([*rings, near_poles(function, RING) * (1 + 1e-3)])
     known = np.append(zeros, 1.0) if rigid_radius else zeros
-    found = refine(function, starts, poles=poles, found=known)
-    return _distinct(refine(function, found, poles=poles), rigid_radius)
+    values = refine(function, starts, poles=poles, zeros=known)
+    return _distinct(refine(function, values, poles=poles), rigid_radius)
 
 
 def near_poles(function: Characteristic, most: int) -> Complexes:

@@ -184,11 +184,11 @@ class _AsSeen:
     def take(self, until: int) -> tuple[Seen, ...]:
         """Return what each route's ticks saw until an instant in quanta, a whole number of frames."""
         first, last, self.now = self.now // self.frame, until // self.frame, until
-        found = []
+        seens = []
         for route, seen in zip(self.routes, self.seen, strict=True):
             rows = np.minimum(np.arange(first * route.ticks, last * route.ticks), len(seen.packets) - 1)
-            found.append(Seen(seen.packets[rows], seen.missing[rows]))
-        return tuple(found)
+            seens.append(Seen(seen.packets[rows], seen.missing[rows]))
+        return tuple(seens)
 
 
 def _apart(run: Run, simulation: Simulation) -> dict[str, tuple[float, float]]:
@@ -198,27 +198,27 @@ def _apart(run: Run, simulation: Simulation) -> dict[str, tuple[float, float]]:
     simulated = {
         signal.name: (signal.unit, whole[:, column]) for column, signal in enumerate(simulation.signals)
     }
-    found: dict[str, tuple[float, float]] = {}
+    result: dict[str, tuple[float, float]] = {}
     for peer in run.peers:
         for name, played in zip(peer.signals, peer.values[: len(whole)].T, strict=True):
             unit, values = simulated[name]
             far = float(np.abs(played - values[: len(played)]).max(initial=0.0))
-            most, large = found.get(unit, (0.0, 0.0))
-            found[unit] = max(most, far), max(large, float(np.abs(played).max(initial=0.0)))
-    return found
+            most, large = result.get(unit, (0.0, 0.0))
+            result[unit] = max(most, far), max(large, float(np.abs(played).max(initial=0.0)))
+    return result
 
 
 def _ways(run: Run) -> tuple[WayRun, ...]:
     system, peers = run.system, {peer.number: peer for peer in run.peers}
     timings = {timing.name: float(timing.value) for timing in system.timings}
     periods = {clock.name: timings[clock.period] for clock in system.clocks}
-    found = []
+    way_runs = []
     for peer in run.peers:
         for number, sender in peer.ways:
             link, trace = system.links[number], trace_name(system, number, sender, peer.number)
             other = peers.get(sender)
             came = describe_delays(delays_of(peer, number, sender), trace, interval=periods[link.clock])
-            found.append(
+            way_runs.append(
                 WayRun(
                     link=link.name,
                     sender=other.name if other else trace.split("-to-")[0],
@@ -228,7 +228,7 @@ def _ways(run: Run) -> tuple[WayRun, ...]:
                     trace=str(Path(run.folder) / trace),
                 )
             )
-    return tuple(found)
+    return tuple(way_runs)
 
 
 def _measured(system: CompiledSystem, link: Link, ways: Sequence[WayRun]) -> Measured:

@@ -76,11 +76,11 @@ class Outside:
 
     def measure(self, time: float, carry: NDArray[np.float64]) -> None:
         """Put what is measured into the states of the device; `carry` (rows, 1) is written over."""
-        found = self._asked(time, None)
-        if not (isinstance(found, int | float | np.floating) and math.isfinite(found)):
-            what = f"gave {found!r:.40} as its position at {time:.6g} s"
+        result = self._asked(time, None)
+        if not (isinstance(result, int | float | np.floating) and math.isfinite(result)):
+            what = f"gave {result!r:.40} as its position at {time:.6g} s"
             raise ApcError(Mistake("E976", Place("--device"), what, hint="return a finite number, in m"))
-        position = float(found)
+        position = float(result)
         if self.before is not None and time > self.before[0]:
             carry[self.device.velocity] = (position - self.before[1]) / (time - self.before[0])
         carry[self.device.position] = position

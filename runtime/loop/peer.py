@@ -517,8 +517,8 @@ class _Emulated:
         key = link.place, other
         if key not in self.delays:
             self.delays[key] = enumerate(_drawn(self._source(link, other)))
-        found = next(delay for number, delay in self.delays[key] if number == count)
-        return None if math.isinf(found) else int(found * NANO)
+        value = next(delay for number, delay in self.delays[key] if number == count)
+        return None if math.isinf(value) else int(value * NANO)
 
     def _source(self, link: _OfLink, other: int) -> PacketSource:
         loop, exchange = self.loop, self.loop.exchange

@@ -100,16 +100,16 @@ def _peer(data: bytes, scene: _Scene) -> PeerRun:
         name: {f"{name}{at}": kind for at in range(len(scene.routes))} for name, kind in OF_ROUTES.items()
     }
     kinds = {"told": ("|u1", 1), **ARRAYS} | of_routes["packets"] | of_routes["missing"]
-    found = read_arrays(data, kinds, LARGEST)
-    _want(found.keys() == kinds.keys(), f"it lacks one of {', '.join(kinds)}")
-    _want(found["told"].size <= LONGEST, "it tells too much")
+    result = read_arrays(data, kinds, LARGEST)
+    _want(result.keys() == kinds.keys(), f"it lacks one of {', '.join(kinds)}")
+    _want(result["told"].size <= LONGEST, "it tells too much")
     try:
-        words = msgspec.json.decode(found["told"].tobytes(), type=Words)
+        words = msgspec.json.decode(result["told"].tobytes(), type=Words)
         _want(all(map(str.isprintable, words.not_given)), "")  # it is shown in a terminal
     except ValueError:
         raise DamageError("what it tells is not what apc play writes") from None
-    arrays: dict[str, Any] = {name: found[name] for name in ARRAYS}
-    arrays |= {name: tuple(map(found.__getitem__, listed)) for name, listed in of_routes.items()}
+    arrays: dict[str, Any] = {name: result[name] for name in ARRAYS}
+    arrays |= {name: tuple(map(result.__getitem__, listed)) for name, listed in of_routes.items()}
     return PeerRun(**asdict(words), **arrays)
 
 

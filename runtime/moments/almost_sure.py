@@ -100,9 +100,9 @@ def almost_sure(system: CompiledSystem, prepared: Prepared, *, seed: int = 0) ->
             ended = np.where(starts + FRAMES == frame, total, ended)
         moved = both @ x
         x = moved[:n] + g @ (moved[n:] * heard)
-    found = (ended - begun) / FRAMES
-    middle = float(found.mean())
-    half = float(stdtrit(COURSES - 1, QUANTILE)) * float(found.std(ddof=1)) / math.sqrt(COURSES)
+    values = (ended - begun) / FRAMES
+    middle = float(values.mean())
+    half = float(stdtrit(COURSES - 1, QUANTILE)) * float(values.std(ddof=1)) / math.sqrt(COURSES)
     return AlmostSure(middle, (middle - half, middle + half))
 
 
@@ -113,9 +113,11 @@ def _without_chance(held: HeldLoop, chances: Sequence[Chance]) -> AlmostSure:
         if chance.law.mean_loss:
             rows[:, list(chance.ears)] = held.e[:, list(chance.ears)]
     matrix = RADII.add(held.f, RADII.multiply(held.g, rows))
-    pairs, found = enclose_eigenvalues(value_of(matrix), radius_of(matrix))
+    pairs, enclosure = enclose_eigenvalues(value_of(matrix), radius_of(matrix))
     radius = float(np.abs(pairs.values).max(initial=0.0))
-    low, middle, high = (math.log(item) if item else -math.inf for item in (found.low, radius, found.high))
+    low, middle, high = (
+        math.log(item) if item else -math.inf for item in (enclosure.low, radius, enclosure.high)
+    )
     return AlmostSure(middle, (min(low, middle), max(middle, high)))
 
 

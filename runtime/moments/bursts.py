@@ -172,8 +172,8 @@ class _Tagged:
     def shortened(self, moments: Floats) -> Floats:
         """Return each number once: the mean of the entries it stands for."""
         size = len(self.many)
-        found = np.bincount(self.entries.ravel(), moments.ravel(), minlength=size) / self.many
-        return np.asarray(found)
+        values = np.bincount(self.entries.ravel(), moments.ravel(), minlength=size) / self.many
+        return np.asarray(values)
 
 
 @cache
@@ -208,13 +208,13 @@ def _tagged(of: Affine, order: int) -> _Tagged:
 
     def times(terms: Terms, arc: Arc) -> Terms:
         """Return what moments so tagged are, tagged by an arc more."""
-        found = []
+        pairs = []
         for factor, tags in terms:
             if arc in tags:
-                found += [(factor, tuple(tag for tag in tags if tag != arc)), (factor * kappa, tags)]
+                pairs += [(factor, tuple(tag for tag in tags if tag != arc)), (factor * kappa, tags)]
             else:
-                found.append((factor, tuple(sorted((*tags, arc)))))
-        return found
+                pairs.append((factor, tuple(sorted((*tags, arc)))))
+        return pairs
 
     place = {pairs: number for number, pairs in enumerate(sets)}
     number = {arc: c for c, arc in enumerate(of.arcs)}
@@ -265,7 +265,7 @@ def _orbits(of: Affine, sets: Sequence[Tags]) -> Integers:
     """Number the entries of each set's matrix, those alike that the set's own permutations exchange."""
     sparse, graph = load_pool("scipy.sparse"), load_pool("scipy.sparse.csgraph")
     n, first = len(of.mean), 0
-    found = np.zeros((len(sets), n, n), np.intp)
+    places = np.zeros((len(sets), n, n), np.intp)
     every = np.arange(n * n).reshape(n, n)
     for place, tags in enumerate(sets):
         touched, rest = _touched(tags, of.peers)
@@ -283,21 +283,21 @@ def _orbits(of: Affine, sets: Sequence[Tags]) -> Integers:
         columns = np.concatenate([move.ravel() for move in moves])
         alike = sparse.coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), shape=(n * n, n * n))
         count, labels = graph.connected_components(alike, directed=False)
-        found[place] = first + labels.reshape(n, n)
+        places[place] = first + labels.reshape(n, n)
         first += count
-    return found
+    return places
 
 
 def _states(of: Affine, peers: Sequence[int]) -> Integers:
     """Return which state comes from where when peer i becomes `peers[i]`: new[states] = old."""
-    found = np.zeros(len(of.mean), np.intp)
+    places = np.zeros(len(of.mean), np.intp)
     number = {arc: place for place, arc in enumerate(of.arcs)}
     own = of.offsets[1]
     for peer, to in enumerate(peers):
-        found[of.offsets[peer] : of.offsets[peer] + own] = of.offsets[to] + np.arange(own)
+        places[of.offsets[peer] : of.offsets[peer] + own] = of.offsets[to] + np.arange(own)
     for place, (g, h) in enumerate(of.arcs):
-        found[list(of.held[place])] = list(of.held[number[peers[g], peers[h]]])
-    return found
+        places[list(of.held[place])] = list(of.held[number[peers[g], peers[h]]])
+    return places
 
 
 def _step(tags: _Tagged, numbers: Floats) -> Floats:

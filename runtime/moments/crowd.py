@@ -362,7 +362,7 @@ def remembered_of(
             if felt[place] and not row.gap:
                 heard.setdefault((row.way.link, row.way.delay), []).append(row)
     links = {link.name: link for link in system.links}
-    found = []
+    remembereds = []
     times = {clock.name: instants(told, clock) for clock in system.clocks}
     for route, listed in sorted(heard.items()):
         link, delay = links[route[0]], told.timings[route[1]]
@@ -371,8 +371,8 @@ def remembered_of(
         law = PERFECT if perfect or link.channel is None else channel_law(system, link, delay)
         off = lost.get(route[0], (0.0,))
         memory = memory_of(law, delay, sent, ticks, told.frame, strictly=told.strictly, lost=off)
-        found.append(remember(route, memory, sorted({row.channel for row in listed})))
-    return found
+        remembereds.append(remember(route, memory, sorted({row.channel for row in listed})))
+    return remembereds
 
 
 def instants(told: Hearing, clock: Clock) -> list[Fraction]:

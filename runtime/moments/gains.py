@@ -199,13 +199,13 @@ def stein(matrix: Matrix, driven: Matrix, numbers: Arithmetic) -> Matrix | None:
     if numbers is FLOATS:
         return _doubled(matrix, driven)
     n = matrix.shape[-1]
-    found = _doubled(value_of(matrix), value_of(driven))
-    if found is None or not n:
-        return None if found is None else driven
-    found = (found + np.swapaxes(found, -1, -2)) / 2
-    guessed = numbers.exact(found)
-    guessed[..., 2:, :, :] = _slopes(matrix, driven, found)
-    weights = _weights(found, value_of(matrix))
+    result = _doubled(value_of(matrix), value_of(driven))
+    if result is None or not n:
+        return None if result is None else driven
+    result = (result + np.swapaxes(result, -1, -2)) / 2
+    guessed = numbers.exact(result)
+    guessed[..., 2:, :, :] = _slopes(matrix, driven, result)
+    weights = _weights(result, value_of(matrix))
     seed = np.diag(weights**2)
     still = _doubled(value_of(matrix), seed[None])
     if still is None:
@@ -230,13 +230,13 @@ def stein(matrix: Matrix, driven: Matrix, numbers: Arithmetic) -> Matrix | None:
     return guessed
 
 
-def _slopes(matrix: Matrix, driven: Matrix, found: Floats) -> Matrix:
+def _slopes(matrix: Matrix, driven: Matrix, values: Floats) -> Matrix:
     """Return how Σ_k M^k B M^kᵀ (b, n, n) changes with each parameter of a cell (b, m, n, n), in floats."""
-    moved = matrix[2:] @ found[:, None] @ value_of(matrix).T
+    moved = matrix[2:] @ values[:, None] @ value_of(matrix).T
     moved = driven[:, 2:] + moved + np.swapaxes(moved, -1, -2)
     if not moved.size:
         return moved
-    total = _doubled(value_of(matrix), moved.reshape(-1, *found.shape[1:]))
+    total = _doubled(value_of(matrix), moved.reshape(-1, *values.shape[1:]))
     assert total is not None, "sums of one matrix end for all that drives it, or for nothing"
     return (total + np.swapaxes(total, -1, -2)).reshape(moved.shape) / 2
 
@@ -256,22 +256,22 @@ def _held_at_corners(matrix: Matrix, seed: Floats, numbers: Arithmetic) -> tuple
     decay = (1 + float(np.abs(np.linalg.eigvals(value)).max(initial=0.0))) / 2
     units = balance(np.abs(value) + np.abs(matrix[2:]).sum(axis=0)) ** 2
     for inner in (seed, np.diag(units * (np.diagonal(seed) / units).max())):
-        found = _doubled(value / decay, inner[None])
-        if found is None:
+        result = _doubled(value / decay, inner[None])
+        if result is None:
             return None
-        found = (found + np.swapaxes(found, -1, -2)) / 2
-        guessed = numbers.exact(found)
+        result = (result + np.swapaxes(result, -1, -2)) / 2
+        guessed = numbers.exact(result)
         left = numbers.subtract(guessed, around(matrix, guessed, numbers))
         for share in SHARES:
             spared = numbers.subtract(left, numbers.exact((1 - share) * seed))
             if all(is_positive(matrix) for matrix in corners(spared[0])):
-                return found[0], share
+                return result[0], share
     return None
 
 
-def _weights(found: Matrix, matrix: Matrix) -> Floats:
+def _weights(result: Matrix, matrix: Matrix) -> Floats:
     """Return how large states are where moments (b, n, n) are found; those that rest, beside the others."""
-    weights = np.sqrt(np.abs(np.diagonal(found, axis1=-2, axis2=-1)).sum(axis=0))
+    weights = np.sqrt(np.abs(np.diagonal(result, axis1=-2, axis2=-1)).sum(axis=0))
     alike = balance(np.abs(matrix))
     shares = weights / alike
     moves = shares > RESTS * shares.max(initial=0.0)  # what is less is what rounding leaves of none

@@ -172,7 +172,7 @@ def ears_of(loop: Loop, lossy: frozenset[str], receivers: Iterable[int]) -> list
         The sites that hear.
     """
     rows = [(g, line, heard) for g in receivers for line, heard in lossy_rows(loop.sites[g], lossy)]
-    found = []
+    ears = []
     for h, sender in enumerate(loop.sites):
         for row, sent in enumerate(sender.schedule.sent):
             weights = {
@@ -181,8 +181,8 @@ def ears_of(loop: Loop, lossy: frozenset[str], receivers: Iterable[int]) -> list
                 if heard.sent == sent and (loop.coupling[heard.way][g][h] or loop.doubts.get(heard.way))
             }
             if weights:
-                found.append(Ear(weights, h, row))
-    return found
+                ears.append(Ear(weights, h, row))
+    return ears
 
 
 def held_loop(loop: Loop, ears: Sequence[Ear], lossy: frozenset[str]) -> HeldLoop:

@@ -187,13 +187,13 @@ def with_memory(group: PeerGroup, remembered: Sequence[Remembered], frame: Frame
     def over_all(block: Matrix, place: int) -> Matrix:
         """Return rows over one number's kept values and packets as rows over those of all."""
         remembered, channel = numbers[place]
-        found = np.zeros((len(block), block.shape[-2], n_m + n_s))
-        found[..., firsts[place] : firsts[place + 1]] = block[..., : remembered.memory.count]
+        values = np.zeros((len(block), block.shape[-2], n_m + n_s))
+        values[..., firsts[place] : firsts[place + 1]] = block[..., : remembered.memory.count]
         for slot in range(remembered.memory.slots):
-            found[..., n_m + row_of[Sent(remembered.route[0], channel, slot)]] = block[
+            values[..., n_m + row_of[Sent(remembered.route[0], channel, slot)]] = block[
                 ..., remembered.memory.count + slot
             ]
-        return found
+        return values
 
     rows, kept = list[Matrix](), list[Matrix]()
     values: dict[tuple[Route, str, int], int] = {}

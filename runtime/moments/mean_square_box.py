@@ -110,8 +110,8 @@ def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question:
     prepared = prepare(system)
 
     def lifted(changed: CompiledSystem) -> Any:
-        found = hearing(changed, prepared)
-        return found.groups, found.exchange
+        result = hearing(changed, prepared)
+        return result.groups, result.exchange
 
     # Inside the box, as a link may lose nothing at an end of it; and moved along each range, as chances that
     # add up to 1 somewhere, by chance, are those of bursts beside it.
@@ -173,8 +173,8 @@ def _is_unstable(asked: _Question, point: Sequence[Fraction]) -> bool:
     system = _changed(asked.system, asked.ranges, point)
     if growth(system, asked.prepared, bounded=False).radius < 1:
         return False
-    found = growth(system, asked.prepared)
-    return found.proved and found.stable is False
+    result = growth(system, asked.prepared)
+    return result.proved and result.stable is False
 
 
 def _looked(asked: _Question, cells: Sequence[Cell]) -> Iterator[Looked]:
@@ -203,9 +203,9 @@ def _proved(asked: _Question, cell: Cell, lifted: Sequence[FrameMap]) -> tuple[b
     frames = {name: lifted[which] for name, which in asked.places.items()}
     of = moments_of(asked.classes, _memories(asked, cell), frames)
     for matrix in of.means[1]:
-        found = contracted(matrix[None])
-        if not found.proved.all():
-            return False, bool(found.inside.all())
+        contraction = contracted(matrix[None])
+        if not contraction.proved.all():
+            return False, bool(contraction.inside.all())
     return below_1(of)
 
 

@@ -176,16 +176,16 @@ def _growth(system: CompiledSystem, prepared: Prepared, bounded: bool) -> Growth
 
 def _over_trace(system: CompiledSystem, prepared: Prepared) -> Growth:
     """Return what second moments grow by over recorded delays."""
-    found = trace_radius(system, prepared)
+    result = trace_radius(system, prepared)
 
     def errors() -> tuple[float, str]:
         raise UnservedError("it is not worked out over recorded delays")
 
-    radius, low, high = found.radius**2, found.low**2 * (1 - ROUNDED), found.high**2 * (1 + ROUNDED)
+    radius, low, high = result.radius**2, result.low**2 * (1 - ROUNDED), result.high**2 * (1 + ROUNDED)
     if low > 1 or high < 1 or high - low < LOOSE:
         return Growth(min(max(radius, low), high), low, high, True, proved=True, errors=errors)
-    doubt = max(DOUBTS * 2 * found.radius * found.doubt, LOOSE)
-    note = f"an estimate: bounds on the roundings of {found.frames:,} frames leave it open"
+    doubt = max(DOUBTS * 2 * result.radius * result.doubt, LOOSE)
+    note = f"an estimate: bounds on the roundings of {result.frames:,} frames leave it open"
     return Growth(radius, max(radius - doubt, 0.0), radius + doubt, False, note=note, errors=errors)
 
 
@@ -349,32 +349,32 @@ def judge_network(
         return None
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         prepared = prepared or prepare(system)
-        found = growth(system, prepared)
+        result = growth(system, prepared)
         lost = [link for link, law in unreliable(system) if law.mean_loss]
         followed = lost and not any(_asked_of_packets(system, link) for link in lost)
         worst = worst_case(system, prepared) if followed else None
-        surely, unsure = _almost_sure(system, prepared, found)
-        metres, unmeasured = _rms_error(found)
+        surely, unsure = _almost_sure(system, prepared, result)
+        metres, unmeasured = _rms_error(result)
         linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
-    told = bool(np.isfinite(found.radius))
-    decided = told and found.stable is not None
+    told = bool(np.isfinite(result.radius))
+    decided = told and result.stable is not None
     notes = (
-        found.why and f"not judged: {found.why}",
-        UNPROVED if certify and decided and not found.proved else "",
-        found.note,
+        result.why and f"not judged: {result.why}",
+        UNPROVED if certify and decided and not result.proved else "",
+        result.note,
         unsure,
         unmeasured and f"root mean square error of copies: {unmeasured}",
         worst.note if worst is not None else "",
     )
     return NetworkVerdict(
         topology=system.name,
-        verdict=verdict_of(found),
-        stable=found.stable if told else None,
-        mean_square_radius=found.radius if told else None,
-        error=max(found.high - found.radius, found.radius - found.low) if told else None,
-        exact=found.exact,
-        proof=(STABLE_PROVED if found.stable else UNSTABLE_PROVED)
-        if certify and decided and found.proved
+        verdict=verdict_of(result),
+        stable=result.stable if told else None,
+        mean_square_radius=result.radius if told else None,
+        error=max(result.high - result.radius, result.radius - result.low) if told else None,
+        exact=result.exact,
+        proof=(STABLE_PROVED if result.stable else UNSTABLE_PROVED)
+        if certify and decided and result.proved
         else "",
         rms_error_m=metres,
         almost_sure=surely,
@@ -384,29 +384,29 @@ def judge_network(
     )
 
 
-def _rms_error(found: Growth) -> tuple[float | None, str]:
+def _rms_error(growth: Growth) -> tuple[float | None, str]:
     """Return the error of copies where second moments die out, and what there is to say of it."""
-    if not found.stable or found.errors is None:
-        return None, "" if found.why else "only where second moments die out"
-    if found.high > 1 - DOUBTFUL:
+    if not growth.stable or growth.errors is None:
+        return None, "" if growth.why else "only where second moments die out"
+    if growth.high > 1 - DOUBTFUL:
         return None, "rounding leaves its digits in doubt"
     try:
-        return found.errors()
+        return growth.errors()
     except UnservedError as why:
         return None, str(why)
 
 
-def verdict_of(found: Growth) -> str:
+def verdict_of(growth: Growth) -> str:
     """Return the verdict in words."""
-    if not np.isfinite(found.radius):
+    if not np.isfinite(growth.radius):
         return NOT_JUDGED
-    verdict = {True: STABLE, False: UNSTABLE, None: UNDECIDED}[found.stable]
-    return f"probably {verdict}" if not found.exact and found.stable is not None else verdict
+    verdict = {True: STABLE, False: UNSTABLE, None: UNDECIDED}[growth.stable]
+    return f"probably {verdict}" if not growth.exact and growth.stable is not None else verdict
 
 
-def _almost_sure(system: CompiledSystem, prepared: Prepared, found: Growth) -> tuple[AlmostSure | None, str]:
+def _almost_sure(system: CompiledSystem, prepared: Prepared, growth: Growth) -> tuple[AlmostSure | None, str]:
     """Return how a scene settles almost surely where mean squares leave it open, or why that is not told."""
-    if found.why or found.stable:  # what settles in mean square settles almost surely
+    if growth.why or growth.stable:  # what settles in mean square settles almost surely
         return None, ""
     try:
         return almost_sure(system, prepared), ""

@@ -90,7 +90,7 @@ class Memory:
         # Of a chance near 1 the variance is small, and what the chance rounds is not.
         doubt = self.doubts[place, slot] + CHANCE_ROUNDINGS * UNIT
         wander = np.abs(moves).sum(axis=0)
-        found = np.minimum.outer(own, own) - np.outer(own, own)
+        result = np.minimum.outer(own, own) - np.outer(own, own)
         least = np.where(own[:, None] <= own, moves[:, :, None], moves[:, None, :])
         slopes = least - own[:, None] * moves[:, None, :] - moves[:, :, None] * own
         both = np.outer(own + wander, doubt) + np.outer(doubt, own + wander) + np.outer(doubt, doubt)
@@ -98,7 +98,7 @@ class Memory:
         np.fill_diagonal(off, (np.abs(1 - 2 * own) + 2 * wander) * doubt + doubt**2)
         off += np.outer(wander, wander)
         off = off * (1 + 8 * UNIT) + (4 + len(moves)) * UNIT * (own + 4 * wander)
-        return np.concatenate([np.stack([found, off]), slopes])
+        return np.concatenate([np.stack([result, off]), slopes])
 
 
 def is_memoryless(law: ChannelLaw) -> bool:
@@ -174,14 +174,14 @@ def memory_of(
 
     def described(time: int) -> tuple[float, ...]:
         """Return how likely a tick hears each packet, the newest first, of this frame and those before."""
-        found = []
+        values = []
         for back in range(ahead + 1):
             for start in starts:
                 elapsed = time - start + back * length
                 if elapsed not in chance:
                     chance[elapsed] = arrives(law, delay, Fraction(elapsed, unit), strictly=strictly)
-                found.append(chance[elapsed])
-        return tuple(found)
+                values.append(chance[elapsed])
+        return tuple(values)
 
     slots, instants = len(sent), sorted({int(tick * unit) for tick in ticks.values()})
     keys: dict[tuple[float, ...], int] = {}

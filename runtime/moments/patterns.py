@@ -243,10 +243,10 @@ def settled(step: Callable[[Floats], Floats], added: Floats) -> Floats:
     """
     linalg = load_pool("scipy.sparse.linalg")
     operator = linalg.LinearOperator((added.size,) * 2, matvec=lambda x: x - step(x), dtype=np.float64)
-    found, open_end = linalg.gmres(operator, added, rtol=LEFT, atol=0.0, restart=VECTORS, maxiter=RESTARTS)
+    result, open_end = linalg.gmres(operator, added, rtol=LEFT, atol=0.0, restart=VECTORS, maxiter=RESTARTS)
     if open_end:
         raise UnservedError("its iteration did not come to an end")
-    return np.asarray(found)
+    return np.asarray(result)
 
 
 def _changed(moved: Floats, laws: Sequence[ChannelLaw]) -> Floats:
@@ -261,8 +261,8 @@ def _changed(moved: Floats, laws: Sequence[ChannelLaw]) -> Floats:
 
 def _chances(laws: Sequence[ChannelLaw]) -> Floats:
     """Return how likely packets are lost as pattern b says in state s (k, k)."""
-    found = np.ones((1, 1))
+    result = np.ones((1, 1))
     for law in laws:
         values = np.array([[1 - law.one_minus_k, law.one_minus_k], [1 - law.one_minus_h, law.one_minus_h]])
-        found = np.kron(values, found)
-    return found
+        result = np.kron(values, result)
+    return result

@@ -89,13 +89,13 @@ def trace_radius(system: CompiledSystem, prepared: Prepared) -> Found:
         )
         for name in links
     }
-    found = []
+    result = []
     for loop in arrange(told.groups, told.exchange).loops:
         packets = sum(depth[sent.link] for site in loop.sites for sent in site.schedule.sent)
         if packets + sum(len(site.z_names) for site in loop.sites) > MOST_STATES:
             raise UnservedError("the recorded delays are longer than can be followed")
-        found.append(_period(loop, told, heard, depth, slots, frames))
-    low, high, radius, doubt = np.array(found).max(axis=0).tolist()
+        result.append(_period(loop, told, heard, depth, slots, frames))
+    low, high, radius, doubt = np.array(result).max(axis=0).tolist()
     return Found(low, high, radius, doubt, frames)
 
 
@@ -122,7 +122,7 @@ def heard_packets(
     )
     longest = max(late for late in delays if late is not None)
     newest = link.channel is None or link.channel.reorder == "newest"
-    found = []
+    numbers = []
     for frame in range(_period_of(link, slots)):
         best: tuple[Fraction, int] | None = None
         for number in itertools.count(slots - 1, -1):
@@ -135,8 +135,8 @@ def heard_packets(
                 continue
             best = max(best or (at + late, number), (at + late, number))
         assert best is not None
-        found.append(best[1])
-    return found
+        numbers.append(best[1])
+    return numbers
 
 
 def _period_of(link: Link, slots: int) -> int:

@@ -130,13 +130,13 @@ def worst_case(system: CompiledSystem, prepared: Prepared) -> LossesInARow:
         From `analysis.prepare`, of this system with any numbers.
     """
     try:
-        found = held_parts(system, prepared)
+        parts = held_parts(system, prepared)
     except UnservedError as why:
         return LossesInARow(None, None, None, f"losses in a row are left open: {why}")
-    certified = harmless(found)
+    certified = harmless(parts)
     if certified == MANY:
         return LossesInARow(MANY, None, None, f"{MANY:,} losses in a row are harmless, where counting ends")
-    pattern, growth, note = shaking(found, known=certified or 0)
+    pattern, growth, note = shaking(parts, known=certified or 0)
     if certified is None and pattern is None:
         note = f"the scene is not proved to settle with no packet lost; {note}"
     return LossesInARow(certified, pattern, growth, note)
@@ -155,10 +155,10 @@ def trace_of_worst(system: CompiledSystem) -> CompiledSystem:
     ApcError
         E897 no such pattern is known, or it can't be played.
     """
-    found = worst_case(system, prepare(system))
-    pattern = found.unstable_pattern
+    losses_in_a_row = worst_case(system, prepare(system))
+    pattern = losses_in_a_row.unstable_pattern
     if pattern is None:
-        what = f"--trace-of worst has nothing to play: {found.note}"
+        what = f"--trace-of worst has nothing to play: {losses_in_a_row.note}"
         raise ApcError(Mistake("E897", Place(system.origin.topology), what, hint="apc simulate"))
     seconds = {timing.name: float(timing.value) for timing in system.timings}
     for link in system.links:
@@ -250,7 +250,7 @@ def ratios_of(sites: Sequence[PeerGroup], lossy: frozenset[str]) -> Ratios:
 
     Those of other links are kept apart. The first channel that counts has the ratio 1.
     """
-    found: dict[tuple[str, str], Fraction] = {}
+    result: dict[tuple[str, str], Fraction] = {}
     for link in sorted(lossy):
         columns: dict[str, dict[tuple[int, int, int, Way], Fraction]] = {}
         for g, site in enumerate(sites):
@@ -276,8 +276,8 @@ def ratios_of(sites: Sequence[PeerGroup], lossy: frozenset[str]) -> Ratios:
                 break
             ratios[link, channel] = ratio
         else:
-            found |= ratios
-    return found
+            result |= ratios
+    return result
 
 
 def weight_of(loops: Sequence[Loop], lossy: frozenset[str]) -> tuple[float, Sizes]:
@@ -314,13 +314,13 @@ def weight_of(loops: Sequence[Loop], lossy: frozenset[str]) -> tuple[float, Size
 
 def _units(weights: Floats) -> Floats:
     """Return units by which a matrix of weights has the smallest norm; 1 where some peers hear nobody."""
-    found = []
+    result = []
     for matrix in (weights, weights.T):
         values, vectors = np.linalg.eig(matrix)
-        found.append(np.abs(vectors[:, int(np.argmax(values.real))]))
-    if min(float(item.min() / item.max()) for item in found) < LEAST_UNIT:
+        result.append(np.abs(vectors[:, int(np.argmax(values.real))]))
+    if min(float(item.min() / item.max()) for item in result) < LEAST_UNIT:
         return np.ones(len(weights))
-    units = np.sqrt(found[1] / found[0])
+    units = np.sqrt(result[1] / result[0])
     return np.asarray(units / units.max())
 
 

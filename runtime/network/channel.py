@@ -198,8 +198,8 @@ class PacketSource:
             state["state"]["counter"] = np.array([first - 1, *pair, 0], np.uint64)  # it counts, then gives
             generator.state = state
             row[:] = generator.random_raw(count * BLOCK)
-        found = words.reshape(self.ways, count, BLOCK)
-        return np.asarray((found >> np.uint64(11)) * 2.0**-53, dtype=np.float64)
+        places = words.reshape(self.ways, count, BLOCK)
+        return np.asarray((places >> np.uint64(11)) * 2.0**-53, dtype=np.float64)
 
     def _states(self, uniforms: Floats) -> Flags:
         """Return whether each way is bad at each packet (M, count).

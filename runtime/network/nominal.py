@@ -75,7 +75,7 @@ def refuse_range(system: CompiledSystem) -> None:
             re.search(rf":(\d+):(\d+): W275 {re.escape(interval.free.label)} ", text)
             for text in system.warnings
         )
-        line, column = next((map(int, found.groups()) for found in told if found), (0, 0))
+        line, column = next((map(int, result.groups()) for result in told if result), (0, 0))
         raise ApcError(Mistake("E899", Place(system.origin.topology, line, column), what, hint=hint))
 
 
@@ -85,14 +85,14 @@ def _ms(seconds: Fraction) -> str:
 
 def channel_numbers(system: CompiledSystem) -> frozenset[str]:
     """Return the names of what links lose and delay packets by, and of all that these follow from."""
-    found: list[str] = []
+    texts: list[str] = []
     for link in system.links:
         if link.channel is not None and link.channel.loss is not None:
             loss = link.channel.loss
-            found += [loss.p, loss.r, loss.one_minus_h, loss.one_minus_k]
+            texts += [loss.p, loss.r, loss.one_minus_h, loss.one_minus_k]
         if link.channel is not None and link.channel.jitter is not None:
-            found.append(link.channel.jitter)
-    return frozenset(scope_of(system).needed(found))
+            texts.append(link.channel.jitter)
+    return frozenset(scope_of(system).needed(texts))
 
 
 def refuse_channel_number(system: CompiledSystem, free: Free, place: Place, *, instead: str = "") -> None:

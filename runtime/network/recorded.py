@@ -226,9 +226,9 @@ def _correlation(delays: Floats) -> float:
     first, second = delays[:-1][both], delays[1:][both]
     if len(first) < 10 or not first.std() or not second.std():
         return 0.0
-    found = float(np.corrcoef(first, second)[0, 1])
+    value = float(np.corrcoef(first, second)[0, 1])
     # Of independent numbers it has the standard deviation 1/√n; 3.3 of these are left once in a thousand.
-    return found if abs(found) > 3.3 / math.sqrt(len(first)) else 0.0
+    return value if abs(value) > 3.3 / math.sqrt(len(first)) else 0.0
 
 
 def _quantile(arrived: Floats, share: float) -> float:

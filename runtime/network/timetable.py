@@ -319,7 +319,7 @@ class Timetable:
 
 def _listen(route: Route, luck: Luck, seed: int, run: int) -> list[tuple[Integers, Listener]]:
     """Return a listener for the ways of each delay of a route, with their places in it."""
-    found = []
+    pairs = []
     for nominal in np.unique(luck.nominal).tolist():
         ways = np.flatnonzero(luck.nominal == nominal)
         law = replace(luck.law, delay=float(luck.delays[ways[0]]))
@@ -331,8 +331,8 @@ def _listen(route: Route, luck: Luck, seed: int, run: int) -> list[tuple[Integer
             quantum=luck.quantum,
             newest=luck.newest,
         )
-        found.append((ways, listener))
-    return found
+        pairs.append((ways, listener))
+    return pairs
 
 
 def routes_of(
@@ -353,8 +353,8 @@ def routes_of(
         E891 a group sets a number of a link for itself; E892 too many ways from peer to peer.
     """
     unreliable = [link for link in system.links if link.channel is not None]
-    found = [_routes_over(system, timings, exchange, frame_s, link) for link in unreliable]
-    return tuple(route for routes in found for route in routes)
+    result = [_routes_over(system, timings, exchange, frame_s, link) for link in unreliable]
+    return tuple(route for routes in result for route in routes)
 
 
 def _routes_over(
@@ -414,8 +414,8 @@ def _groups(exchange: Exchange, pairs: Integers) -> tuple[list[tuple[int, int]],
     """Return the different pairs of groups of pairs of peers, and which of them each pair (M,) is."""
     groups = np.searchsorted(exchange.starts, pairs, side="right") - 1
     count = len(exchange.groups)
-    found, of_pair = np.unique(groups[:, 0] * count + groups[:, 1], return_inverse=True)
-    return [divmod(item, count) for item in found.tolist()], of_pair
+    text, of_pair = np.unique(groups[:, 0] * count + groups[:, 1], return_inverse=True)
+    return [divmod(item, count) for item in text.tolist()], of_pair
 
 
 def _highest(ticks: Integers, ways: Integers, when: Integers, ranks: Integers, first: Integers) -> Integers:
@@ -430,7 +430,7 @@ def _highest(ticks: Integers, ways: Integers, when: Integers, ranks: Integers, f
     first
         The ranks (M,) at the beginning.
     """
-    found = np.full((len(ticks), len(first)), START, np.int64)
-    found[0] = first
-    np.maximum.at(found.reshape(-1), np.searchsorted(ticks, when) * len(first) + ways, ranks)
-    return np.maximum.accumulate(found, axis=0)
+    places = np.full((len(ticks), len(first)), START, np.int64)
+    places[0] = first
+    np.maximum.at(places.reshape(-1), np.searchsorted(ticks, when) * len(first) + ways, ranks)
+    return np.maximum.accumulate(places, axis=0)

@@ -110,14 +110,14 @@ def compile_text(system: CompiledSystem, needs: Needs, target: Path) -> Lines:
 
 def _pairwise(system: CompiledSystem) -> Iterator[str]:
     """Yield what is evaluated once a pair of peers, and why it can't be once a peer."""
-    found = {
+    result = {
         receive.name: receive
         for kind in system.kinds
         for clock in kind.clocks
         for receive in clock.receives
         if receive.edge is not None or receive.operator in ("max", "min")
     }
-    for name, receive in found.items():
+    for name, receive in result.items():
         why = (
             f"what it runs over is not linear in what the others send over {receive.link}"
             if receive.edge is not None and receive.operator in ("sum", "mean")
@@ -172,35 +172,35 @@ def _mode_document(mode: Mode) -> Plain:
     return record(mode, {"motion": ..., **moved})
 
 
-def answer_text(found: Answer) -> Lines:
+def answer_text(answer: Answer) -> Lines:
     """Yield what `apc analyze` prints: the analysis, and what stands beside it."""
-    conventions, topology = found.conventions, found.analysis.topology
+    conventions, topology = answer.conventions, answer.analysis.topology
     warned = f"Warning: {conventions.warning}" if conventions.warning else ""
-    nominal: tuple[object, ...] = (found.analysis, found.sensitivities, found.margins)
-    if found.network is not None and not found.nominal:
-        nominal = (_in_short(found.analysis),)
+    nominal: tuple[object, ...] = (answer.analysis, answer.sensitivities, answer.margins)
+    if answer.network is not None and not answer.nominal:
+        nominal = (_in_short(answer.analysis),)
     parts = (
-        found.box,
-        found.network,
+        answer.box,
+        answer.network,
         *nominal,
-        found.contact_modes,
-        found.switching,
-        found.buzz,
-        "\n".join(wrapped(f"{topology}: {found.no_buzz}")) if found.no_buzz else "",
-        conventions if found.detailed else "\n".join(wrapped(warned)),
+        answer.contact_modes,
+        answer.switching,
+        answer.buzz,
+        "\n".join(wrapped(f"{topology}: {answer.no_buzz}")) if answer.no_buzz else "",
+        conventions if answer.detailed else "\n".join(wrapped(warned)),
     )
     first, _, rest = "\n\n".join(filter(None, map(str, filter(None, parts)))).partition("\n")
     yield first
-    yield from warning_lines(found.warnings)
+    yield from warning_lines(answer.warnings)
     yield rest
 
 
-def _in_short(found: Analysis) -> str:
+def _in_short(analysis: Analysis) -> str:
     """Return the verdict of the nominal network, beside that of the network as it is."""
-    radius = radius_text(found.spectral_radius, found.spectral_radius_error, found.beyond)
+    radius = radius_text(analysis.spectral_radius, analysis.spectral_radius_error, analysis.beyond)
     text = (
-        f"With every packet on time: {found.verdict}, spectral radius {radius} per frame of "
-        f"{found.frame_s * 1000:.6g} ms (apc analyze --nominal says all of it)."
+        f"With every packet on time: {analysis.verdict}, spectral radius {radius} per frame of "
+        f"{analysis.frame_s * 1000:.6g} ms (apc analyze --nominal says all of it)."
     )
     return "\n".join(sentences(text))
 
@@ -210,34 +210,34 @@ def warning_lines(warnings: Sequence[str]) -> Lines:
     return notes(*(f"Warning: {text}" for text in warnings))
 
 
-def network_answer_text(found: NetworkAnswer) -> Lines:
+def network_answer_text(network_answer: NetworkAnswer) -> Lines:
     """Yield the verdict over the network as it is, and what moves it."""
-    yield f"{found.verdict}\n\n{found.sensitivities}\n\n{found.margins}"
+    yield f"{network_answer.verdict}\n\n{network_answer.sensitivities}\n\n{network_answer.margins}"
 
 
-def network_answer_document(found: NetworkAnswer) -> Plain:
+def network_answer_document(network_answer: NetworkAnswer) -> Plain:
     """Return the verdict over the network as it is, and what moves it, as plain data."""
-    return found.verdict.to_dict() | {
-        "sensitivities": found.sensitivities.to_dict(),
-        "margins": document(found.margins.rows),
-        "margins_note": found.margins.note,
+    return network_answer.verdict.to_dict() | {
+        "sensitivities": network_answer.sensitivities.to_dict(),
+        "margins": document(network_answer.margins.rows),
+        "margins_note": network_answer.margins.note,
     }
 
 
-def answer_document(found: Answer) -> Plain:
+def answer_document(answer: Answer) -> Plain:
     """Return what `apc analyze --json` prints: the analysis with more keys."""
-    told = found.analysis.to_dict()
-    told |= picked(found, "network", "sensitivities", "contact_modes", "switching", "buzz")
+    told = answer.analysis.to_dict()
+    told |= picked(answer, "network", "sensitivities", "contact_modes", "switching", "buzz")
     told |= {
-        "margins": document(found.margins.rows),
-        "margins_note": found.margins.note,
-        "buzz_note": "" if found.buzz else found.no_buzz or NOT_PLAYED,
-        "warnings": [*found.warnings, *filter(None, (found.conventions.warning,))],
+        "margins": document(answer.margins.rows),
+        "margins_note": answer.margins.note,
+        "buzz_note": "" if answer.buzz else answer.no_buzz or NOT_PLAYED,
+        "warnings": [*answer.warnings, *filter(None, (answer.conventions.warning,))],
     }
-    if found.detailed:
-        told["conventions"] = found.conventions.to_dict()
-    if found.box is not None:
-        told["box"] = found.box.to_dict()
+    if answer.detailed:
+        told["conventions"] = answer.conventions.to_dict()
+    if answer.box is not None:
+        told["box"] = answer.box.to_dict()
     return told
 
 
@@ -302,103 +302,110 @@ def _leading(mode: Mode) -> str:
     return ", ".join(f"{name} {share:.0%}" for name, share in largest if share >= LEAST_SHARE)
 
 
-def needs_text(found: Needs) -> Lines:
+def needs_text(needs: Needs) -> Lines:
     """Yield what a scene needs in one sentence."""
-    several = len(found.sites) > 1
-    sites = "; ".join(f"{site.name}: {_site(site)}" if several else _site(site) for site in found.sites)
-    whole = found.peers > 1 and sum(count for count, _ in found.systems) == 1
-    noun = "determinant" if found.method == "determinant" else "system" if whole else "mode"
-    systems = " and ".join(f"{counted(count, noun)} of {size}" for count, size in found.systems)
-    analysed = f"not analysed: {found.refused}" if found.refused else f"analysed as {systems}"
-    pairs = "".join(f"; costs N²: {name} is evaluated once a pair of peers" for name in found.pairs)
-    yield f"{sites}, {counted(found.peers, 'peer')}; {analysed}{pairs}"
+    several = len(needs.sites) > 1
+    sites = "; ".join(f"{site.name}: {_site(site)}" if several else _site(site) for site in needs.sites)
+    whole = needs.peers > 1 and sum(count for count, _ in needs.systems) == 1
+    noun = "determinant" if needs.method == "determinant" else "system" if whole else "mode"
+    systems = " and ".join(f"{counted(count, noun)} of {size}" for count, size in needs.systems)
+    analysed = f"not analysed: {needs.refused}" if needs.refused else f"analysed as {systems}"
+    pairs = "".join(f"; costs N²: {name} is evaluated once a pair of peers" for name in needs.pairs)
+    yield f"{sites}, {counted(needs.peers, 'peer')}; {analysed}{pairs}"
 
 
-def _site(found: SiteNeeds) -> str:
-    parts = [f"{found.motion} motion"]
-    if found.remembered:
-        parts.append(f"{found.remembered} delayed force")
-    if found.packets:
-        parts.append(f"{found.packets} network")
-    return f"{found.states} states a peer ({', '.join(parts)})"
+def _site(site_needs: SiteNeeds) -> str:
+    parts = [f"{site_needs.motion} motion"]
+    if site_needs.remembered:
+        parts.append(f"{site_needs.remembered} delayed force")
+    if site_needs.packets:
+        parts.append(f"{site_needs.packets} network")
+    return f"{site_needs.states} states a peer ({', '.join(parts)})"
 
 
-def box_proof_text(found: BoxProof) -> Lines:
+def box_proof_text(box_proof: BoxProof) -> Lines:
     """Yield what was proved of a box."""
     where = [
         f"  {interval.free.label} = {quantity(value, interval.unit, 12)}"
-        for interval, value in zip(found.ranges, found.point, strict=False)  # a proved box has no point
+        for interval, value in zip(
+            box_proof.ranges, box_proof.point, strict=False
+        )  # a proved box has no point
     ]
-    cells = counted(found.cells, "cell")
-    said = f"undecided, {100 * found.open_share:.3g} % of the box is left open ({cells})"
-    if found.stable is not None:
-        whole = f"proved {found.verdict} for every value in the box ({cells})"
-        said = whole if found.stable else "not stable in all of the box"
-    yield f"{found.topology}:"
-    for text in (*found.left_out, said):
+    cells = counted(box_proof.cells, "cell")
+    said = f"undecided, {100 * box_proof.open_share:.3g} % of the box is left open ({cells})"
+    if box_proof.stable is not None:
+        whole = f"proved {box_proof.verdict} for every value in the box ({cells})"
+        said = whole if box_proof.stable else "not stable in all of the box"
+    yield f"{box_proof.topology}:"
+    for text in (*box_proof.left_out, said):
         yield from wrapped(text)
-    yield from (f"  {range_text(interval)}" for interval in found.ranges)
-    if found.stable is False:
-        yield f"proved {found.verdict} at"
+    yield from (f"  {range_text(interval)}" for interval in box_proof.ranges)
+    if box_proof.stable is False:
+        yield f"proved {box_proof.verdict} at"
         yield from where
-    elif found.stable is None and found.point:  # else nothing was looked at, as its notes say
+    elif box_proof.stable is None and box_proof.point:  # else nothing was looked at, as its notes say
         yield "among others around"
         yield from where
-        yield from wrapped(f"more cells may decide it: --cells {MORE_CELLS * found.cells}")
-    if found.changing is not None:
+        yield from wrapped(f"more cells may decide it: --cells {MORE_CELLS * box_proof.cells}")
+    if box_proof.changing is not None:
         yield ""
-        yield from wrapped(_changing(found.changing, found.ranges[0]))
-    yield from notes(*found.notes)
+        yield from wrapped(_changing(box_proof.changing, box_proof.ranges[0]))
+    yield from notes(*box_proof.notes)
 
 
-def _changing(found: ChangingDelay, over: Range) -> str:
+def _changing(changing: ChangingDelay, over: Range) -> str:
     """Return what is proved of a delay that changes from packet to packet, in a sentence."""
     low, high = (quantity(float(number), over.unit, 9) for number in (over.low, over.high))
-    said = [found.note or "open whether it stays stable"]
-    if found.unstable is not None:
-        said = [f"unstable if by turns {found.unstable[0]} packets take {low} and {found.unstable[1]} {high}"]
-    if found.proved_to == float(over.high):
+    said = [changing.note or "open whether it stays stable"]
+    if changing.unstable is not None:
+        first, second = changing.unstable
+        said = [f"unstable if by turns {first} packets take {low} and {second} {high}"]
+    if changing.proved_to == float(over.high):
         said = ["stable, proved by the small gain theorem"]
-    elif found.proved_to is not None:
-        to = quantity(found.proved_to, over.unit, 9)
+    elif changing.proved_to is not None:
+        to = quantity(changing.proved_to, over.unit, 9)
         said = [f"stable from {low} to {to}, proved by the small gain theorem", f"over all of it {said[0]}"]
     return f"However the delay changes from packet to packet: {'; '.join(said)}."
 
 
-def range_text(found: Range) -> str:
+def range_text(interval: Range) -> str:
     """Return a parameter and its range in words."""
-    low, high = (quantity(float(number), found.unit, 9) for number in (found.low, found.high))
-    return f"{found.free.label} from {low} to {high}"
+    low, high = (quantity(float(number), interval.unit, 9) for number in (interval.low, interval.high))
+    return f"{interval.free.label} from {low} to {high}"
 
 
-def range_document(found: Range) -> Plain:
+def range_document(interval: Range) -> Plain:
     """Return a parameter and its range as plain data."""
-    return {"parameter": found.free.label, "unit": found.unit, "range": document((found.low, found.high))}
-
-
-def box_proof_document(found: BoxProof) -> Plain:
-    """Return what was proved of a box as plain data."""
     return {
-        **picked(found, "topology", "left_out", "verdict", "stable", "cells", "open_share", "notes"),
-        "box": [range_document(interval) for interval in found.ranges],
-        "unstable_at": list(found.point) if found.stable is False else None,
-        "open_around": list(found.point) if found.stable is None and found.point else None,
-        "changing": found.changing and picked(found.changing, "proved_to", "unstable", "note"),
+        "parameter": interval.free.label,
+        "unit": interval.unit,
+        "range": document((interval.low, interval.high)),
     }
 
 
-def contact_modes_text(found: ContactModes) -> Lines:
+def box_proof_document(box_proof: BoxProof) -> Plain:
+    """Return what was proved of a box as plain data."""
+    return {
+        **picked(box_proof, "topology", "left_out", "verdict", "stable", "cells", "open_share", "notes"),
+        "box": [range_document(interval) for interval in box_proof.ranges],
+        "unstable_at": list(box_proof.point) if box_proof.stable is False else None,
+        "open_around": list(box_proof.point) if box_proof.stable is None and box_proof.point else None,
+        "changing": box_proof.changing and picked(box_proof.changing, "proved_to", "unstable", "note"),
+    }
+
+
+def contact_modes_text(contact_modes: ContactModes) -> Lines:
     """Yield the modes of contact as a table, and which is unstable in words."""
-    if not found.modes:
-        yield f"{found.topology}: no part switches"
-        yield from found.notes
+    if not contact_modes.modes:
+        yield f"{contact_modes.topology}: no part switches"
+        yield from contact_modes.notes
         return
-    yield from wrapped(f"{found.topology}: {found.summary}")
+    yield from wrapped(f"{contact_modes.topology}: {contact_modes.summary}")
     yield ""
-    yield from (f"  {name} on: it follows the motion; off: it does not" for name in found.parts)
+    yield from (f"  {name} on: it follows the motion; off: it does not" for name in contact_modes.parts)
     rows = [("spectral radius", "frequency", "verdict", "")]
     refused = []
-    for mode in found.modes:
+    for mode in contact_modes.modes:
         if mode.refusal:
             rows.append(("–", "–", "not analysed", mode.name))
             refused.append(f"{mode.name}: not analysed: {mode.refusal}")
@@ -410,47 +417,47 @@ def contact_modes_text(found: ContactModes) -> Lines:
         rows.append((radius, frequency, verdict + "*" * mode.linearized, mode.name))
     yield ""
     yield from table(rows, "<><<")
-    if any(mode.linearized for mode in found.modes):
+    if any(mode.linearized for mode in contact_modes.modes):
         yield "\n  * near the start values: this piece is not linear"
-    yield from notes(*refused, *found.notes)
+    yield from notes(*refused, *contact_modes.notes)
 
 
-def contact_modes_document(found: ContactModes) -> Plain:
+def contact_modes_document(contact_modes: ContactModes) -> Plain:
     """Return the modes of contact as plain data."""
-    modes = [_analysed(mode, {"on": dict(mode.on)}, "frequency_hz") for mode in found.modes]
-    return record(found, {"unstable": found.unstable, "modes": modes})
+    modes = [_analysed(mode, {"on": dict(mode.on)}, "frequency_hz") for mode in contact_modes.modes]
+    return record(contact_modes, {"unstable": contact_modes.unstable, "modes": modes})
 
 
-def switching_text(found: Switching) -> Lines:
+def switching_text(switching: Switching) -> Lines:
     """Yield whether contacts may open and close at will, in words."""
-    reach = found.reach
-    if found.stable:
+    reach = switching.reach
+    if switching.stable:
         said = "proved stable by the circle criterion"
-        if found.jumps:
-            said += f" (as {found.jumps} jumps where it opens, within bounds: it need not come to rest)"
+        if switching.jumps:
+            said += f" (as {switching.jumps} jumps where it opens, within bounds: it need not come to rest)"
     else:
-        said = f"{'cannot be proved' if found.stable is False else 'not decided'}: {found.reason}"
+        said = f"{'cannot be proved' if switching.stable is False else 'not decided'}: {switching.reason}"
     if reach is not None and math.isfinite(reach):
         times = f"{math.floor(reach * 10**DECIMALS) / 10**DECIMALS:.6g}"
         said += f"; the criterion holds for contacts up to {times} times as stiff"
     elif reach is not None:
         said += "; the criterion holds however stiff the contacts"
-    yield from wrapped(f"{found.topology}, contacts that open and close at will: {said}", "", "  ")
+    yield from wrapped(f"{switching.topology}, contacts that open and close at will: {said}", "", "  ")
 
 
-def switching_document(found: Switching) -> Plain:
+def switching_document(switching: Switching) -> Plain:
     """Return whether contacts may open and close at will, as plain data."""
-    return {"stable": found.stable, **record(found)}
+    return {"stable": switching.stable, **record(switching)}
 
 
-def _analysed(found: ContactMode | Outcome, instead: Plain, *more: str) -> Plain:
+def _analysed(result: ContactMode | Outcome, instead: Plain, *more: str) -> Plain:
     """Return plain data of what may have been refused: then there are no numbers of an analysis."""
-    if not found.verdict:
+    if not result.verdict:
         instead |= dict.fromkeys(("verdict", "spectral_radius", "spectral_radius_error", *more))
-    return record(found, instead)
+    return record(result, instead)
 
 
-def conventions_text(found: Conventions) -> Lines:
+def conventions_text(conventions: Conventions) -> Lines:
     """Yield what every convention leads to."""
     from apc.analysis.conventions import (  # loaded where there are outcomes, and else not needed
         DEFAULT,
@@ -458,12 +465,12 @@ def conventions_text(found: Conventions) -> Lines:
     )
 
     headline = "the same verdict under every convention"
-    if not found.repeated:
-        headline = found.not_repeated
-    elif found.flips:
+    if not conventions.repeated:
+        headline = conventions.not_repeated
+    elif conventions.flips:
         headline = "the verdict depends on the conventions"
-    yield f"{found.topology}: {headline}\n"
-    for number, outcome in enumerate(found.outcomes, 1):
+    yield f"{conventions.topology}: {headline}\n"
+    for number, outcome in enumerate(conventions.outcomes, 1):
         radius = radius_text(outcome.spectral_radius, outcome.spectral_radius_error, outcome.beyond)
         yield f"  {number}  {outcome.verdict or 'not analysed'}"
         yield f"     spectral radius {radius}" if outcome.verdict else f"     {outcome.refusal}"
@@ -471,31 +478,33 @@ def conventions_text(found: Conventions) -> Lines:
         if outcome.start:
             yield f"     heard before the first packet: {outcome.start}"
         yield f"     {len(outcome.orders)} of {ORDERS} orders, such as {' < '.join(outcome.orders[0])}"
-    if found.repeated and not found.start_matters:
+    if conventions.repeated and not conventions.start_matters:
         yield "\n  What is heard before the first packet can't change the verdict."
 
 
-def conventions_document(found: Conventions) -> Plain:
+def conventions_document(conventions: Conventions) -> Plain:
     """Return what every convention leads to as plain data."""
-    outcomes = [_analysed(outcome, {}) for outcome in found.outcomes]
-    return record(found, {"flips": found.flips, "repeated": found.repeated, "outcomes": outcomes})
+    outcomes = [_analysed(outcome, {}) for outcome in conventions.outcomes]
+    return record(
+        conventions, {"flips": conventions.flips, "repeated": conventions.repeated, "outcomes": outcomes}
+    )
 
 
-def paper_route_text(found: PaperRoute) -> Lines:
+def paper_route_text(paper_route: PaperRoute) -> Lines:
     """Yield the shapes of the paper's matrices, a line each."""
-    yield f"ratio {found.ratio}, frame {found.frame_s * 1e3:.6g} ms"
-    for field in fields(found):
-        matrix = getattr(found, field.name)
+    yield f"ratio {paper_route.ratio}, frame {paper_route.frame_s * 1e3:.6g} ms"
+    for field in fields(paper_route):
+        matrix = getattr(paper_route, field.name)
         if hasattr(matrix, "columns"):
             which, mark, of = field.name.partition("_")
             name = "A_cl" if which == "closed" else f"{which.upper()}{mark}{of.replace('d', 'D')}"
             yield f"  {name:<6} {len(matrix.rows):>4} × {len(matrix.columns)}"
 
 
-def matrix_text(found: NamedMatrix) -> Lines:
+def matrix_text(named_matrix: NamedMatrix) -> Lines:
     """Yield the shape of a matrix and the ends of its names."""
-    rows, columns = found.rows, found.columns
-    ends = f": {rows[0]} … {rows[-1]} by {columns[0]} … {columns[-1]}" if found.values.size else ""
+    rows, columns = named_matrix.rows, named_matrix.columns
+    ends = f": {rows[0]} … {rows[-1]} by {columns[0]} … {columns[-1]}" if named_matrix.values.size else ""
     yield f"{len(rows)} × {len(columns)}{ends}"
 
 
@@ -529,12 +538,12 @@ def analysis_picture(result: Analysis, ax: Any = None) -> Any:
     return ax
 
 
-def locus_picture(found: Locus, ax: Any = None) -> Any:
+def locus_picture(locus: Locus, ax: Any = None) -> Any:
     """Draw where eigenvalues go as a parameter grows; return the matplotlib Axes.
 
     Parameters
     ----------
-    found
+    locus
         The eigenvalues by value.
     ax
         The matplotlib Axes to draw into; one of a figure of its own if not given.
@@ -545,21 +554,21 @@ def locus_picture(found: Locus, ax: Any = None) -> Any:
         E875 matplotlib is not installed.
     """
     ax = _circle(ax)
-    of = found.critical
-    points = np.concatenate(found.eigenvalues)  # conjugates are among them
-    colours = np.repeat(found.values, [len(eigenvalue) for eigenvalue in found.eigenvalues])
+    of = locus.critical
+    points = np.concatenate(locus.eigenvalues)  # conjugates are among them
+    colours = np.repeat(locus.values, [len(eigenvalue) for eigenvalue in locus.eigenvalues])
     drawn = ax.scatter(points.real, points.imag, c=colours, s=5, linewidths=0, cmap="viridis", zorder=3)
     ax.figure.colorbar(drawn, ax=ax, label=axis_label(of.parameter, of.unit))
-    _mark(ax, found.now, "x", COLOURS[2], f"now, {quantity(of.present, of.unit)}")
+    _mark(ax, locus.now, "x", COLOURS[2], f"now, {quantity(of.present, of.unit)}")
     for place, crossing in enumerate(of.crossings[:MOST_NAMED]):
-        if not found.values.size or not found.values[0] <= crossing.value <= found.values[-1]:
+        if not locus.values.size or not locus.values[0] <= crossing.value <= locus.values[-1]:
             continue
-        nearest = found.eigenvalues[int(np.abs(found.values - crossing.value).argmin())]
+        nearest = locus.eigenvalues[int(np.abs(locus.values - crossing.value).argmin())]
         at = nearest[np.abs(np.abs(nearest) - 1).argmin()]
         told = "" if np.isnan(crossing.frequency_hz) else f", {in_hertz(crossing.frequency_hz)}"
         label = f"changes at {quantity(crossing.value, of.unit)}{told}"
         _mark(ax, at / abs(at), MARKS[place], "none", label)
-    _entitle(ax, [f"{of.topology}: eigenvalues of a frame of {1e3 * found.frame_s:g} ms, packets on time"])
+    _entitle(ax, [f"{of.topology}: eigenvalues of a frame of {1e3 * locus.frame_s:g} ms, packets on time"])
     return ax
 
 

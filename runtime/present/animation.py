@@ -47,14 +47,14 @@ def check_animation(path: Path) -> None:
 
 
 @part("draw")
-def save_animation(system: CompiledSystem, found: Trajectory, path: Path) -> None:
+def save_animation(system: CompiledSystem, trajectory: Trajectory, path: Path) -> None:
     """Draw a run into a file that moves, its format chosen by the suffix.
 
     Parameters
     ----------
     system
         The compiled scene.
-    found
+    trajectory
         Its run, with the positions of all bodies among the signals.
     path
         A .gif or .mp4.
@@ -67,17 +67,17 @@ def save_animation(system: CompiledSystem, found: Trajectory, path: Path) -> Non
     check_animation(path)
     moving = need("matplotlib.animation", "plot")
     figure, actors = draw_actors(system)
-    columns = {signal.name: place for place, signal in enumerate(found.signals)}
-    tracks = [MM * found.values[:, [columns[name] for name in actor.states]] for actor in actors]
-    turns = [heading(found.values[:, [columns[text] for text in actor.turning]]) for actor in actors]
+    columns = {signal.name: place for place, signal in enumerate(trajectory.signals)}
+    tracks = [MM * trajectory.values[:, [columns[name] for name in actor.states]] for actor in actors]
+    turns = [heading(trajectory.values[:, [columns[text] for text in actor.turning]]) for actor in actors]
     for actor, track in zip(actors, tracks, strict=True):
         widen(actor, track)
     if actors:
         keep_in_sight([actor.ax for actor in actors])
-    start, end = float(found.time[0]), float(found.time[-1])
+    start, end = float(trajectory.time[0]), float(trajectory.time[-1])
     seconds = min(max(end - start, SHORTEST), LONGEST)
     times = np.linspace(start, end, round(RATE * seconds) + 1)
-    rows = np.minimum(np.searchsorted(found.time, times), len(found.time) - 1)
+    rows = np.minimum(np.searchsorted(trajectory.time, times), len(trajectory.time) - 1)
     speed = (end - start) / seconds
     told = "" if abs(speed - 1) < 1e-3 else f", {speed:.2g} × as fast as it is"
     pixels = [2 * round(side * DPI / 2) for side in figure.get_size_inches()]  # ffmpeg wants even ones
@@ -92,7 +92,7 @@ def save_animation(system: CompiledSystem, found: Trajectory, path: Path) -> Non
             named = Path(folder, f"moving{path.suffix.lower()}")  # writers go by the suffix
             with writer.saving(figure, named, DPI):
                 for row in rows.tolist():
-                    title.set_text(f"{system.name}: {found.time[row]:.3f} s{told}")
+                    title.set_text(f"{system.name}: {trajectory.time[row]:.3f} s{told}")
                     for actor, track, turn in zip(actors, tracks, turns, strict=True):
                         actor.move(track[row], turn[row])
                     writer.grab_frame()

@@ -33,23 +33,23 @@ BETTER = (
 STARRED = "stable*: stable up to a common translation"
 
 
-def bench_text(found: Bench) -> Lines:
+def bench_text(bench: Bench) -> Lines:
     """Yield a table a task, the methods sorted by time."""
-    peers = counted(found.peers, "peer", ",")
-    yield f"{found.topology}: {peers}\n"
-    for comparison in found.comparisons:
+    peers = counted(bench.peers, "peer", ",")
+    yield f"{bench.topology}: {peers}\n"
+    for comparison in bench.comparisons:
         yield from _task(comparison)
         yield ""
-    yield from notes(", ".join(f"{name} {value}" for name, value in found.machine.items() if value))
+    yield from notes(", ".join(f"{name} {value}" for name, value in bench.machine.items() if value))
 
 
-def _task(found: Comparison) -> Lines:
-    yield f"apc {found.task}: time against error of the {found.quantity}"
-    yield from notes(*found.left_out)
+def _task(comparison: Comparison) -> Lines:
+    yield f"apc {comparison.task}: time against error of the {comparison.quantity}"
+    yield from notes(*comparison.left_out)
     yield ""
-    if found.measured:
+    if comparison.measured:
         rows = [("method", "median", "spread", "error", "bound", "")]
-        for measured in found.measured:
+        for measured in comparison.measured:
             spread = NOTHING if measured.rounds < 2 else _time(measured.spread)
             marks = ("*" if measured.front else " ") + (" chosen" if measured.chosen else "")
             rows.append(
@@ -64,37 +64,37 @@ def _task(found: Comparison) -> Lines:
             )
         yield from table(rows, "<>>>><")
         yield ""
-        known = any(measured.error is not None for measured in found.measured)
-        told = [f"error and bound are {found.relative}", BETTER] if known else []
-        reference = f"{'' if known else 'no '}reference: {found.reference}"
-        yield from notes(_times(found), *told, _choice(found), reference, *found.notes)
-    yield from notes(*(f"{name} left out: {reason}" for name, reason in found.refused))
+        known = any(measured.error is not None for measured in comparison.measured)
+        told = [f"error and bound are {comparison.relative}", BETTER] if known else []
+        reference = f"{'' if known else 'no '}reference: {comparison.reference}"
+        yield from notes(_times(comparison), *told, _choice(comparison), reference, *comparison.notes)
+    yield from notes(*(f"{name} left out: {reason}" for name, reason in comparison.refused))
 
 
-def _times(found: Comparison) -> str:
+def _times(comparison: Comparison) -> str:
     """Say what the columns of times are."""
-    least, most = (pick(measured.rounds for measured in found.measured) for pick in (min, max))
+    least, most = (pick(measured.rounds for measured in comparison.measured) for pick in (min, max))
     runs = counted(most, "run") if least == most else f"{least} to {most} runs"
     columns = "median and spread (half the distance between the quartiles)"
-    return f"{columns} are of {runs}: processor time of {found.timed}"
+    return f"{columns} are of {runs}: processor time of {comparison.timed}"
 
 
-def _choice(found: Comparison) -> str:
-    chosen: Measured | None = found.chosen
+def _choice(comparison: Comparison) -> str:
+    chosen: Measured | None = comparison.chosen
     if chosen is None:
-        return f"what {found.task} chooses is none of these"
+        return f"what {comparison.task} chooses is none of these"
     if chosen.error is None:
         where = "which can't be judged without a reference"
     else:
         where = "which is on the front" if chosen.front else "which is NOT on the front"
-    return f"{found.task} chooses {chosen.name}, {where}"
+    return f"{comparison.task} chooses {chosen.name}, {where}"
 
 
-def hard_text(found: HardReport) -> Lines:
+def hard_text(hard_report: HardReport) -> Lines:
     """Yield a line a hard case, and what failed."""
-    yield f"{found.folder}: {counted(len(found.cases), 'scene')} with a known truth\n"
+    yield f"{hard_report.folder}: {counted(len(hard_report.cases), 'scene')} with a known truth\n"
     rows = [("scene", "error", "bound", "bound÷error", "time", "verdict")]
-    for case in found.cases:
+    for case in hard_report.cases:
         loose = f"{case.looseness:.2g}" if math.isfinite(case.looseness) else NOTHING
         verdict = case.verdict.replace("stable up to a common translation", "stable*").partition(":")[0]
         mark = "FAILED" if case.failed else verdict
@@ -104,27 +104,27 @@ def hard_text(found: HardReport) -> Lines:
     yield from notes("error and bound are of the spectral radius ρ, divided by ρ where it is above 1")
     if any(row[-1] == "stable*" for row in rows):
         yield from notes(STARRED)
-    yield from notes(*(f"{name} has no truth beside it: left out" for name in found.without))
-    yield from notes(*(f"FAILED {case.name}: {case.failed}" for case in found.failures))
-    if found.failures:
-        undecided = sum(case.undecided for case in found.cases)
-        unbounded = sum(case.unbounded for case in found.cases)
-        scenes = f"{len(found.failures)} of {counted(len(found.cases), 'scene')} failed"
+    yield from notes(*(f"{name} has no truth beside it: left out" for name in hard_report.without))
+    yield from notes(*(f"FAILED {case.name}: {case.failed}" for case in hard_report.failures))
+    if hard_report.failures:
+        undecided = sum(case.undecided for case in hard_report.cases)
+        unbounded = sum(case.unbounded for case in hard_report.cases)
+        scenes = f"{len(hard_report.failures)} of {counted(len(hard_report.cases), 'scene')} failed"
         yield from notes(f"{scenes}; {undecided} left open, {unbounded} without a bound")
     else:
         yield from notes("every bound holds; every verdict is right")
 
 
-def scale_text(found: Scale) -> Lines:
+def scale_text(scale: Scale) -> Lines:
     """Yield a line a number of peers."""
     from apc.benchmark.scale import REPEATS  # loaded where there is one, and else not needed
 
-    beside = {row.peers - row.count for row in found.rows} - {0}
+    beside = {row.peers - row.count for row in scale.rows} - {0}
     others = "".join(f", beside {number:,} of other groups" for number in sorted(beside))
-    yield from wrapped(f"{found.topology}: peers of group {found.group}{others}")
+    yield from wrapped(f"{scale.topology}: peers of group {scale.group}{others}")
     yield ""
     rows = [("peers", "compile", "analyze", "memory", "error", "bound", "method")]
-    for row in found.rows:
+    for row in scale.rows:
         memory = f"{row.memory / 2**20:.0f} MiB"
         numbers = (_time(row.compile_s), _time(row.analyze_s), memory, _size(row.error), _size(row.bound))
         rows.append((f"{row.count:,}", *numbers, row.method))
@@ -133,24 +133,24 @@ def scale_text(found: Scale) -> Lines:
     times = f"processor time of compiling, and the median of {REPEATS} analyses"
     yield from notes(
         f"{times}; error of the spectral radius",
-        f"memory is the most the whole process took, of which {found.floor}",
-        *(f"{counted(count, 'peer', ',')}: {reason}" for count, reason in found.refused),
+        f"memory is the most the whole process took, of which {scale.floor}",
+        *(f"{counted(count, 'peer', ',')}: {reason}" for count, reason in scale.refused),
     )
 
 
-def hard_document(found: HardReport) -> dict[str, Any]:
+def hard_document(hard_report: HardReport) -> dict[str, Any]:
     """Return what `apc bench --hard --json` prints."""
     return {
-        "folder": found.folder,
-        "cases": [record(case, {"bound_over_error": case.looseness}) for case in found.cases],
-        "without_truth": list(found.without),
-        "failed": [case.name for case in found.failures],
-        "undecided": [case.name for case in found.cases if case.undecided],
-        "unbounded": [case.name for case in found.cases if case.unbounded],
+        "folder": hard_report.folder,
+        "cases": [record(case, {"bound_over_error": case.looseness}) for case in hard_report.cases],
+        "without_truth": list(hard_report.without),
+        "failed": [case.name for case in hard_report.failures],
+        "undecided": [case.name for case in hard_report.cases if case.undecided],
+        "unbounded": [case.name for case in hard_report.cases if case.unbounded],
     }
 
 
-def bench_picture(found: Bench) -> Any:
+def bench_picture(bench: Bench) -> Any:
     """Draw every task that has errors; return the matplotlib Figure.
 
     Raises
@@ -158,21 +158,21 @@ def bench_picture(found: Bench) -> Any:
     ApcError
         E875 matplotlib is not installed.
     """
-    figure = new_figure((WIDTH * len(found.comparisons), HEIGHT))
-    axes = figure.subplots(1, len(found.comparisons), squeeze=False)[0]
-    for ax, comparison in zip(axes, found.comparisons, strict=True):
+    figure = new_figure((WIDTH * len(bench.comparisons), HEIGHT))
+    axes = figure.subplots(1, len(bench.comparisons), squeeze=False)[0]
+    for ax, comparison in zip(axes, bench.comparisons, strict=True):
         _panel(ax, comparison)
-    figure.suptitle(f"{found.topology}: error against time", fontsize=11)
+    figure.suptitle(f"{bench.topology}: error against time", fontsize=11)
     return figure
 
 
-def _panel(ax: Any, found: Comparison) -> None:
-    ax.set_title(f"apc {found.task}", fontsize=10)
+def _panel(ax: Any, comparison: Comparison) -> None:
+    ax.set_title(f"apc {comparison.task}", fontsize=10)
     ax.set_xlabel("median time [s]")
-    ax.set_ylabel(f"error of the {found.quantity}", fontsize=9)
-    points = [measured for measured in found.measured if measured.error is not None]
+    ax.set_ylabel(f"error of the {comparison.quantity}", fontsize=9)
+    points = [measured for measured in comparison.measured if measured.error is not None]
     if not points:
-        why = "no reference" if found.measured else found.reference
+        why = "no reference" if comparison.measured else comparison.reference
         ax.text(0.5, 0.5, why, transform=ax.transAxes, ha="center")
         return
     ax.set(xscale="log", yscale="log")

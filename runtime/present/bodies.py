@@ -81,11 +81,11 @@ class PeerView:
 
 def positions_of(kind: Kind) -> dict[str, list[int]]:
     """Return the positions of a kind, each by the places of its coordinates among the states."""
-    found: dict[str, list[int]] = {}
+    result: dict[str, list[int]] = {}
     for place, state in enumerate(kind.states):
         if state.unit == "m":
-            found.setdefault(whole_and_index(state.name)[0], []).append(place)
-    return found
+            result.setdefault(whole_and_index(state.name)[0], []).append(place)
+    return result
 
 
 def heading(turned: Floats) -> Floats:
@@ -105,11 +105,11 @@ def heading(turned: Floats) -> Floats:
 
 def turns_of(kind: Kind) -> dict[str, list[int]]:
     """Return of each part that turns, in a plane or in space, the places of how among the states."""
-    found: dict[str, list[int]] = {}
+    result: dict[str, list[int]] = {}
     for place, state in enumerate(kind.states):
         if state.unit == "rad":
-            found.setdefault(state.name.rpartition(".")[0], []).append(place)
-    return {part: places for part, places in found.items() if len(places) in (1, 3)}
+            result.setdefault(state.name.rpartition(".")[0], []).append(place)
+    return {part: places for part, places in result.items() if len(places) in (1, 3)}
 
 
 def moves_in_plane(system: CompiledSystem) -> bool:
@@ -122,15 +122,15 @@ def views_of(system: CompiledSystem) -> list[PeerView]:
     numbers = resolve(system)
     sites = [jacobians(kind) for kind in system.kinds]
     plane = moves_in_plane(system)
-    found: list[PeerView] = []
+    peer_views: list[PeerView] = []
     for group, members in enumerate(system.groups):
-        for peer in range(min(members.count, MOST_PEERS - len(found))):
+        for peer in range(min(members.count, MOST_PEERS - len(peer_views))):
             vector = [float(value) for value in numbers.parameters[group][numbers.rows[group][peer]]]
             start, _, _ = start_values(sites[members.kind], vector)
             bodies, surfaces = bodies_of(system.kinds[members.kind], vector, start)
             shown = tuple(body for body in bodies if not plane or len(body.place) > 1)
-            found.append(PeerView(f"{members.name}[{peer + 1}]", shown, tuple(surfaces)))
-    return found
+            peer_views.append(PeerView(f"{members.name}[{peer + 1}]", shown, tuple(surfaces)))
+    return peer_views
 
 
 def bodies_of(

@@ -81,12 +81,14 @@ REACHES = (
 )
 
 
-def comparison_text(found: Comparison) -> Lines:
+def comparison_text(comparison: Comparison) -> Lines:
     """Yield what `apc compare` prints: a table for each question, a line for each scheme."""
-    schemes = found.schemes
+    schemes = comparison.schemes
     feet: dict[str, int] = {}
     yield counted(len(schemes), "scheme") + " side by side" * (len(schemes) > 1)
-    yield from notes(*_meant(found), *found.left_out, *(f"note: {text}" for text in found.notes))
+    yield from notes(
+        *_meant(comparison), *comparison.left_out, *(f"note: {text}" for text in comparison.notes)
+    )
     tables: list[tuple[tuple[str, ...], Iterable[tuple[str, ...]]]] = [
         (("",), [(f"{scheme.topology}, {counted(scheme.peers, 'peer', ',d')}",) for scheme in schemes]),
         (("verdict", "spectral radius a frame"), [_verdict(scheme, feet) for scheme in schemes]),
@@ -122,11 +124,13 @@ def _costs(scheme: Scheme) -> tuple[str, ...]:
     return f"{counted(effort.operations, 'operation', ',d')}{clock}", *sent
 
 
-def _meant(found: Comparison) -> Iterator[str]:
+def _meant(comparison: Comparison) -> Iterator[str]:
     """Yield what stable means, where it is not that motions die out."""
-    if any(scheme.passive for scheme in found.schemes):
+    if any(scheme.passive for scheme in comparison.schemes):
         yield MEANT["passive"]
-    elif any(reached(scheme, f"{key}.criterion") in MEANT for scheme in found.schemes for key, _ in VARIED):
+    elif any(
+        reached(scheme, f"{key}.criterion") in MEANT for scheme in comparison.schemes for key, _ in VARIED
+    ):
         yield f"of a link that is, or becomes, unreliable: {MEANT['mean-square']}"
 
 
@@ -148,8 +152,8 @@ def _verdict(scheme: Scheme, feet: dict[str, int]) -> tuple[str, str]:
     if scheme.passive is not None:
         told.append("the radius is that with free hands")
     verdict = scheme.verdict + (", linearized" if scheme.analysis.linearized else "")
-    found = scheme.analysis
-    radius = radius_text(found.spectral_radius, found.spectral_radius_error, found.beyond)
+    analysis = scheme.analysis
+    radius = radius_text(analysis.spectral_radius, analysis.spectral_radius_error, analysis.beyond)
     return verdict, _marked(radius, told, feet)
 
 
@@ -167,27 +171,29 @@ def _in_time(scheme: Scheme, feet: dict[str, int]) -> tuple[str, str]:
 
 
 def _varied(scheme: Scheme, key: str, feet: dict[str, int]) -> tuple[str, str]:
-    found: Critical | None = getattr(scheme, key)
-    if found is None:
+    critical: Critical | None = getattr(scheme, key)
+    if critical is None:
         return _marked(NONE, _why(scheme, key), feet), NONE
     told = []
-    if len(found.crossings) > 1:
-        told.append(f"{counted(len(found.crossings), 'crossing')} in all: apc critical {found.parameter}")
-    if found.groups:
+    if len(critical.crossings) > 1:
+        told.append(
+            f"{counted(len(critical.crossings), 'crossing')} in all: apc critical {critical.parameter}"
+        )
+    if critical.groups:
         told.append("one value for all groups, which differ in the scene")
-    return _marked(_reach(found), told, feet), found.parameter
+    return _marked(_reach(critical), told, feet), critical.parameter
 
 
-def _reach(found: Critical) -> str:
+def _reach(critical: Critical) -> str:
     """Return in words how far a scene is stable."""
-    if found.value is None:
-        if not found.enters:
-            return f"{found.verdict.partition(' ')[0]} whatever it is"
-        if found.verdict.startswith("stable"):
-            return f"none up to {quantity(found.scanned[1], found.unit)}"
-        return f"{found.verdict.partition(' ')[0]} from {span(*found.scanned, found.unit)}"
-    value = uncertain(found.value, found.error or 0.0, found.unit).removesuffix(", exact")
-    return value if found.stable_side == "below" else f"{value}, stable above it"
+    if critical.value is None:
+        if not critical.enters:
+            return f"{critical.verdict.partition(' ')[0]} whatever it is"
+        if critical.verdict.startswith("stable"):
+            return f"none up to {quantity(critical.scanned[1], critical.unit)}"
+        return f"{critical.verdict.partition(' ')[0]} from {span(*critical.scanned, critical.unit)}"
+    value = uncertain(critical.value, critical.error or 0.0, critical.unit).removesuffix(", exact")
+    return value if critical.stable_side == "below" else f"{value}, stable above it"
 
 
 def _felt(scheme: Scheme, feet: dict[str, int]) -> tuple[str, str, str]:
@@ -200,9 +206,9 @@ def _felt(scheme: Scheme, feet: dict[str, int]) -> tuple[str, str, str]:
     return cells[0], cells[1], scheme.feel.at
 
 
-def comparison_document(found: Comparison) -> Plain:
+def comparison_document(comparison: Comparison) -> Plain:
     """Return the same as plain data, in SI: each part as the JSON of its command."""
-    return {"schemes": [_document(scheme) for scheme in found.schemes], "notes": list(found.notes)}
+    return {"schemes": [_document(scheme) for scheme in comparison.schemes], "notes": list(comparison.notes)}
 
 
 def _document(scheme: Scheme) -> Plain:
@@ -211,11 +217,11 @@ def _document(scheme: Scheme) -> Plain:
     )
 
 
-def comparison_rows(found: Comparison) -> Tabled:
+def comparison_rows(comparison: Comparison) -> Tabled:
     """Return the columns of a table of schemes, a row a scheme, and what was left out."""
-    left_out = {scheme.topology: list(scheme.left_out) for scheme in found.schemes}
+    left_out = {scheme.topology: list(scheme.left_out) for scheme in comparison.schemes}
     columns = [column for column, _ in COLUMNS]
-    return columns, map(_row, found.schemes), {"left_out": left_out, "notes": list(found.notes)}
+    return columns, map(_row, comparison.schemes), {"left_out": left_out, "notes": list(comparison.notes)}
 
 
 def _varied_columns(key: str, unit: str) -> list[tuple[Column, str]]:
@@ -272,7 +278,7 @@ class _Bar:
     further: bool = False
 
 
-def comparison_picture(found: Comparison) -> Any:
+def comparison_picture(comparison: Comparison) -> Any:
     """Draw all schemes beside each other; return the matplotlib Figure.
 
     Raises
@@ -280,7 +286,7 @@ def comparison_picture(found: Comparison) -> Any:
     ApcError
         E875 matplotlib is not installed.
     """
-    schemes = found.schemes
+    schemes = comparison.schemes
     panels = [(title, [_number(reached(scheme, path)) for scheme in schemes]) for title, path in NUMBERS]
     reaches = [
         (title, [_reach_bar(getattr(scheme, key), scale) for scheme in schemes])
@@ -302,7 +308,7 @@ def comparison_picture(found: Comparison) -> Any:
     axes[0].axvline(BOUNDARY, color="0.4", linewidth=0.8, linestyle=(0, (3, 2)))
     for place, scheme in enumerate(schemes):
         axes[0].annotate(_judged(scheme), (0, place), (4, 0), **LETTERS)
-    lines = [line for text in (*found.left_out, *found.notes) for line in textwrap.wrap(text, 110)]
+    lines = [line for text in (*comparison.left_out, *comparison.notes) for line in textwrap.wrap(text, 110)]
     figure.suptitle("\n".join(lines), fontsize=8.5)
     return figure
 
@@ -311,13 +317,13 @@ def _number(value: complex | None) -> _Bar:
     return _Bar(0.0, NONE) if value is None else _Bar(abs(value), f"{abs(value):.4g}")
 
 
-def _reach_bar(found: Critical | None, scale: float) -> _Bar:
+def _reach_bar(critical: Critical | None, scale: float) -> _Bar:
     """Return how far a scheme is stable: up to a crossing, or beyond all that was looked at."""
-    if found is not None and found.value is not None and found.stable_side == "below":
-        return _Bar(scale * found.value, f"{scale * found.value:.4g}")
-    if found is not None and found.value is None and found.verdict.startswith("stable"):
-        return _Bar(scale * found.scanned[1], f"> {scale * found.scanned[1]:.4g}", further=True)
-    return _Bar(0.0, "unstable" if found is not None and found.verdict.startswith("unstable") else NONE)
+    if critical is not None and critical.value is not None and critical.stable_side == "below":
+        return _Bar(scale * critical.value, f"{scale * critical.value:.4g}")
+    if critical is not None and critical.value is None and critical.verdict.startswith("stable"):
+        return _Bar(scale * critical.scanned[1], f"> {scale * critical.scanned[1]:.4g}", further=True)
+    return _Bar(0.0, "unstable" if critical is not None and critical.verdict.startswith("unstable") else NONE)
 
 
 def _draw(ax: Any, title: str, bars: Sequence[_Bar]) -> None:

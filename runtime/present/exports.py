@@ -28,49 +28,57 @@ def _numbered(word: str, names: Sequence[str]) -> Lines:
     return notes(f"{counted(len(names), word)}: {listed(names)}")
 
 
-def state_space_text(found: StateSpace) -> Lines:
+def state_space_text(state_space: StateSpace) -> Lines:
     """Yield what a state space has."""
-    yield f"{found.topology}: {found.what} over one frame of {found.frame_s * 1e3:.6g} ms\n"
-    for word, ports in (("state", found.states), ("input", found.inputs), ("output", found.outputs)):
+    yield f"{state_space.topology}: {state_space.what} over one frame of {state_space.frame_s * 1e3:.6g} ms\n"
+    for word, ports in (
+        ("state", state_space.states),
+        ("input", state_space.inputs),
+        ("output", state_space.outputs),
+    ):
         yield from _numbered(word, [port.name for port in ports])
-    if found.free:
-        free = listed([port.name for port in found.free])
+    if state_space.free:
+        free = listed([port.name for port in state_space.free])
         yield from notes(f"A, B, C and D are a function of {free}")
     yield ""
-    yield from notes(found.meaning, *found.notes)
+    yield from notes(state_space.meaning, *state_space.notes)
 
 
-def state_space_control(found: StateSpace) -> Any:
+def state_space_control(state_space: StateSpace) -> Any:
     """Return a state space as python-control's."""
     from apc.exports.files import as_control  # what writes files is asked for where one is written
 
-    return as_control(found)
+    return as_control(state_space)
 
 
-def state_space_document(found: StateSpace) -> Plain:
+def state_space_document(state_space: StateSpace) -> Plain:
     """Return a state space as plain data."""
-    function = found.function and found.function.serialize()
-    instead = {"made_by": json.loads(found.made_by), "function": function, "meaning": found.meaning}
-    return record(found, instead)
+    function = state_space.function and state_space.function.serialize()
+    instead = {
+        "made_by": json.loads(state_space.made_by),
+        "function": function,
+        "meaning": state_space.meaning,
+    }
+    return record(state_space, instead)
 
 
-def modelica_text(found: ModelicaModel) -> Lines:
+def modelica_text(model: ModelicaModel) -> Lines:
     """Yield what a Modelica model has."""
-    yield f"{found.topology}: the model {found.name} of Modelica 3.3\n"
-    yield f"  {counted(found.peers, 'peer')}, {counted(found.variables, 'variable')}, one equation each"
-    yield from (f"  {clock}" for clock in found.clocks)
+    yield f"{model.topology}: the model {model.name} of Modelica 3.3\n"
+    yield f"  {counted(model.peers, 'peer')}, {counted(model.variables, 'variable')}, one equation each"
+    yield from (f"  {clock}" for clock in model.clocks)
 
 
-def code_text(found: Code) -> Lines:
+def code_text(code: Code) -> Lines:
     """Yield what a peer's code takes and gives."""
-    peer = found.code
+    peer = code.code
     period = float(peer.schedule.frame_s) / len(peer.instants) * 1e3
     every = (
         f"every {period:.6g} ms"
         if len({instant.move for instant in peer.instants}) == 1
         else "at its instants"
     )
-    yield f"{found.topology}: {peer.name} in C99, {peer.identifier}_tick {every}\n"
+    yield f"{code.topology}: {peer.name} in C99, {peer.identifier}_tick {every}\n"
     for what, names in (
         ("measures", [f"{peer.kind.states[i].name} [{peer.kind.states[i].unit}]" for i in peer.measured]),
         ("hears", [f"{sender.name} over {line.link}" for line in peer.lines for sender in line.senders]),
@@ -80,17 +88,17 @@ def code_text(found: Code) -> Lines:
     ):
         yield from notes(f"{what} {listed(names)}")
     yield ""
-    yield from notes(f"method between ticks: {found.method}; all numbers in SI units")
+    yield from notes(f"method between ticks: {code.method}; all numbers in SI units")
 
 
-def code_document(found: Code) -> Plain:
+def code_document(code: Code) -> Plain:
     """Return a peer's code as plain data."""
     from apc.exports.c_text import source
 
-    peer = found.code
+    peer = code.code
     starts = accumulate((peer.moves[instant.move].quanta for instant in peer.instants), initial=0)
     return {
-        **picked(found, "topology", "method"),
+        **picked(code, "topology", "method"),
         "peer": peer.name,
         "name": peer.identifier,
         "measured": [peer.kind.states[place].name for place in peer.measured],
@@ -110,11 +118,11 @@ def code_document(found: Code) -> Plain:
     }
 
 
-def unit_text(found: Unit) -> Lines:
+def unit_text(unit: Unit) -> Lines:
     """Yield what an FMU takes and gives."""
-    what = found.peer or counted(len(found.scene.peers), "peer")
-    yield f"{found.system.name}: {what} for co-simulation, FMI 2.0\n"
-    variables = found.scene.variables
+    what = unit.peer or counted(len(unit.scene.peers), "peer")
+    yield f"{unit.system.name}: {what} for co-simulation, FMI 2.0\n"
+    variables = unit.scene.variables
     fixed = [variable.name for variable in variables if variable.role == "parameter"]
     yield from _numbered("input", [variable.name for variable in variables if variable.given])
     yield from _numbered(
@@ -122,14 +130,14 @@ def unit_text(found: Unit) -> Lines:
     )
     if fixed:
         yield from _numbered("parameter", fixed)
-    told = f"steps of {found.step * 1e3:.6g} ms show every tick of the fastest clock, values before the tick"
-    if found.peer:
+    told = f"steps of {unit.step * 1e3:.6g} ms show every tick of the fastest clock, values before the tick"
+    if unit.peer:
         told += "; what it hears is set when it has arrived: delays and losses are the network's"
     yield ""
     yield from notes(told)
 
 
-def unit_document(found: Unit) -> Plain:
+def unit_document(unit: Unit) -> Plain:
     """Return an FMU as plain data."""
     variables = [
         {
@@ -137,12 +145,12 @@ def unit_document(found: Unit) -> Plain:
             "input": variable.given,
             "parameter": variable.role == "parameter",
         }
-        for variable in found.scene.variables
+        for variable in unit.scene.variables
     ]
     return {
-        "topology": found.system.name,
-        "peer": found.peer or None,
-        "step_s": found.step,
-        "duration_s": document(found.duration),
+        "topology": unit.system.name,
+        "peer": unit.peer or None,
+        "step_s": unit.step,
+        "duration_s": document(unit.duration),
         "variables": variables,
     }

@@ -98,12 +98,12 @@ def reached(value: Any, path: str) -> Any:
     return value
 
 
-def json_text(found: Any, *, indent: int | None = 2) -> str:
+def json_text(result: Any, *, indent: int | None = 2) -> str:
     """Return plain data as one JSON document, on one line if `indent` is None.
 
     JSON has no word for what is no finite number: null stands in its place, as in `document`.
     """
-    return json.dumps(document(found), ensure_ascii=False, allow_nan=False, indent=indent)
+    return json.dumps(document(result), ensure_ascii=False, allow_nan=False, indent=indent)
 
 
 def radius_text(radius: float, error: float, beyond: tuple[float, float] | None = None) -> str:

@@ -90,10 +90,10 @@ def _places(boxes: Sequence[Box], edges: Sequence[Edge]) -> _Places:
     graph = networkx.Graph()
     graph.add_nodes_from(by_key)
     graph.add_edges_from((edge.one, edge.two) for edge in edges)
-    found: _Places = {}
+    result: _Places = {}
     below = 0.0
     for box in boxes:
-        if box.key in found:
+        if box.key in result:
             continue
         joined = networkx.node_connected_component(graph, box.key)
         hands = [key for key in by_key if key in joined and by_key[key].role == "hand"]
@@ -106,11 +106,11 @@ def _places(boxes: Sequence[Box], edges: Sequence[Edge]) -> _Places:
             width = max(_width(line, SIZE) for box in column for line in box.lines) + 2 * PAD
             top = below + (max(heights) - height) / 2
             for item in column:
-                found[item.key] = left, top, width, _height(item)
+                result[item.key] = left, top, width, _height(item)
                 top += _height(item) + BETWEEN
             left += width + GAP
         below += max(heights) + 2 * BETWEEN
-    return found
+    return result
 
 
 def _width(text: str, size: float) -> float:

@@ -42,45 +42,55 @@ SHOWN = 12
 DIGITS = 6
 
 
-def passive_text(found: PassiveHands) -> Lines:
+def passive_text(passive_hands: PassiveHands) -> Lines:
     """Yield whether a scene is stable with any passive hands, in words and numbers."""
-    yield from wrapped(f"{found.topology}: {found.verdict}{LINEARIZED if found.linearized else ''}", "", "  ")
-    yield from notes(*found.left_out)
+    yield from wrapped(
+        f"{passive_hands.topology}: {passive_hands.verdict}{LINEARIZED if passive_hands.linearized else ''}",
+        "",
+        "  ",
+    )
+    yield from notes(*passive_hands.left_out)
     yield ""
-    if found.why:
-        yield from sentences(f"{found.why}.")
-    elif found.worst is not None:
-        yield from sentences(_worst(found, found.worst))
-    if found.why and not found.modes:
+    if passive_hands.why:
+        yield from sentences(f"{passive_hands.why}.")
+    elif passive_hands.worst is not None:
+        yield from sentences(_worst(passive_hands, passive_hands.worst))
+    if passive_hands.why and not passive_hands.modes:
         yield from sentences(
             "Take the velocity by a backward difference of samples, as VirtualWall does, or none (damping 0)."
         )
     yield ""
-    clamped = radius_text(found.clamped_radius, found.clamped_error)
-    moves = f"spectral radius {clamped}" if found.clamped_radius or found.clamped_error else "nothing moves"
-    yield from labelled(("devices clamped", moves), ("proof", found.proof))
-    if found.modes:
+    clamped = radius_text(passive_hands.clamped_radius, passive_hands.clamped_error)
+    moves = (
+        f"spectral radius {clamped}"
+        if passive_hands.clamped_radius or passive_hands.clamped_error
+        else "nothing moves"
+    )
+    yield from labelled(("devices clamped", moves), ("proof", passive_hands.proof))
+    if passive_hands.modes:
         yield ""
-        yield from table([("mode", "damping", "needed", "at", "at rest", ""), *map(_mode, found.modes)])
+        yield from table(
+            [("mode", "damping", "needed", "at", "at rest", ""), *map(_mode, passive_hands.modes)]
+        )
 
 
-def _worst(found: PassiveHands, worst: PassiveMode) -> str:
+def _worst(passive_hands: PassiveHands, worst: PassiveMode) -> str:
     """Say how the devices move that take most energy out, or need most damping."""
     moved = "all alike" if worst.name in ("common", "single") else f"in a {worst.name} mode"
     if worst.more is None:
         held = "with its devices clamped the scene is unstable, and no damping of theirs helps"
         return f"Devices that move {moved}: {held}."
-    alone = "" if found.joined else ", each by itself"
+    alone = "" if passive_hands.joined else ", each by itself"
     enough = f"With {worst.more:.4g} N*s/m more damping at each device they can't"
-    if found.stable:
+    if passive_hands.stable:
         return (
             f"Whatever gives back no more energy than it was given may hold the devices{alone}. Of their "
             f"damping {-worst.more:.4g} N*s/m could be spared, with the least left as they move {moved} at "
             f"{worst.frequency_hz:.4g} Hz."
         )
-    if found.clamped_stable is False:
+    if passive_hands.clamped_stable is False:
         return "Hands that hold the devices still are passive, and with these the scene is not stable."
-    if found.stable is False:
+    if passive_hands.stable is False:
         return (
             f"Hands that move the devices {moved} at {worst.frequency_hz:.4g} Hz get energy out of the scene "
             f"for ever, and can make it shake. {enough}."
@@ -114,25 +124,25 @@ def _mode(passive_mode: PassiveMode) -> tuple[str, ...]:
     return name, damping, needed, at, stiffness, verdict
 
 
-def passive_document(found: PassiveHands) -> Plain:
+def passive_document(passive_hands: PassiveHands) -> Plain:
     """Return the same as plain data."""
-    modes = [{**document(mode), "damping_needed": document(mode.needed)} for mode in found.modes]
-    return {"hands": "passive", **record(found, {"modes": modes})}
+    modes = [{**document(mode), "damping_needed": document(mode.needed)} for mode in passive_hands.modes]
+    return {"hands": "passive", **record(passive_hands, {"modes": modes})}
 
 
-def feel_text(found: Feel) -> Lines:
+def feel_text(feel: Feel) -> Lines:
     """Yield what is felt at a device, in words and numbers."""
-    title = f"{found.topology}: what a hand feels at {found.at}{LINEARIZED if found.linearized else ''}"
+    title = f"{feel.topology}: what a hand feels at {feel.at}{LINEARIZED if feel.linearized else ''}"
     yield from wrapped(title, "", "  ")
-    yield from notes(*found.notes, *found.left_out)
+    yield from notes(*feel.notes, *feel.left_out)
     yield ""
-    slow = found.low_frequency
+    slow = feel.low_frequency
     if slow is not None:
         yield "  Of slow motions, the other hands as the scene has them:"
         parts = zip(("mass", "damping", "stiffness"), ("kg", "N*s/m", "N/m"), slow.errors, strict=True)
         for name, unit, error in parts:
             yield from labelled((name, measured(getattr(slow, name), error, unit)))
-        if (network := found.network_viscosity) is not None:
+        if (network := feel.network_viscosity) is not None:
             share = measured(network.network, network.error, "N*s/m")
             yield from labelled(("of that", f"{share}, which the network adds"))
         if slow.mass < 0:
@@ -140,16 +150,16 @@ def feel_text(found: Feel) -> Lines:
         yield ""
     headings = ("frequency", "impedance", "phase", "arrives", "copies apart", "alias")
     units = ("Hz", "N*s/m", "degrees", "mm/s/N", "mm/N", "")
-    yield from table([headings, units, *_rows_shown(found)], ">>>>>>")
-    told = [f"arrives: at {found.between}"] if found.between else []
-    told += [f"copies: of {found.copy}, from the mean of the others'"] if found.copy else []
+    yield from table([headings, units, *_rows_shown(feel)], ">>>>>>")
+    told = [f"arrives: at {feel.between}"] if feel.between else []
+    told += [f"copies: of {feel.copy}, from the mean of the others'"] if feel.copy else []
     told += ["alias: the largest part that sampling moves to another frequency, beside that at this one"]
     yield ""
     yield from sentences("; ".join(told))
-    if found.hinf and found.stable is not False:
+    if feel.hinf and feel.stable is not False:
         yield "\n  Largest gain at any frequency (H∞), forces of any course:"
-        yield from table([_extreme(extremes) for extremes in found.hinf])
-    for noise in found.h2:  # of a sample that is off by a mm, a µm is what a mm is of 1 N
+        yield from table([_extreme(extremes) for extremes in feel.hinf])
+    for noise in feel.h2:  # of a sample that is off by a mm, a µm is what a mm is of 1 N
         what, small = ("1 N rms of every hand", "m")
         if noise.source != "hands":
             what, small = "1 mm rms of every device's samples", "µ"
@@ -165,30 +175,30 @@ def feel_text(found: Feel) -> Lines:
         yield from notes(f"{', '.join(values) or 'it drifts'} (rms) for {what}, new at each tick")
 
 
-def _curves(found: Feel) -> list[tuple[NDArray[np.complex128], Floats, float, bool, str]]:
+def _curves(feel: Feel) -> list[tuple[NDArray[np.complex128], Floats, float, bool, str]]:
     """Return what is felt: responses (k,), their relative bounds (k,), a factor, if it is there, its name."""
-    apart = bool(found.copy)
+    apart = bool(feel.copy)
     return [
-        (found.impedance, found.bound, 1.0, True, "impedance (N·s/m)"),
+        (feel.impedance, feel.bound, 1.0, True, "impedance (N·s/m)"),
         (
-            *(found.transmitted_admittance, found.transmitted_bound, 1e3, bool(found.between)),
-            f"velocity at {found.between} (mm/s/N)",
+            *(feel.transmitted_admittance, feel.transmitted_bound, 1e3, bool(feel.between)),
+            f"velocity at {feel.between} (mm/s/N)",
         ),
-        (found.error_per_force, found.error_bound, 1e3, apart, f"copies of {found.copy} apart (mm/N)"),
+        (feel.error_per_force, feel.error_bound, 1e3, apart, f"copies of {feel.copy} apart (mm/N)"),
     ]
 
 
-def _rows_shown(found: Feel) -> Iterator[tuple[str, ...]]:
+def _rows_shown(feel: Feel) -> Iterator[tuple[str, ...]]:
     """Yield some lines of the table, the first and the last among them."""
-    count = len(found.frequency_hz)
+    count = len(feel.frequency_hz)
     for place in sorted({round(value) for value in np.linspace(0, count - 1, min(SHOWN, count))}):
         sizes = [
-            (float(abs(values[place]) * scale), bound[place]) for values, bound, scale, *_ in _curves(found)
+            (float(abs(values[place]) * scale), bound[place]) for values, bound, scale, *_ in _curves(feel)
         ]
         size, arrives, apart = (known_digits(value, value * float(bound), DIGITS) for value, bound in sizes)
-        phase = f"{np.degrees(np.angle(found.impedance[place])):.2f}"
-        others = (arrives if found.between else "", apart if found.copy else "")
-        yield (f"{found.frequency_hz[place]:.5g}", size, phase, *others, f"{found.alias[place]:.1e}")
+        phase = f"{np.degrees(np.angle(feel.impedance[place])):.2f}"
+        others = (arrives if feel.between else "", apart if feel.copy else "")
+        yield (f"{feel.frequency_hz[place]:.5g}", size, phase, *others, f"{feel.alias[place]:.1e}")
 
 
 def _extreme(extremes: Extremes) -> tuple[str, str]:
@@ -202,16 +212,16 @@ def _extreme(extremes: Extremes) -> tuple[str, str]:
     return f"{extremes.mode}, {what}", size
 
 
-def feel_document(found: Feel) -> Plain:
+def feel_document(feel: Feel) -> Plain:
     """Return the same as plain data, in SI; complex numbers as pairs."""
     instead = {
-        "hinf": {f"{extremes.mode} {extremes.of}": extremes for extremes in found.hinf},
-        "h2": {noise.source: noise for noise in found.h2},
+        "hinf": {f"{extremes.mode} {extremes.of}": extremes for extremes in feel.hinf},
+        "h2": {noise.source: noise for noise in feel.h2},
     }
-    return record(found, instead)
+    return record(feel, instead)
 
 
-def feel_picture(found: Feel, kind: str = "bode", ax: Any = None) -> Any:
+def feel_picture(feel: Feel, kind: str = "bode", ax: Any = None) -> Any:
     """Draw the impedance, and what arrives elsewhere, as Bode's plot or Nyquist's; return the Figure.
 
     Into an `ax` of somebody's, of Bode's plot the magnitudes alone are drawn.
@@ -221,26 +231,26 @@ def feel_picture(found: Feel, kind: str = "bode", ax: Any = None) -> Any:
         figure = new_figure((4.2, 4.0) if nyquist else (5.2, 5.6))
         axes = figure.subplots(1 if nyquist else 2, 1, sharex=True, squeeze=False)[:, 0].tolist()
     size, *phases = axes
-    size.set_title(f"{found.topology}: felt at {found.at}", fontsize=9)
+    size.set_title(f"{feel.topology}: felt at {feel.at}", fontsize=9)
     if nyquist:
-        size.plot(found.impedance.real, found.impedance.imag, color=COLOURS[0])
+        size.plot(feel.impedance.real, feel.impedance.imag, color=COLOURS[0])
         for line in (size.axvline, size.axhline):
             line(0.0, color="#999999", linewidth=0.6)
         size.set_aspect("equal", adjustable="datalim")
         size.set(xlabel="real part of the impedance (N·s/m)", ylabel="imaginary part (N·s/m)")
         for place, mark in ((0, "o"), (-1, "s")):
-            at, label = found.impedance[place], f"{found.frequency_hz[place]:.3g} Hz"
+            at, label = feel.impedance[place], f"{feel.frequency_hz[place]:.3g} Hz"
             size.plot(at.real, at.imag, mark, color=COLOURS[0], markersize=5, label=label)
     else:
-        for place, (values, _, scale, known, label) in enumerate(_curves(found)):
+        for place, (values, _, scale, known, label) in enumerate(_curves(feel)):
             if known and np.any(values):
                 look = {"color": COLOURS[place], "linestyle": ("-", "--", "-.")[place], "label": label}
-                size.loglog(found.frequency_hz, scale * np.abs(values), **look)
+                size.loglog(feel.frequency_hz, scale * np.abs(values), **look)
         size.set_ylabel("magnitude")
         axes[-1].set_xlabel("frequency (Hz)")
     for phase in phases:
-        degrees = np.degrees(np.angle(found.impedance))
-        phase.semilogx(found.frequency_hz, degrees, color=COLOURS[0])
+        degrees = np.degrees(np.angle(feel.impedance))
+        phase.semilogx(feel.frequency_hz, degrees, color=COLOURS[0])
         phase.set_ylabel("phase of the impedance (°)")
         if np.abs(degrees).max() <= 90:
             phase.set_yticks(range(-90, 91, 45))
@@ -257,7 +267,7 @@ def feel_picture(found: Feel, kind: str = "bode", ax: Any = None) -> Any:
     return size.figure
 
 
-def feel_rows(found: Feel) -> Tabled:
+def feel_rows(feel: Feel) -> Tabled:
     """Return the columns of a table of responses, a row a frequency, and what it is of."""
     responses = (("impedance", "N*s/m"), ("transmitted admittance", "m/s/N"), ("error per force", "m/N"))
     headings = [Column("frequency", "Hz")]
@@ -265,8 +275,8 @@ def feel_rows(found: Feel) -> Tabled:
         Column(f"{name} {which}", unit) for name, unit in responses for which in ("real", "imaginary")
     ]
     headings += [Column(name) for name in ("alias", "bound", "transmitted bound", "error bound")]
-    curves = _curves(found)
+    curves = _curves(feel)
     parts = [part for values, *_ in curves for part in (values.real, values.imag)]
-    columns = [found.frequency_hz, *parts, found.alias, *(bound for _, bound, *_ in curves)]
+    columns = [feel.frequency_hz, *parts, feel.alias, *(bound for _, bound, *_ in curves)]
     rows = zip(*(column.tolist() for column in columns), strict=True)
-    return headings, rows, {"at": found.at, "left_out": list(found.left_out)}
+    return headings, rows, {"at": feel.at, "left_out": list(feel.left_out)}

@@ -21,28 +21,28 @@ if TYPE_CHECKING:
 HEADINGS = ("50 %", "99 %", "99.9 %", "most")
 
 
-def run_comparison_text(found: RunComparison) -> Lines:
+def run_comparison_text(run_comparison: RunComparison) -> Lines:
     """Yield what happened beside what is said of it."""
-    peers = counted(len(found.ticks), "peer")
-    yield f"{found.topology}: {peers}, {found.seconds:.6g} s in real time\n"
-    if found.emulated:
+    peers = counted(len(run_comparison.ticks), "peer")
+    yield f"{run_comparison.topology}: {peers}, {run_comparison.seconds:.6g} s in real time\n"
+    if run_comparison.emulated:
         yield from notes("packets were held back and lost at the sender, as the scene's links say")
         yield ""
-    if found.why_not:
-        yield from notes(f"not simulated beside it: {found.why_not}")
+    if run_comparison.why_not:
+        yield from notes(f"not simulated beside it: {run_comparison.why_not}")
     else:
         yield from notes("beside simulate with the same packets at each tick, signals differ by at most")
-        apart = found.apart.items()
+        apart = run_comparison.apart.items()
         yield from table(
             [(f"  {far:.0e} {unit}", f"of up to {large:.4g} {unit}") for unit, (far, large) in apart]
         )
         if not any(large for _, (_, large) in apart):
             yield from notes("nothing moved: start values or a force in the scene would move it")
     yield ""
-    yield from ticks_text(found.ticks)
+    yield from ticks_text(run_comparison.ticks)
     yield ""
-    yield from _ways_text(found.ways)
-    for measured in found.measured:
+    yield from _ways_text(run_comparison.ways)
+    for measured in run_comparison.measured:
         yield ""
         yield from _measured_text(measured)
 
@@ -90,7 +90,7 @@ def _measured_text(measured: Measured) -> Lines:
     return notes(f"analyze says, {after}: {verdict}", judged)
 
 
-def run_comparison_document(found: RunComparison) -> dict[str, Any]:
+def run_comparison_document(run_comparison: RunComparison) -> dict[str, Any]:
     """Return a run beside its scene as plain data; times in seconds."""
     measured = [
         {
@@ -98,7 +98,7 @@ def run_comparison_document(found: RunComparison) -> dict[str, Any]:
             "verdict": measured.analysis.verdict,
             "spectral_radius": measured.analysis.spectral_radius,
         }
-        for measured in found.measured
+        for measured in run_comparison.measured
     ]
-    ways = [record(way, {"came": recording_document(way.came)}) for way in found.ways]
-    return record(found, {"ways": ways, "measured": measured})
+    ways = [record(way, {"came": recording_document(way.came)}) for way in run_comparison.ways]
+    return record(run_comparison, {"ways": ways, "measured": measured})

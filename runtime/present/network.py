@@ -29,109 +29,118 @@ _WORDS = {
 }
 
 
-def network_text(found: NetworkVerdict) -> Lines:
+def network_text(result: NetworkVerdict) -> Lines:
     """Yield what becomes of a scene over its network, in words and numbers."""
-    radius = found.mean_square_radius
+    radius = result.mean_square_radius
     where = " over its network" if radius is None else ""
-    yield f"{found.topology}: {found.verdict}{where}{LINEARIZED if found.linearized else ''}"
+    yield f"{result.topology}: {result.verdict}{where}{LINEARIZED if result.linearized else ''}"
     yield ""
     if radius is not None:
-        yield from sentences(_WORDS[found.verdict.removeprefix("probably ")])
+        yield from sentences(_WORDS[result.verdict.removeprefix("probably ")])
         yield ""
-        error, root = found.error or 0.0, math.sqrt(radius)
+        error, root = result.error or 0.0, math.sqrt(radius)
         rooted = radius_text(root, error / (2 * root) if root else error)
         yield from labelled(
             ("mean squares", f"multiplied by {radius_text(radius, error)} a frame"),
             ("their root", f"{rooted}, to compare with a spectral radius"),
         )
-    if found.rms_error_m is not None:
-        apart = f"{found.rms_error_m * 1e3:.4g} mm rms, for 1 N rms at every hand, white from tick to tick"
+    if result.rms_error_m is not None:
+        apart = f"{result.rms_error_m * 1e3:.4g} mm rms, for 1 N rms at every hand, white from tick to tick"
         yield from labelled(("copies apart", apart))
-    if found.almost_sure is not None:
-        low, high = found.almost_sure.interval
-        exponent = f"growth e^{found.almost_sure.exponent:.4g} a frame ({low:.4g} to {high:.4g})"
+    if result.almost_sure is not None:
+        low, high = result.almost_sure.interval
+        exponent = f"growth e^{result.almost_sure.exponent:.4g} a frame ({low:.4g} to {high:.4g})"
         yield from labelled(("almost surely", exponent))
-    if found.losses_in_a_row is not None:
-        yield from labelled(*_losses(found.losses_in_a_row))
-    yield from labelled(("proof", found.proof))
-    yield from notes(*found.notes)
+    if result.losses_in_a_row is not None:
+        yield from labelled(*_losses(result.losses_in_a_row))
+    yield from labelled(("proof", result.proof))
+    yield from notes(*result.notes)
 
 
-def _losses(found: LossesInARow) -> Iterator[tuple[str, str]]:
-    if found.certified is not None:
+def _losses(losses_in_a_row: LossesInARow) -> Iterator[tuple[str, str]]:
+    if losses_in_a_row.certified is not None:
         harmless = (
-            f"any pattern of at most {found.certified}" if found.certified else "not even one at a time"
+            f"any pattern of at most {losses_in_a_row.certified}"
+            if losses_in_a_row.certified
+            else "not even one at a time"
         )
         yield "losses in a row", f"{harmless} is certified harmless"
-    pattern = "".join("×" if lost else "·" for lost in found.unstable_pattern or ())
-    grows = f"grow by {found.growth:.6g} a frame" if pattern else ""
+    pattern = "".join("×" if lost else "·" for lost in losses_in_a_row.unstable_pattern or ())
+    grows = f"grow by {losses_in_a_row.growth:.6g} a frame" if pattern else ""
     if "×" in pattern:
         yield "worst pattern", f"{pattern} lost again and again (×) makes a motion {grows}"
     elif pattern:
         yield "losses in a row", f"with none a motion {grows.replace('grow', 'grows', 1)}"
 
 
-def network_document(found: NetworkVerdict) -> Plain:
+def network_document(result: NetworkVerdict) -> Plain:
     """Return what becomes of a scene over its network as plain data."""
-    return record(found, {"topology": ...})
+    return record(result, {"topology": ...})
 
 
-def recording_text(found: NetworkRecording) -> Lines:
+def recording_text(recording: NetworkRecording) -> Lines:
     """Yield what a recording amounts to, in words and numbers, and a link's entry that says so."""
-    of = f" by {found.program}" if found.program else ""
-    file = Path(found.file).name
-    yield f"{file}: {counted(found.packets, 'packet', ',')} recorded{of}"
+    of = f" by {recording.program}" if recording.program else ""
+    file = Path(recording.file).name
+    yield f"{file}: {counted(recording.packets, 'packet', ',')} recorded{of}"
     yield ""
-    if found.left_out:
-        yield from notes(*found.left_out)
+    if recording.left_out:
+        yield from notes(*recording.left_out)
         yield ""
-    yield from labelled(("lost", _share(found.lost)))
-    if found.lost.count:
-        how = "losses follow losses" if found.bursty else "no more than luck makes of independent losses"
-        average = f"{found.lost.count / found.bursts:.3g} packets on average"
-        bursts = f"{found.bursts:,}, {average}, {found.longest_burst:,} the longest"
+    yield from labelled(("lost", _share(recording.lost)))
+    if recording.lost.count:
+        how = "losses follow losses" if recording.bursty else "no more than luck makes of independent losses"
+        average = f"{recording.lost.count / recording.bursts:.3g} packets on average"
+        bursts = f"{recording.bursts:,}, {average}, {recording.longest_burst:,} the longest"
         yield from labelled(("bursts", bursts), ("", f"{how} (Fisher's exact test)"))
-    if found.law is not None:
-        several = found.packets > found.lost.count + 1
-        spread = f", standard deviation {_ms(found.deviation)}" if several else ""
-        quantiles = ((f"  {100 * share:g} %", f"at most {_ms(delay)}") for share, delay in found.quantiles)
-        span = f"{_ms(found.shortest)} to {_ms(found.longest)}"
-        yield from labelled(("delay", span), ("  mean", f"{_ms(found.mean)}{spread}"), *quantiles)
-    if found.overtaken is not None:
-        yield from labelled(("overtaken", counted(found.overtaken, "packet", ",")))
+    if recording.law is not None:
+        several = recording.packets > recording.lost.count + 1
+        spread = f", standard deviation {_ms(recording.deviation)}" if several else ""
+        quantiles = (
+            (f"  {100 * share:g} %", f"at most {_ms(delay)}") for share, delay in recording.quantiles
+        )
+        span = f"{_ms(recording.shortest)} to {_ms(recording.longest)}"
+        yield from labelled(("delay", span), ("  mean", f"{_ms(recording.mean)}{spread}"), *quantiles)
+    if recording.overtaken is not None:
+        yield from labelled(("overtaken", counted(recording.overtaken, "packet", ",")))
     yield "\n  as keys of a link"
-    yield from wrapped(link_entry(found), "    ", "     ")
-    if found.law is not None and found.law.jitter:
-        away = f"shares of packets below a delay differ by at most {100 * found.law.distance:.2g} %"
-        nearest = f"{found.law.distribution} is the nearest of the distributions: {away}"
+    yield from wrapped(link_entry(recording), "    ", "     ")
+    if recording.law is not None and recording.law.jitter:
+        away = f"shares of packets below a delay differ by at most {100 * recording.law.distance:.2g} %"
+        nearest = f"{recording.law.distribution} is the nearest of the distributions: {away}"
         yield from wrapped(nearest, "    ", "    ")
     yield f"  or packet by packet\n    lan: {{clock: network, trace: {file}}}"
 
 
-def recording_document(found: NetworkRecording) -> Plain:
+def recording_document(recording: NetworkRecording) -> Plain:
     """Return a recording as plain data: seconds, shares from 0 to 1."""
-    shares = {name: getattr(found, name) for name in ("lost", "turns_bad", "turns_good")}
+    shares = {name: getattr(recording, name) for name in ("lost", "turns_bad", "turns_good")}
     instead = {name: record(share, {"share": share.value}) for name, share in shares.items()}
-    return record(found, {"delays": ..., "entry": link_entry(found), **instead})
+    return record(recording, {"delays": ..., "entry": link_entry(recording), **instead})
 
 
-def recording_table(found: NetworkRecording) -> str:
+def recording_table(recording: NetworkRecording) -> str:
     """Return all delays as the table that a link's `trace` takes."""
-    rows = ("lost" if math.isinf(delay) else f"{delay * 1e3:.12g}" for delay in found.delays)
+    rows = ("lost" if math.isinf(delay) else f"{delay * 1e3:.12g}" for delay in recording.delays)
     return "\n".join(["delay [ms]", *rows])
 
 
-def link_entry(found: NetworkRecording) -> str:
+def link_entry(recording: NetworkRecording) -> str:
     """Return the entry of a link with the keys that a recording amounts to."""
     keys = ["clock: network"]
-    if found.law is not None:
-        keys.append(f"delay: {_ms(found.law.delay)}")
-        if found.law.jitter:
-            keys += [f"jitter: {_ms(found.law.jitter)}", f"distribution: {found.law.distribution}"]
-    if found.bursty:
-        keys.append(f"loss: {{p: {_percent(found.turns_bad.value)}, r: {_percent(found.turns_good.value)}}}")
-    elif found.lost.count:
-        keys.append(f"loss: {_percent(found.lost.value)}")
+    if recording.law is not None:
+        keys.append(f"delay: {_ms(recording.law.delay)}")
+        if recording.law.jitter:
+            keys += [
+                f"jitter: {_ms(recording.law.jitter)}",
+                f"distribution: {recording.law.distribution}",
+            ]
+    if recording.bursty:
+        keys.append(
+            f"loss: {{p: {_percent(recording.turns_bad.value)}, r: {_percent(recording.turns_good.value)}}}"
+        )
+    elif recording.lost.count:
+        keys.append(f"loss: {_percent(recording.lost.value)}")
     return f"lan: {{{', '.join(keys)}}}"
 
 

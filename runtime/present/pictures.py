@@ -130,14 +130,14 @@ def write_figure(figure: Any, path: Path) -> None:
     write_file(path, write)
 
 
-def write_result(path: Path, found: Result, draw: Callable[[], Any]) -> None:
+def write_result(path: Path, result: Result, draw: Callable[[], Any]) -> None:
     """Write a result as a picture, a table or JSON, by the suffix.
 
     Parameters
     ----------
     path
         The file.
-    found
+    result
         The result; its table is made of the `rows` that its module has: see `table_of`.
     draw
         Makes its picture, a matplotlib Figure or Axes.
@@ -151,27 +151,27 @@ def write_result(path: Path, found: Result, draw: Callable[[], Any]) -> None:
     if suffix in FORMATS:
         write_picture(draw, path)
     elif suffix in SUFFIXES:
-        columns, cells, made = found._shown("rows")
+        columns, cells, made = result._shown("rows")
         write_table(path, columns, blocks_of(cells), {"apc": program_version(), **made})
     else:
-        write_text(path, json_text(found.to_dict()))
+        write_text(path, json_text(result.to_dict()))
 
 
-def table_of(found: Result) -> pandas.DataFrame:
+def table_of(result: Result) -> pandas.DataFrame:
     """Return the rows of a result as a pandas table.
 
     `NAME_rows` in the result's module gives its columns, its rows, and what a file says of how it was made.
     """
-    columns, rows, _ = found._shown("rows")
+    columns, rows, _ = result._shown("rows")
     return need("pandas", "data").DataFrame(list(rows), columns=[column.heading for column in columns])
 
 
-def html_of(found: Any) -> str:
+def html_of(result: Any) -> str:
     """Return a result for a notebook: its text, and its picture as an image where matplotlib is there."""
-    text = f"<pre>{escape(str(found))}</pre>"
-    if not (found.pictured and hasattr(found, "plot")):
+    text = f"<pre>{escape(str(result))}</pre>"
+    if not (result.pictured and hasattr(result, "plot")):
         return text
     try:
-        return text + svg_image(found.plot().figure, repr(found))
+        return text + svg_image(result.plot().figure, repr(result))
     except ApcError:
         return text

@@ -31,81 +31,81 @@ Floats = NDArray[np.float64]
 MOST_CURVES = 12
 
 
-def region_text(found: Region) -> Lines:
+def region_text(region: Region) -> Lines:
     """Yield what `apc region` prints of one region."""
     axes = [
         (letter, interval.free.label, span(float(interval.low), float(interval.high), interval.unit))
-        for letter, interval in (("x", found.x), ("y", found.y))
+        for letter, interval in (("x", region.x), ("y", region.y))
     ]
-    off, percent = found.stable_area_error, 100 / float(found.rectangle.width.prod())
-    share = known_digits(percent * found.stable_area, percent * off, 4)
-    area = measured(found.stable_area, off) if off else f"{found.stable_area:.9g}"
-    yield f"{found.topology}: {_words(found)}"
-    yield from notes(MEANT.get(found.criterion, ""), *found.left_out)
+    off, percent = region.stable_area_error, 100 / float(region.rectangle.width.prod())
+    share = known_digits(percent * region.stable_area, percent * off, 4)
+    area = measured(region.stable_area, off) if off else f"{region.stable_area:.9g}"
+    yield f"{region.topology}: {_words(region)}"
+    yield from notes(MEANT.get(region.criterion, ""), *region.left_out)
     yield ""
     yield from table(axes)
     yield f"\n  stable area  {area} in SI, {share} % of the rectangle"
-    if found.curves:
+    if region.curves:
         yield ""
         rows = [("boundary", "frequency [Hz]", "from (x, y)", "to (x, y)", "error")]
-        yield from table([*rows, *(_row(found, curve) for curve in found.curves[:MOST_CURVES])])
-        left = len(found.curves) - MOST_CURVES
+        yield from table([*rows, *(_row(region, curve) for curve in region.curves[:MOST_CURVES])])
+        left = len(region.curves) - MOST_CURVES
         if left > 0:
             yield f"  and {left} more (--json lists all)"
-    if coarse := found.coarse:
+    if coarse := region.coarse:
         most, many = max(curve.error for curve in coarse), counted(len(coarse), "curve")
         yield ""
         yield from sentences(
-            f"{many} could not be followed to {found.tolerance:.0e} of a coordinate, but to {most:.0e}"
+            f"{many} could not be followed to {region.tolerance:.0e} of a coordinate, but to {most:.0e}"
         )
-    sizes = zip(found.cell, (found.x, found.y), strict=True)
+    sizes = zip(region.cell, (region.x, region.y), strict=True)
     cell = " × ".join(quantity(size, axis.unit, 4) for size, axis in sizes)
     looked = f"Looked at in cells of {cell}, and finer where the eigenvalues hint at more; "
     yield ""
     yield from sentences(f"{looked}an island inside one cell could be missed.")
-    if found.stepped and found.criterion == "passive":
+    if region.stepped and region.criterion == "passive":
         yield "  Its points are on the boundary, with straight lines between; the error is an"
         yield "  estimate by how far the middles of these were off, no bound."
-    elif found.stepped:
+    elif region.stepped:
         yield "  Along these times the boundary has steps: it is right to a cell only."
 
 
-def _words(found: Region) -> str:
-    if found.curves:
-        closed = sum(curve.closed for curve in found.curves)
-        pieces = "one piece" if len(found.curves) == 1 else f"{len(found.curves)} pieces"
+def _words(region: Region) -> str:
+    if region.curves:
+        closed = sum(curve.closed for curve in region.curves)
+        pieces = "one piece" if len(region.curves) == 1 else f"{len(region.curves)} pieces"
         return f"the stable region has a boundary in {pieces}" + (f", {closed} closed" if closed else "")
-    return "stable in the whole rectangle" if found.corner else "stable nowhere in the rectangle"
+    return "stable in the whole rectangle" if region.corner else "stable nowhere in the rectangle"
 
 
-def _row(found: Region, curve: Curve) -> tuple[str, ...]:
+def _row(region: Region, curve: Curve) -> tuple[str, ...]:
     low, high = (f"{value:.4g}" for value in curve.frequency_hz)
     frequency = "–" if low == "nan" else low if low == high else f"{low} to {high}"
-    end = "closed" if curve.closed else _point(found, curve, -1)
-    return f"{curve.mode:.11}", frequency, _point(found, curve, 0), end, f"{curve.error:.0e}"
+    end = "closed" if curve.closed else _point(region, curve, -1)
+    return f"{curve.mode:.11}", frequency, _point(region, curve, 0), end, f"{curve.error:.0e}"
 
 
-def _point(found: Region, curve: Curve, place: int) -> str:
+def _point(region: Region, curve: Curve, place: int) -> str:
     """Return a point of a curve in the units of the axes; its error is relative to each coordinate."""
-    by = [float(as_shown(float(axis.high), axis.unit)[0]) for axis in (found.x, found.y)]
+    by = [float(as_shown(float(axis.high), axis.unit)[0]) for axis in (region.x, region.y)]
     return "({}, {})".format(
         *(known_digits(point, curve.error * abs(point), 6) for point in curve.points[place] * by)
     )
 
 
-def region_document(found: Region) -> Plain:
+def region_document(region: Region) -> Plain:
     """Return what `apc region --json` prints of one region."""
     names = ("topology", "tolerance", "stable_area", "stable_area_error", "cell", "criterion", "left_out")
     each = ("points", "handles", "error", "mode", "frequency_hz", "closed", "smooth")
     return {
-        **picked(found, *names),
-        "x": range_document(found.x),
-        "y": range_document(found.y),
-        "coarse": [number for number, curve in enumerate(found.curves) if curve in found.coarse],
-        "boundary": [{**picked(curve, *each), "stable_side": "left"} for curve in found.curves],
-        "area_unit": _product(found.x.unit, found.y.unit),
-        "finest_cell": found.finest,
-        "origin": dict(found.system.origin.digests),
+        **picked(region, *names),
+        "x": range_document(region.x),
+        "y": range_document(region.y),
+        "coarse": [number for number, curve in enumerate(region.curves) if curve in region.coarse],
+        "boundary": [{**picked(curve, *each), "stable_side": "left"} for curve in region.curves],
+        "area_unit": _product(region.x.unit, region.y.unit),
+        "finest_cell": region.finest,
+        "origin": dict(region.system.origin.digests),
     }
 
 
@@ -115,9 +115,9 @@ def _product(x: str, y: str) -> str:
     return "*".join(f"({unit})" if "/" in unit or "*" in unit else unit for unit in units) or "1"
 
 
-def panels_text(found: Panels) -> Lines:
+def panels_text(panels: Panels) -> Lines:
     """Yield what `apc region` prints of several regions."""
-    for place, panel in enumerate(found.panels):
+    for place, panel in enumerate(panels.panels):
         if panel.title:
             yield f"({panel_letter(place)}) {panel.title}\n"
         for region, gain in zip(panel.regions, panel.gains, strict=True):
@@ -127,11 +127,11 @@ def panels_text(found: Panels) -> Lines:
             yield ""
 
 
-def panels_document(found: Panels) -> Plain:
+def panels_document(panels: Panels) -> Plain:
     """Return what `apc region --json` prints: the region itself if it is alone, else the panels."""
-    if found.alone is not None:
-        return found.alone.to_dict()
-    return {"normalized": found.normalized, "panels": [_panel_document(panel) for panel in found.panels]}
+    if panels.alone is not None:
+        return panels.alone.to_dict()
+    return {"normalized": panels.normalized, "panels": [_panel_document(panel) for panel in panels.panels]}
 
 
 def _panel_document(panel: Panel) -> Plain:
@@ -145,9 +145,9 @@ def _panel_document(panel: Panel) -> Plain:
     }
 
 
-def panels_rows(found: Panels) -> Tabled:
+def panels_rows(panels: Panels) -> Tabled:
     """Return the columns of a table of boundary points, a row a point, and how they were made."""
-    regions = [(region, panel.title) for panel in found.panels for region in panel.regions]
+    regions = [(region, panel.title) for panel in panels.panels for region in panel.regions]
     made = {
         "axes": [range_document(interval) for interval in (regions[0][0].x, regions[0][0].y)],
         "left_out": {region.topology: list(region.left_out) for region, _ in regions},
@@ -157,25 +157,25 @@ def panels_rows(found: Panels) -> Tabled:
     return _columns(regions[0][0]), rows, made
 
 
-def region_rows(found: Region) -> Tabled:
+def region_rows(region: Region) -> Tabled:
     """Return the same of one region."""
-    return _columns(found), _rows(found), {}
+    return _columns(region), _rows(region), {}
 
 
-def _columns(found: Region) -> list[Column]:
+def _columns(region: Region) -> list[Column]:
     """Return the columns of a table of boundary points."""
     x, y = (
         Column(interval.free.label, "" if interval.unit == "1" else interval.unit)
-        for interval in (found.x, found.y)
+        for interval in (region.x, region.y)
     )
     words = (Column("panel", kind="text"), Column("topology", kind="text"))
     curve = (Column("curve", kind="count"), Column("mode", kind="text"))
     return [*words, *curve, x, y, Column("error")]
 
 
-def _rows(found: Region, panel: str = "") -> Iterator[Row]:
+def _rows(region: Region, panel: str = "") -> Iterator[Row]:
     """Yield a row a point of every curve, in the order of `_columns`."""
-    for number, curve in enumerate(found.curves):
+    for number, curve in enumerate(region.curves):
         mode = curve.mode
         for point in curve.points.tolist():
-            yield (panel, found.topology, number, mode, *point, curve.error)
+            yield (panel, region.topology, number, mode, *point, curve.error)

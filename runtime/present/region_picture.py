@@ -48,7 +48,7 @@ def panel_letter(place: int) -> str:
     return ascii_lowercase[place % len(ascii_lowercase)]
 
 
-def region_picture(found: Region, ax: Any = None) -> Any:
+def region_picture(region: Region, ax: Any = None) -> Any:
     """Draw one region into a matplotlib Axes, or into a figure of its own; return the Axes.
 
     Raises
@@ -58,11 +58,11 @@ def region_picture(found: Region, ax: Any = None) -> Any:
     """
     if ax is None:
         ax = new_figure((PANEL + 0.6, PANEL)).subplots()
-    draw_panel(ax, "", Panel("", (found,), (1,), ()))
+    draw_panel(ax, "", Panel("", (region,), (1,), ()))
     return ax
 
 
-def panels_picture(found: Panels) -> Any:
+def panels_picture(panels: Panels) -> Any:
     """Draw all panels side by side; return the matplotlib Figure.
 
     Raises
@@ -70,22 +70,22 @@ def panels_picture(found: Panels) -> Any:
     ApcError
         E875 matplotlib is not installed.
     """
-    count = len(found.panels)
+    count = len(panels.panels)
     columns = 2 if count == 4 else min(count, 3)
     rows = -(-count // columns)
     figure = new_figure((PANEL * columns + 0.6, PANEL * rows + 0.6))
     axes = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
-    for place, (ax, panel) in enumerate(zip(axes, found.panels, strict=False)):
+    for place, (ax, panel) in enumerate(zip(axes, panels.panels, strict=False)):
         letter = f"({panel_letter(place)}) " if count > 1 else ""
         title = f"{letter}{_unbroken(panel.title)}".strip()
         draw_panel(ax, title, panel)
-        if found.normalized:
+        if panels.normalized:
             ax.set_ylabel(f"effective gain of\n{ax.get_ylabel()}")
         ax.label_outer(remove_inner_ticks=False)
     for ax in axes[count:]:
         ax.set_axis_off()
     handles, labels = axes[0].get_legend_handles_labels()
-    if len(labels) > 1 or found.normalized:
+    if len(labels) > 1 or panels.normalized:
         look = {"frameon": False, "fontsize": 8.5, "ncols": min(columns, 2), "handlelength": 3}
         figure.legend(handles, labels, loc="outside lower center", **look)
     return figure
@@ -131,14 +131,14 @@ def draw_panel(ax: Any, title: str, panel: Panel) -> None:
     ax.set_title("\n".join(line for text in texts for line in textwrap.wrap(text, 48)), fontsize=8.5)
 
 
-def _draw(ax: Any, found: Region, gain: int, place: int, curves: Sequence[Floats], name: str) -> None:
+def _draw(ax: Any, region: Region, gain: int, place: int, curves: Sequence[Floats], name: str) -> None:
     """Draw one region: its stable side hatched, its boundary as a line."""
     path = need("matplotlib.path", "plot").Path
     patches = need("matplotlib.patches", "plot")
     colour = COLOURS[place % len(COLOURS)]
     outlines = [
         path(np.concatenate([values, values[:1]]) * [1, gain], closed=True)
-        for values in stable_outlines(found)
+        for values in stable_outlines(region)
     ]
     if outlines:
         look = {"facecolor": "none", "edgecolor": colour, "alpha": HATCH, "linewidth": 0}
@@ -166,9 +166,9 @@ def _are_one(these: Floats, those: Floats) -> bool:
     )
 
 
-def drawn_points(found: Region, number: int) -> Floats:
+def drawn_points(region: Region, number: int) -> Floats:
     """Return a curve as a polyline in SI (k, 2), fine enough for the eye."""
-    curve = found.curves[number]
+    curve = region.curves[number]
     if not curve.smooth:
         return curve.points
     pieces = -(-DRAWN // (len(curve.points) - 1))
@@ -176,17 +176,17 @@ def drawn_points(found: Region, number: int) -> Floats:
     return np.concatenate([np.stack(parts, axis=1).reshape(-1, 2), curve.points[-1:]])
 
 
-def stable_outlines(found: Region) -> list[Floats]:
+def stable_outlines(region: Region) -> list[Floats]:
     """Return closed polylines in SI that wind once around the stable side, and not at all around the rest.
 
     Each curve, whose left is stable, is closed along the rectangle's edge, counter-clockwise from its end to
     its start. What these wind around too often is taken away by whole rectangles, clockwise.
     """
-    rectangle = found.rectangle
-    curves = [rectangle.points(drawn_points(found, number)) for number in range(len(found.curves))]
+    rectangle = region.rectangle
+    curves = [rectangle.points(drawn_points(region, number)) for number in range(len(region.curves))]
     rings = [np.concatenate([curve, _along_edge(curve[-1], curve[0])]) for curve in curves]
     wound = sum(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2 for x, y in (ring.T for ring in rings))
-    turns = round(wound - found.stable_area / float(rectangle.width.prod()))
+    turns = round(wound - region.stable_area / float(rectangle.width.prod()))
     rings += [CORNERS[::-1] if turns > 0 else CORNERS] * abs(turns)
     return [rectangle.values(ring) for ring in rings]
 

@@ -50,23 +50,23 @@ UNLIKE = {"provenance", "origin", "points", "handles", "participation"}
 _KEPT = re.compile(r'<script type="application/json" id="apc-report">(.*?)</script>', re.DOTALL)
 
 
-def report_text(found: Report) -> Lines:
+def report_text(report: Report) -> Lines:
     """Yield what is printed of a report: a line a section, and why those are empty that are."""
-    for scene in found.scenes:
-        if scene is not found.scenes[0]:
+    for scene in report.scenes:
+        if scene is not report.scenes[0]:
             yield ""
         yield scene.name
         for section in scene.sections:
             yield from notes(f"{TITLES[section.key]}: {section.refused or f'as {section.command}'}")
 
 
-def report_document(found: Report) -> Plain:
+def report_document(report: Report) -> Plain:
     """Return a report as plain data: what is needed to compute it again, and all of its tables."""
     scenes = [
         record(scene, {"path": ..., "file": scene.path.name, "sections": [*map(_kept, scene.sections)]})
-        for scene in found.scenes
+        for scene in report.scenes
     ]
-    return {"apc_report": 2, "versions": dict(found.versions), "scenes": scenes}
+    return {"apc_report": 2, "versions": dict(report.versions), "scenes": scenes}
 
 
 def _kept(section: Section) -> Plain:
@@ -89,13 +89,13 @@ def _is_dead(item: Any) -> bool:
 
 
 @part("page")
-def report_page(found: Report) -> str:
+def report_page(report: Report) -> str:
     """Return a report as one HTML document."""
     from apc.compiler.view.listing import diagram_of  # of the topologies as written
 
-    kept = json_text(report_document(found), indent=None)
+    kept = json_text(report_document(report), indent=None)
     drawing = {"diagram_of": diagram_of, "graph_picture": graph_picture}
-    return page("report.html", found=found, titles=TITLES, kept=inert(kept), **drawing)
+    return page("report.html", report=report, titles=TITLES, kept=inert(kept), **drawing)
 
 
 # ---- files ----
@@ -111,14 +111,14 @@ def check_report_path(path: Path) -> None:
 
 
 def _browser(path: Path) -> str:
-    found = next((text for name in BROWSERS if (text := shutil.which(name))), None)
-    if found is None:
+    result = next((text for name in BROWSERS if (text := shutil.which(name))), None)
+    if result is None:
         hint = f"--out {path.with_suffix('.html')}, or install it, as by: apt install chromium"
         raise missing("Chromium is not installed, which prints a .pdf", hint)
-    return found
+    return result
 
 
-def save_report(found: Report, path: Path) -> None:
+def save_report(report: Report, path: Path) -> None:
     """Write a report, its format chosen by the suffix.
 
     Raises
@@ -127,7 +127,7 @@ def save_report(found: Report, path: Path) -> None:
         As `check_report_path`; E601 the browser could not print it.
     """
     check_report_path(path)
-    page = report_page(found)
+    page = report_page(report)
     if path.suffix.lower() == ".pdf":
         write_file(path, lambda temporary: _print(page, temporary, path))
     else:
@@ -188,8 +188,8 @@ def kept_report(path: Path) -> KeptReport:
         E990 it is no page that `apc report` wrote, or is damaged.
     """
     try:
-        found = _KEPT.search(read_file(path, LARGEST).decode("utf-8"))
-        return msgspec.json.decode(found[1] if found else "", type=KeptReport)
+        search = _KEPT.search(read_file(path, LARGEST).decode("utf-8"))
+        return msgspec.json.decode(search[1] if search else "", type=KeptReport)
     except RefusedError as refused:
         raise ApcError(Mistake("E990", Place(str(path)), refused.words)) from None
     except (ValueError, RecursionError):

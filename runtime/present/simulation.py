@@ -79,38 +79,38 @@ _WORDS = {
 }
 
 
-def buzz_text(found: Buzz) -> Lines:
+def buzz_text(buzz: Buzz) -> Lines:
     """Yield a buzz as it is predicted beside what was played."""
-    known = found.predicted
-    settles = "settles" if found.settles else ""
-    played = in_hertz(found.lines[0].frequency_hz) if found.lines else settles or "–"
+    known = buzz.predicted
+    settles = "settles" if buzz.settles else ""
+    played = in_hertz(buzz.lines[0].frequency_hz) if buzz.lines else settles or "–"
     rows = [
         ("", "predicted", "played"),
         ("frequency", in_hertz(known.frequency_hz) if known else "–", played),
     ]
     share = f"{known.in_contact:.1%}" if known else "–"
-    for contact in found.contacts:
+    for contact in buzz.contacts:
         depth = "–" if contact.predicted_depth_m is None else f"{contact.predicted_depth_m * 1e3:.4g} mm"
         rows += [
             (f"{contact.name}: depth", depth, settles or f"{contact.depth_m * 1e3:.4g} mm"),
             (f"{contact.name}: in contact", share, f"{contact.in_contact:.1%}"),
         ]
-    played_s = f"predicted beside {found.played_s:g} s played"
-    yield from wrapped(f"{found.topology}: the buzz of its contacts, {played_s}")
+    played_s = f"predicted beside {buzz.played_s:g} s played"
+    yield from wrapped(f"{buzz.topology}: the buzz of its contacts, {played_s}")
     yield ""
     yield from table(rows, "<>>")
-    yield from notes(found.reason, *found.notes)
+    yield from notes(buzz.reason, *buzz.notes)
 
 
-def played_text(found: Played) -> Lines:
+def played_text(played: Played) -> Lines:
     """Yield what `apc simulate` prints: the summary, the method if it is not exact, the error if known."""
-    summary = found.summary
+    summary = played.summary
     units = {extent.name: extent.unit for extent in summary.extents}
     swing = ""
     if summary.swing:
         name, size, rate = summary.swing
         swing = f"{name} by {_quantity(size, units[name])}, {rate:.3g} times a second"
-    yield f"{found.topology}: {summary.verdict}\n"
+    yield f"{played.topology}: {summary.verdict}\n"
     rests_in_part = summary.verdict == "rests" and summary.unrecorded
     words = RECORDED_REST if rests_in_part else _WORDS[summary.verdict]
     yield from sentences(
@@ -123,7 +123,7 @@ def played_text(found: Played) -> Lines:
         )
     )
     yield ""
-    for title, text in _facts(found, units):
+    for title, text in _facts(played, units):
         yield from labelled((title, text), width=15)
 
 
@@ -153,19 +153,19 @@ def error_text(estimate: ErrorEstimate) -> str:
     return f"{about}{size}, {worst.relative:.1g} of its range ({estimate.compared})"
 
 
-def played_document(found: Played) -> Plain:
+def played_document(played: Played) -> Plain:
     """Return what `apc simulate --json` prints."""
-    summary = found.summary
+    summary = played.summary
 
     def keyed(values: Sequence[Any] | None, *keys: str) -> Plain | None:
         return None if values is None else dict(zip(keys, values, strict=True))
 
     return {
-        "topology": found.topology,
+        "topology": played.topology,
         "verdict": summary.verdict,
         "settled_s": summary.settled,
         "diverged": {"signal": summary.stopped, "time_s": summary.stopped_at} if summary.stopped else None,
-        "interrupted": found.interrupted,
+        "interrupted": played.interrupted,
         "swing": keyed(summary.swing, "signal", "size", "frequency_hz"),
         "overshoot": keyed(summary.overshoot, "signal", "part"),
         "limits_broken": document(summary.broken),
@@ -177,54 +177,56 @@ def played_document(found: Played) -> Plain:
         "signals": [
             record(extent, {"settled": ..., "settled_s": extent.settled}) for extent in summary.extents
         ],
-        "error_estimate": None if found.error is None else _error_document(found.error),
-        "provenance": provenance_document(found.provenance),
+        "error_estimate": None if played.error is None else _error_document(played.error),
+        "provenance": provenance_document(played.provenance),
     }
 
 
-def _error_document(found: ErrorEstimate) -> Plain:
+def _error_document(error_estimate: ErrorEstimate) -> Plain:
     signals = [
         record(signal, {"at": ..., "span": ..., "time_s": signal.at, "range": signal.span})
-        for signal in found.signals
+        for signal in error_estimate.signals
     ]
-    return {"kind": found.kind, "compared_with": found.compared, "signals": signals}
+    return {"kind": error_estimate.kind, "compared_with": error_estimate.compared, "signals": signals}
 
 
-def provenance_document(found: Provenance) -> Plain:
+def provenance_document(provenance: Provenance) -> Plain:
     """Return what made a result as plain data."""
     instead = {
         "texts": ...,
-        "sha256": found.texts,
-        "tolerances": {tolerance.state: record(tolerance, {"state": ...}) for tolerance in found.tolerances},
-        "parameters": {name: {"value": value, "unit": unit} for name, value, unit in found.parameters},
+        "sha256": provenance.texts,
+        "tolerances": {
+            tolerance.state: record(tolerance, {"state": ...}) for tolerance in provenance.tolerances
+        },
+        "parameters": {name: {"value": value, "unit": unit} for name, value, unit in provenance.parameters},
         "timings": ...,
-        "timings_s": dict(found.timings),
-        "versions": dict(found.versions),
+        "timings_s": dict(provenance.timings),
+        "versions": dict(provenance.versions),
     }
-    return record(found, instead)
+    return record(provenance, instead)
 
 
-def provenance_json(found: Provenance) -> str:
+def provenance_json(provenance: Provenance) -> str:
     """Return what made a result as one line of JSON."""
-    return json_text(provenance_document(found), indent=None)
+    return json_text(provenance_document(provenance), indent=None)
 
 
-def played_table(found: Trajectory) -> Any:
+def played_table(trajectory: Trajectory) -> Any:
     """Return the rows of a run as a pandas table."""
     pandas = need("pandas", "data")
-    columns = [signal.heading for signal in found.signals]
-    return pandas.DataFrame(found.values, pandas.Index(found.time, name="time [s]"), columns)
+    columns = [signal.heading for signal in trajectory.signals]
+    return pandas.DataFrame(trajectory.values, pandas.Index(trajectory.time, name="time [s]"), columns)
 
 
-def played_dataset(found: Trajectory) -> Any:
+def played_dataset(trajectory: Trajectory) -> Any:
     """Return the rows of a run as an xarray Dataset."""
     xarray = need("xarray", "data")
     variables = {
-        signal.name: ("time", found.values[:, place], {"units": signal.unit})
-        for place, signal in enumerate(found.signals)
+        signal.name: ("time", trajectory.values[:, place], {"units": signal.unit})
+        for place, signal in enumerate(trajectory.signals)
     }
-    time = ("time", found.time, {"units": "s"})
-    return xarray.Dataset(variables, {"time": time}, {"provenance": provenance_json(found.provenance)})
+    time = ("time", trajectory.time, {"units": "s"})
+    return xarray.Dataset(variables, {"time": time}, {"provenance": provenance_json(trajectory.provenance)})
 
 
 def played_picture(trajectory: Trajectory, ax: Any = None) -> Any:
@@ -267,10 +269,10 @@ def played_picture(trajectory: Trajectory, ax: Any = None) -> Any:
 
 def _panels(signals: Sequence[Signal]) -> dict[str, list[int]]:
     """Return the signals' places by unit: first the known quantities, then the others as they come."""
-    found: dict[str, list[int]] = {}
+    result: dict[str, list[int]] = {}
     for place, signal in enumerate(signals):
-        found.setdefault(signal.unit, []).append(place)
-    return {unit: found[unit] for unit in dict.fromkeys([*QUANTITIES, *found]) if unit in found}
+        result.setdefault(signal.unit, []).append(place)
+    return {unit: result[unit] for unit in dict.fromkeys([*QUANTITIES, *result]) if unit in result}
 
 
 def paths_of(signals: Sequence[Signal]) -> list[tuple[int, int]]:
@@ -322,14 +324,16 @@ def _are_many(signals: Sequence[Signal]) -> bool:
 
 def _identical(values: Floats, places: Sequence[int]) -> list[list[int]]:
     """Return places by curve: in one those that differ by nothing but rounding, of what the panel spans."""
-    found: list[list[int]] = []
+    result: list[list[int]] = []
     off = ROUNDING * float(np.ptp(values[:, places]))
     for place in places:
-        same = (numbers for numbers in found if np.abs(values[:, place] - values[:, numbers[0]]).max() <= off)
+        same = (
+            numbers for numbers in result if np.abs(values[:, place] - values[:, numbers[0]]).max() <= off
+        )
         if (curve := next(same, None)) is None:
-            found.append(curve := [])
+            result.append(curve := [])
         curve.append(place)
-    return found
+    return result
 
 
 def _by_group(signals: Sequence[Signal], places: Sequence[int]) -> list[list[int]]:
@@ -403,56 +407,56 @@ def ensemble_text(ensemble: Ensemble) -> Lines:
         yield "  interrupted: there were to be more runs"
 
 
-def _beside(ensemble: Ensemble, found: MeanSquare) -> str:
+def _beside(ensemble: Ensemble, mean_square: MeanSquare) -> str:
     """Return one sentence on what the runs say of the verdict in mean square."""
     n, calm = len(ensemble.runs), ensemble.calm
-    if found.why:
-        return f"in mean square: not judged: {found.why}"
-    told = f"{found.verdict}, and {calm} of {counted(n, 'run')} settle or die away: "
-    if found.linearized:
+    if mean_square.why:
+        return f"in mean square: not judged: {mean_square.why}"
+    told = f"{mean_square.verdict}, and {calm} of {counted(n, 'run')} settle or die away: "
+    if mean_square.linearized:
         return (
             f"{told}that verdict is of small motions about the start, the runs are of contacts as they come"
         )
-    if found.stable is None:
+    if mean_square.stable is None:
         return f"{told}bounds leave that verdict open"
     if ensemble.agrees:
         return f"{told}they agree"
-    if not found.stable:
+    if not mean_square.stable:
         return f"{told}what makes mean squares grow is rarer, or slower, than these runs show"
-    if found.settles_in is not None and found.settles_in > ensemble.duration:
-        return f"{told}that takes some {found.settles_in:.2g} s, and the runs show how it begins"
+    if mean_square.settles_in is not None and mean_square.settles_in > ensemble.duration:
+        return f"{told}that takes some {mean_square.settles_in:.2g} s, and the runs show how it begins"
     return f"{told}what moves the others is a force that goes on, which that verdict is not about"
 
 
-def ensemble_document(found: Ensemble) -> Plain:
+def ensemble_document(ensemble: Ensemble) -> Plain:
     """Return what many runs amount to as plain data."""
     from apc.simulation.ensemble import QUANTILES, share_interval
 
-    n, told = len(found.runs), found.mean_square
+    n, told = len(ensemble.runs), ensemble.mean_square
     shares = {
         verdict: {"runs": count, "share": count / n, "share_95": list(share_interval(count, n))}
-        for verdict, count in found.verdicts
+        for verdict, count in ensemble.verdicts
     }
     instead: Plain = {
         "duration": ...,
-        "duration_s": found.duration,
+        "duration_s": ensemble.duration,
         "runs": n,
-        "mean_square": None if told is None else {**document(told), "agrees": found.agrees},
+        "mean_square": None if told is None else {**document(told), "agrees": ensemble.agrees},
         "verdicts": shares,
     }
     for name in LABELS:
-        instead[name] = statistics = found.statistics(name)
+        instead[name] = statistics = ensemble.statistics(name)
         if statistics is not None:
             quantiles = dict(zip(map(str, QUANTILES), statistics.quantiles, strict=True))
             instead[name] = record(
                 statistics, {"count": ..., "runs": statistics.count, "quantiles": quantiles}
             )
-    return record(found, instead)
+    return record(ensemble, instead)
 
 
-def _facts(found: Played, units: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+def _facts(played: Played, units: Mapping[str, str]) -> Iterator[tuple[str, str]]:
     """Yield what a run amounts to, each fact with its label; `units` are those of its signals by name."""
-    summary = found.summary
+    summary = played.summary
     if summary.largest_force and (summary.largest_force[1] or summary.verdict != "rests"):
         name, size, at = summary.largest_force
         yield "largest force", f"{_quantity(size, 'N')}, {name} at {_quantity(at, 's')}"
@@ -472,7 +476,7 @@ def _facts(found: Played, units: Mapping[str, str]) -> Iterator[tuple[str, str]]
         done = ", ".join(f"{part} {_quantity(value, 'J')}" for part, value in summary.work)
         yield "work put in", f"{done} by held forces"
     yield "recorded", f"{summary.rows} rows of {summary.signals} signals until {summary.end:g} s"
-    if found.provenance.method != EXACT:
-        yield "method", _method(found.provenance)
-    if found.error:
-        yield "error", error_text(found.error)
+    if played.provenance.method != EXACT:
+        yield "method", _method(played.provenance)
+    if played.error:
+        yield "error", error_text(played.error)

@@ -42,10 +42,10 @@ TYPED, BUYS = 12, 3
 SETTLED = 0.02
 
 
-def tuning_text(found: Tuning) -> Lines:
+def tuning_text(tuning: Tuning) -> Lines:
     """Yield the gains, what is proved of them and what binds, in at most 80 columns."""
-    yield from wrapped(_sentence(found), "", "  ")
-    yield from notes(MEANT.get(found.criterion, ""), *found.left_out, *found.notes)
+    yield from wrapped(_sentence(tuning), "", "  ")
+    yield from notes(MEANT.get(tuning.criterion, ""), *tuning.left_out, *tuning.notes)
     yield ""
     rows = [("gain", "value", "before rounding", "chosen from")]
     rows += [
@@ -55,80 +55,80 @@ def tuning_text(found: Tuning) -> Lines:
             quantity(gain.best, gain.unit),
             span(gain.low, gain.high, gain.unit),
         )
-        for gain in found.gains
+        for gain in tuning.gains
     ]
     yield from table(rows)
-    if found.met or found.proofs:
+    if tuning.met or tuning.proofs:
         yield ""
-    value = uncertain(found.best, found.error, found.unit)
-    if _is_felt(found):  # found without knowing how far any better one may be
-        value = quantity(found.best, found.unit, BUYS + 1)
+    value = uncertain(tuning.best, tuning.error, tuning.unit)
+    if _is_felt(tuning):  # found without knowing how far any better one may be
+        value = quantity(tuning.best, tuning.unit, BUYS + 1)
     better = f"no gains in these ranges do better by {100 * float(SHARE):.3g} %"
     yield from labelled(
-        ("before rounding", f"{value}, the best of {found.looked:,} points" if found.met else ""),
-        ("no others", f"{better}, proved in {found.bounded:,} cells" if found.bounded else ""),
-        ("margin", _margin(found) if found.met else ""),
+        ("before rounding", f"{value}, the best of {tuning.looked:,} points" if tuning.met else ""),
+        ("no others", f"{better}, proved in {tuning.bounded:,} cells" if tuning.bounded else ""),
+        ("margin", _margin(tuning) if tuning.met else ""),
     )
-    yield from _proof_lines(found)
-    if found.binding:
-        yield "\n  what binds" if found.met else "\n  what is in the way"
-        for binding in found.binding:
-            yield from _binding_lines(found, binding)
-    elif any(gain.parameter == found.aim and gain.value in (gain.low, gain.high) for gain in found.gains):
-        yield f"\n  nothing binds {found.aim} but the end of its range"
+    yield from _proof_lines(tuning)
+    if tuning.binding:
+        yield "\n  what binds" if tuning.met else "\n  what is in the way"
+        for binding in tuning.binding:
+            yield from _binding_lines(tuning, binding)
+    elif any(gain.parameter == tuning.aim and gain.value in (gain.low, gain.high) for gain in tuning.gains):
+        yield f"\n  nothing binds {tuning.aim} but the end of its range"
 
 
-def _sentence(found: Tuning) -> str:
+def _sentence(tuning: Tuning) -> str:
     """Return the answer in a sentence."""
     stable = "the scene is stable"
-    if found.decay != 1:
-        stable = f"motions die out by {-20 * math.log10(found.decay):.6g} dB a second"
-    stable += " and what is felt is as asked" if found.felt else ""
-    over = f" for {enumerated([range_text(interval) for interval in found.over])}" if found.over else ""
-    if not found.met:
-        return f"{found.topology}: no gains were found in these ranges with which {stable}{over}"
-    proved = "proved" if found.proved else "not proved"
-    best = "largest" if found.larger else "least"
-    if found.aim in (RADIUS, SETTLING):
-        power = 2 if found.criterion == "mean-square" else 1  # of what a frame multiplies
-        settled = found.frame_s * power * math.log(SETTLED) / math.log(found.value)
+    if tuning.decay != 1:
+        stable = f"motions die out by {-20 * math.log10(tuning.decay):.6g} dB a second"
+    stable += " and what is felt is as asked" if tuning.felt else ""
+    over = f" for {enumerated([range_text(interval) for interval in tuning.over])}" if tuning.over else ""
+    if not tuning.met:
+        return f"{tuning.topology}: no gains were found in these ranges with which {stable}{over}"
+    proved = "proved" if tuning.proved else "not proved"
+    best = "largest" if tuning.larger else "least"
+    if tuning.aim in (RADIUS, SETTLING):
+        power = 2 if tuning.criterion == "mean-square" else 1  # of what a frame multiplies
+        settled = tuning.frame_s * power * math.log(SETTLED) / math.log(tuning.value)
         time = f"all motions die out but for {100 * SETTLED:.0f} % within {quantity(settled, 's', 3)}{over}"
-        least = f"with {_radius(found)} below {found.value:.6g}, next to the least found; it is {proved}"
-        return f"{found.topology}: {time}, {least}"
-    value = f"{quantity(found.value, found.unit, TYPED)} is the {best} {found.aim}"
-    return f"{found.topology}: {value} found with which {stable}{over}; it is {proved}"
+        least = f"with {_radius(tuning)} below {tuning.value:.6g}, next to the least found; it is {proved}"
+        return f"{tuning.topology}: {time}, {least}"
+    value = f"{quantity(tuning.value, tuning.unit, TYPED)} is the {best} {tuning.aim}"
+    return f"{tuning.topology}: {value} found with which {stable}{over}; it is {proved}"
 
 
-def _is_felt(found: Tuning) -> bool:
+def _is_felt(tuning: Tuning) -> bool:
     """Say whether the aim is what is felt, or a weighted sum."""
-    return found.aim not in (RADIUS, SETTLING, *(gain.parameter for gain in found.gains))
+    return tuning.aim not in (RADIUS, SETTLING, *(gain.parameter for gain in tuning.gains))
 
 
-def _margin(found: Tuning) -> str:
+def _margin(tuning: Tuning) -> str:
     """Return how near the worst scenario is to what is allowed."""
-    if found.felt or _is_felt(found):
-        return f"{math.exp(found.worst):.6g} of what is allowed in the worst scenario"
-    if found.criterion == "passive":
-        needed = (1 + found.worst) / (1 - found.worst)  # see `hands.passivity.passive_growth`
+    if tuning.felt or _is_felt(tuning):
+        return f"{math.exp(tuning.worst):.6g} of what is allowed in the worst scenario"
+    if tuning.criterion == "passive":
+        needed = (1 + tuning.worst) / (1 - tuning.worst)  # see `hands.passivity.passive_growth`
         return f"passive hands need {needed:.4g} of the damping there is in the worst scenario"
-    radius, most = math.exp(found.worst + found.allowed), math.exp(found.allowed)
-    return f"{_radius(found)} of {radius:.6g} in the worst scenario, {most:.6g} allowed"
+    radius, most = math.exp(tuning.worst + tuning.allowed), math.exp(tuning.allowed)
+    return f"{_radius(tuning)} of {radius:.6g} in the worst scenario, {most:.6g} allowed"
 
 
-def _radius(found: Tuning) -> str:
-    return "a mean-square radius" if found.criterion == "mean-square" else "a spectral radius"
+def _radius(tuning: Tuning) -> str:
+    return "a mean-square radius" if tuning.criterion == "mean-square" else "a spectral radius"
 
 
-def _proof_lines(found: Tuning) -> Lines:
+def _proof_lines(tuning: Tuning) -> Lines:
     """Yield what was proved, and of what it was not."""
-    proved = [proof for proof in found.proofs if proof.proof.stable]
+    proved = [proof for proof in tuning.proofs if proof.proof.stable]
     cells = sum(item.proof.cells for item in proved)
     if proved:
-        told = counted(cells, "cell" if found.over else "analysis", ",d").replace("analysiss", "analyses")
+        told = counted(cells, "cell" if tuning.over else "analysis", ",d").replace("analysiss", "analyses")
         many = f"for each of {len(proved)} numbers of peers, " if proved[0].counts else ""
         yield from labelled(("proved", f"{many}{proved[0].proof.verdict} ({told})"))
     left: dict[str, list[str]] = {}
-    for proof in found.proofs:
+    for proof in tuning.proofs:
         if not proof.proof.stable:
             open_share = 100 * proof.proof.open_share
             share = [f"{open_share:.3g} % of the box is left open"] if open_share else []
@@ -137,7 +137,7 @@ def _proof_lines(found: Tuning) -> Lines:
             left.setdefault(said, []).append(", ".join(f"{label} {number}" for label, number in proof.counts))
     for said, where in left.items():
         yield from labelled(("not proved", "; ".join(filter(None, [", ".join(filter(None, where)), said]))))
-    if found.met and not found.proofs:
+    if tuning.met and not tuning.proofs:
         yield from labelled(("not proved", "the time was up before any proof"))
 
 
@@ -145,15 +145,15 @@ def _where(binding: Binding) -> str:
     return ", ".join(f"{label} {quantity(value, unit)}" for label, value, unit in binding.where)
 
 
-def _binding_lines(found: Tuning, binding: Binding) -> Lines:
-    other = "what is felt" if found.felt else found.aim if _is_felt(found) else "stability"
+def _binding_lines(tuning: Tuning, binding: Binding) -> Lines:
+    other = "what is felt" if tuning.felt else tuning.aim if _is_felt(tuning) else "stability"
     mode = f"{binding.shape} mode" if binding.shape else "" if math.isnan(binding.frequency_hz) else other
     mode += f" at {in_hertz(binding.frequency_hz)}" if mode else ""
     yield from wrapped(": ".join(filter(None, [_where(binding), mode])) or other, "    ", "      ")
     for label, value, unit, better in (
-        binding.buys if found.met and found.aim not in (RADIUS, SETTLING) else ()
+        binding.buys if tuning.met and tuning.aim not in (RADIUS, SETTLING) else ()
     ):
-        buys = quantity(better, found.unit, BUYS)
+        buys = quantity(better, tuning.unit, BUYS)
         text = f"1 % less of {label} = {quantity(value, unit)} buys {buys}"
         yield from wrapped(text, "      ", "        ")
 
@@ -167,31 +167,33 @@ def panels_of(system: CompiledSystem, gains: int) -> tuple[bool, bool]:
     return two, moves
 
 
-def tuning_picture(found: Tuning, ax: Any = None) -> Any:
+def tuning_picture(tuning: Tuning, ax: Any = None) -> Any:
     """Draw two gains over the stable regions, and what a strike comes to now and with the gains found.
 
     Into an Axes that is given only the first of them is drawn, of any other number of gains the second; the
     first Axes is returned.
     """
-    two, moves = panels_of(found.scenes[0], len(found.ranges))
+    two, moves = panels_of(tuning.scenes[0], len(tuning.ranges))
     panels = [*[_draw_gains] * two, *[_draw_struck] * moves]
     axes = [ax] if ax else new_figure((5.0 * len(panels), 4.4)).subplots(1, len(panels), squeeze=False)[0]
     for draw, axis in zip(panels, axes, strict=False):
-        draw(found, axis)
+        draw(tuning, axis)
     return axes[0]
 
 
-def _draw_gains(found: Tuning, ax: Any) -> None:
+def _draw_gains(tuning: Tuning, ax: Any) -> None:
     """Draw two gains now and then, over the stable regions of the scenes that limit them."""
     regions: list[Region] = []
-    ranges = found.ranges[0], found.ranges[1]
-    for where, scene in zip(map(_where, found.binding) if found.binding else [""], found.scenes, strict=True):
-        name = where or found.topology
+    ranges = tuning.ranges[0], tuning.ranges[1]
+    for where, scene in zip(
+        map(_where, tuning.binding) if tuning.binding else [""], tuning.scenes, strict=True
+    ):
+        name = where or tuning.topology
         if name not in [known.topology for known in regions]:
-            regions.append(replace(region(scene, ranges, criterion=found.criterion), topology=name))
-    more = "; what is asked beside stability is not drawn" if found.felt or found.decay < 1 else ""
-    draw_panel(ax, f"{found.topology}{more}", Panel("", tuple(regions), (1,) * len(regions), ()))
-    (now, best) = np.array([(gain.now, float(gain.value)) for gain in found.gains]).T
+            regions.append(replace(region(scene, ranges, criterion=tuning.criterion), topology=name))
+    more = "; what is asked beside stability is not drawn" if tuning.felt or tuning.decay < 1 else ""
+    draw_panel(ax, f"{tuning.topology}{more}", Panel("", tuple(regions), (1,) * len(regions), ()))
+    (now, best) = np.array([(gain.now, float(gain.value)) for gain in tuning.gains]).T
     ax.annotate("", best, now, arrowprops={"arrowstyle": "->", "color": "0.3"})
     whole: Plain = {"clip_on": False, "zorder": 5}  # where an end of a range is best, too
     ax.plot(*now, "o", color="0.3", label="now", **whole)
@@ -199,14 +201,14 @@ def _draw_gains(found: Tuning, ax: Any) -> None:
     legend_below(ax)
 
 
-def _draw_struck(found: Tuning, ax: Any) -> None:
+def _draw_struck(tuning: Tuning, ax: Any) -> None:
     """Draw where a struck device goes in the scene that limits gains most, now and with those found."""
-    scene = found.scenes[0]
+    scene = tuning.scenes[0]
     for label, values in (
-        ("found", [gain.value for gain in found.gains]),
-        ("now", [Fraction(gain.now) for gain in found.gains]),
+        ("found", [gain.value for gain in tuning.gains]),
+        ("now", [Fraction(gain.now) for gain in tuning.gains]),
     ):
-        changes = [Override(own.free, value) for own, value in zip(found.ranges, values, strict=True)]
+        changes = [Override(own.free, value) for own, value in zip(tuning.ranges, values, strict=True)]
         struck, name = strike(apply(scene, changes))
         played = simulate(struck, duration=WATCHED, signals=[f"{name}.*"], jit=False)
         place = next(place for place, signal in enumerate(played.signals) if signal.unit == LENGTH)
@@ -215,49 +217,49 @@ def _draw_struck(found: Tuning, ax: Any) -> None:
             low, high = ax.get_ylim()
     least, most = ax.get_ylim()  # what grows without end is cut off
     ax.set_ylim(max(least, 3 * low - 2 * high), min(most, 3 * high - 2 * low))
-    where = f", {_where(found.binding[0])}" if found.binding and _where(found.binding[0]) else ""
+    where = f", {_where(tuning.binding[0])}" if tuning.binding and _where(tuning.binding[0]) else ""
     ax.set_title(f"{name} struck{where}", fontsize=9)
     ax.set(xlabel="time (s)", ylabel=f"{played.signals[place].local} (mm)")
     ax.legend(frameon=False, fontsize=8)
     ax.grid(linewidth=0.4, alpha=0.5)
 
 
-def front_text(found: Front) -> Lines:
+def front_text(front: Front) -> Lines:
     """Yield the designs as a table, those at the ends and at the knee named, in at most 80 columns."""
-    best = "largest" if found.larger else "least"
+    best = "largest" if front.larger else "least"
     yield from wrapped(
-        f"{found.topology}: the {best} {found.aim} for each bound on {found.against}", "", "  "
+        f"{front.topology}: the {best} {front.aim} for each bound on {front.against}", "", "  "
     )
-    yield from notes(MEANT.get(found.criterion, ""), *found.left_out, *found.notes)
+    yield from notes(MEANT.get(front.criterion, ""), *front.left_out, *front.notes)
     yield ""
-    names_of = [name for name, _, _ in found.designs[0].gains]
-    apart = found.aim not in names_of  # what is best is in no column of the gains
-    heads = ["felt", best] if apart else [found.against]  # the title names both
+    names_of = [name for name, _, _ in front.designs[0].gains]
+    apart = front.aim not in names_of  # what is best is in no column of the gains
+    heads = ["felt", best] if apart else [front.against]  # the title names both
     # An end is no knee; beside a column of what is best there is no room for names.
-    names = {} if apart else {found.knee: "knee", 0: "least felt", len(found.designs) - 1: best}
+    names = {} if apart else {front.knee: "knee", 0: "least felt", len(front.designs) - 1: best}
     rows = [(*heads, *names_of, "", "")]
-    for place, design in enumerate(found.designs):
+    for place, design in enumerate(front.designs):
         gains = (quantity(value, unit, TYPED) for _, value, unit in design.gains)
         proved = "" if design.proved else "not proved"
-        value = [quantity(design.value, found.unit, 4)] * apart
+        value = [quantity(design.value, front.unit, 4)] * apart
         rows.append(
-            (quantity(design.felt, found.against_unit, 5), *value, *gains, names.get(place, ""), proved)
+            (quantity(design.felt, front.against_unit, 5), *value, *gains, names.get(place, ""), proved)
         )
     yield from table(rows)
     if apart:
-        knee = quantity(found.designs[found.knee].felt, found.against_unit, 5)
+        knee = quantity(front.designs[front.knee].felt, front.against_unit, 5)
         yield from labelled(("knee", f"{knee} felt"))
 
 
-def front_picture(found: Front, ax: Any = None) -> Any:
+def front_picture(front: Front, ax: Any = None) -> Any:
     """Draw the front, three designs named; return the matplotlib Axes."""
     ax = new_figure((5.2, 3.8)).subplots() if ax is None else ax
-    x, y = (np.array([getattr(design, name) for design in found.designs]) for name in ("felt", "value"))
+    x, y = (np.array([getattr(design, name) for design in front.designs]) for name in ("felt", "value"))
     ax.plot(x, y, "o-", markersize=4, color=COLOURS[0])
-    ax.set(xlabel=f"{found.against} ({found.against_unit})", ylabel=f"{found.aim} ({found.unit})")
-    ax.set_title(found.topology, fontsize=9)
-    end = "largest" if found.larger else "least"
-    for place, name in {found.knee: "knee", 0: "least felt", len(x) - 1: end}.items():
+    ax.set(xlabel=f"{front.against} ({front.against_unit})", ylabel=f"{front.aim} ({front.unit})")
+    ax.set_title(front.topology, fontsize=9)
+    end = "largest" if front.larger else "least"
+    for place, name in {front.knee: "knee", 0: "least felt", len(x) - 1: end}.items():
         at = (float(x[place]), float(y[place]))
         ax.annotate(name, at, xytext=(6, 6 if y[0] > y[-1] else -12), textcoords="offset points", fontsize=8)
     ax.margins(0.12)  # room for the names
@@ -265,11 +267,11 @@ def front_picture(found: Front, ax: Any = None) -> Any:
     return ax
 
 
-def tuning_document(found: Tuning) -> Plain:
+def tuning_document(tuning: Tuning) -> Plain:
     """Return the gains, what is proved of them and what binds as plain data."""
     proofs = [
         {"counts": dict(proof.counts), "verdict": proof.proof.verdict, "stable": proof.proof.stable}
         | {"cells": proof.proof.cells, "open_share": proof.proof.open_share}
-        for proof in found.proofs
+        for proof in tuning.proofs
     ]
-    return record(found, {"over": [range_document(interval) for interval in found.over], "proofs": proofs})
+    return record(tuning, {"over": [range_document(interval) for interval in tuning.over], "proofs": proofs})

@@ -56,65 +56,69 @@ HOW = (
 )
 
 
-def critical_text(found: Critical) -> Lines:
+def critical_text(critical: Critical) -> Lines:
     """Yield where a scene's verdict changes with a parameter."""
-    unit = found.unit
-    now = quantity(found.present, unit)
-    if found.groups:
-        values = ["several values" if value is None else quantity(value, unit) for _, value in found.groups]
-        now = ", ".join(f"{value} at {group}" for value, (group, _) in zip(values, found.groups, strict=True))
-        now += f", to be one value for all {'groups' if len(found.groups) > 1 else 'its peers'}"
-    said = _stable_ranges(found)
+    unit = critical.unit
+    now = quantity(critical.present, unit)
+    if critical.groups:
+        values = [
+            "several values" if value is None else quantity(value, unit) for _, value in critical.groups
+        ]
+        now = ", ".join(
+            f"{value} at {group}" for value, (group, _) in zip(values, critical.groups, strict=True)
+        )
+        now += f", to be one value for all {'groups' if len(critical.groups) > 1 else 'its peers'}"
+    said = _stable_ranges(critical)
     if not said:
-        wording = ("value scanned", "number looked at") if found.counted else ("", "")
-        said = found.verdict.replace(*wording)
-    yield from wrapped(f"{found.topology}: {said}")
-    meant = MEANT.get(found.criterion, "")
-    yield from notes(meant, *found.left_out, f"{found.parameter} is now {now}")
+        wording = ("value scanned", "number looked at") if critical.counted else ("", "")
+        said = critical.verdict.replace(*wording)
+    yield from wrapped(f"{critical.topology}: {said}")
+    meant = MEANT.get(critical.criterion, "")
+    yield from notes(meant, *critical.left_out, f"{critical.parameter} is now {now}")
     yield ""
-    if not found.enters:
+    if not critical.enters:
         return
-    if found.counted:
-        yield from _count_lines(found)
+    if critical.counted:
+        yield from _count_lines(critical)
         return
-    for crossing in found.crossings:
+    for crossing in critical.crossings:
         yield f"  {uncertain(crossing.value, crossing.error, unit)}"
         kind = "jump, " if crossing.kind == "jump" else ""
         turns = "" if math.isnan(crossing.frequency_hz) else f", {in_hertz(crossing.frequency_hz)}"
         yield f"    {kind}stable {crossing.stable_side} it{turns}, {crossing.proof}"
         if crossing.error > ROUGH * abs(crossing.value):
             yield "    no narrower: within its error the bounds on growth leave the verdict open"
-    if found.crossings:
+    if critical.crossings:
         yield ""
-    yield f"  scanned {_span(found.scanned, unit)}"
-    yield f"  {counted(found.looked, 'value')} looked at: two crossings near to each other could hide"
-    if found.left_open:
-        parts = ", ".join(_span(pair, unit) for pair in found.left_open[:SHOWN])
-        rest = f" and {len(found.left_open) - SHOWN} more" if len(found.left_open) > SHOWN else ""
+    yield f"  scanned {_span(critical.scanned, unit)}"
+    yield f"  {counted(critical.looked, 'value')} looked at: two crossings near to each other could hide"
+    if critical.left_open:
+        parts = ", ".join(_span(pair, unit) for pair in critical.left_open[:SHOWN])
+        rest = f" and {len(critical.left_open) - SHOWN} more" if len(critical.left_open) > SHOWN else ""
         yield from sentences(f"the verdict is left open {parts}{rest}")
-    if not found.whole:
+    if not critical.whole:
         yield "  an eigenvalue keeps near to the boundary: more crossings could hide"
 
 
-def _stable_ranges(found: Critical) -> str:
+def _stable_ranges(critical: Critical) -> str:
     """Return where a scene is stable in a sentence; nothing where no crossing was found."""
     ranges, begin = [], ""
-    for crossing in found.crossings:
-        if found.counted:
+    for crossing in critical.crossings:
+        if critical.counted:
             value = f"{math.floor(crossing.boundary) + (crossing.stable_side == 'above'):,d}"
         else:
-            by, shown = as_shown(crossing.value, found.unit)
+            by, shown = as_shown(crossing.value, critical.unit)
             value = with_unit(
                 f"{_on_stable_side(crossing.value * by, crossing.error * by, crossing.stable_side):g}", shown
             )
         if crossing.stable_side == "above":
             begin = value
             continue
-        most = f"up to {value}" if found.counted else f"below {value}"
+        most = f"up to {value}" if critical.counted else f"below {value}"
         ranges.append(f"from {begin} {most}" if begin else most)
         begin = ""
-    ranges += [f"from {begin} on" if found.counted else f"above {begin}"] if begin else []
-    return f"stable with {found.parameter} {', and '.join(ranges)}" if ranges else ""
+    ranges += [f"from {begin} on" if critical.counted else f"above {begin}"] if begin else []
+    return f"stable with {critical.parameter} {', and '.join(ranges)}" if ranges else ""
 
 
 def _on_stable_side(value: float, error: float, side: str) -> float:
@@ -131,11 +135,11 @@ def _span(ends: tuple[float, float], unit: str) -> str:
     return f"from {quantity(ends[0], unit)} to {quantity(ends[1], unit)}"
 
 
-def _count_lines(found: Critical) -> Lines:
+def _count_lines(critical: Critical) -> Lines:
     """Yield which numbers of peers are stable, and how many were looked at."""
-    first, last = map(int, found.scanned)
-    sides = [crossing.stable_side for crossing in found.crossings]
-    ends = [math.floor(crossing.boundary) for crossing in found.crossings]
+    first, last = map(int, critical.scanned)
+    sides = [crossing.stable_side for crossing in critical.crossings]
+    ends = [math.floor(crossing.boundary) for crossing in critical.crossings]
     lines = [
         (f"{low:,d}" if low == high else f"{low:,d} to {high:,d}", "stable" if stable else "unstable")
         for low, high, stable in zip(
@@ -149,42 +153,42 @@ def _count_lines(found: Critical) -> Lines:
     if lines:
         yield from table(lines)
         yield ""
-    looked = (
-        f"every number from {first:,d} to {last:,d} was looked at"
-        if found.looked == last - first + 1
-        else f"{found.looked} numbers from {first:,d} to {last:,d} were looked at, those on either side of a "
-        "change among them; a change and back between two could hide"
-    )
+    looked = f"every number from {first:,d} to {last:,d} was looked at"
+    if critical.looked != last - first + 1:
+        looked = (
+            f"{critical.looked} numbers from {first:,d} to {last:,d} were looked at, those on either side of "
+            "a change among them; a change and back between two could hide"
+        )
     yield from sentences(looked)
 
 
-def critical_picture(found: Critical, ax: Any) -> Any:
+def critical_picture(critical: Critical, ax: Any) -> Any:
     """Draw where the eigenvalues go; return the matplotlib Axes."""
     from apc.present.analysis import locus_picture
     from apc.vary.locus import root_locus
 
-    return locus_picture(root_locus(found.system, found), ax)
+    return locus_picture(root_locus(critical.system, critical), ax)
 
 
-def critical_document(found: Critical) -> Plain:
+def critical_document(critical: Critical) -> Plain:
     """Return where a scene's verdict changes with a parameter as plain data."""
-    return record(found, {"groups": dict(found.groups)})
+    return record(critical, {"groups": dict(critical.groups)})
 
 
-def margins_text(found: Margins) -> Lines:
+def margins_text(margins: Margins) -> Lines:
     """Yield the table of the margins, of at most 80 columns."""
-    if not found.rows:
-        yield from notes(f"margins {found.note}")
+    if not margins.rows:
+        yield from notes(f"margins {margins.note}")
         return
-    width = max(len(row.parameter) for row in found.rows)
+    width = max(len(row.parameter) for row in margins.rows)
     ends = []
-    for row in found.rows:
+    for row in margins.rows:
         value, error = row.value or 0.0, row.error or 0.0
         by, shown = as_shown(value, row.unit)
         ends.append("" if row.value is None else with_unit(known_digits(value * by, error * by, 7), shown))
     wide = max(16, *map(len, ends))
     yield f"  {'may grow':<{width}}  from           {'to':<{wide}} times  at"
-    for row, end in zip(found.rows, ends, strict=True):
+    for row, end in zip(margins.rows, ends, strict=True):
         times = "–" if row.factor is None else f"{row.factor:.4g}"
         at = in_hertz(math.nan if row.frequency_hz is None else row.frequency_hz)
         told = f"{end:<{wide}} {times:>5}  {at}{', jump' if row.kind == 'jump' else ''}"
@@ -193,77 +197,77 @@ def margins_text(found: Margins) -> Lines:
         elif row.value is None:
             told = f"none found up to {quantity(row.scanned, row.unit, 5)}"
         yield f"  {row.parameter:<{width}}  {quantity(row.present, row.unit, 5):<14} {told}"
-    yield from notes(found.note)
+    yield from notes(margins.note)
 
 
-def margins_document(found: Margins) -> Plain:
+def margins_document(margins: Margins) -> Plain:
     """Return the margins as plain data."""
-    return {"margins": document(found.rows), "note": found.note}
+    return {"margins": document(margins.rows), "note": margins.note}
 
 
-def sensitivities_text(found: Sensitivities) -> Lines:
+def sensitivities_text(sensitivities: Sensitivities) -> Lines:
     """Yield the table "what moves it most", of at most 80 columns."""
     # Eigenvalues that share the radius often change alike, and then one row tells it.
     same: dict[tuple[str, str, str], list[str]] = {}
-    for row in found.rows:
-        if abs(row.relative) > LEAST_CHANGE * found.radius:
+    for row in sensitivities.rows:
+        if abs(row.relative) > LEAST_CHANGE * sensitivities.radius:
             key = (row.parameter, f"{quantity(row.value, row.unit):<15}", f"{row.relative / 100:+.2e}")
             same.setdefault(key, []).append(str(row.mode + 1))
     if not same:
-        told = found.note if len(found.active) < 2 else ""
+        told = sensitivities.note if len(sensitivities.active) < 2 else ""
         yield from notes(told or NONE_TOLD)
         return
     rows: list[tuple[str, ...]] = [("what moves it most", f"{'value':<15}", "per percent")]
     for (*cells, change), modes in list(same.items())[:SHOWN]:
-        which = f"  mode {', '.join(modes)}" if len(modes) < len(found.active) else ""
+        which = f"  mode {', '.join(modes)}" if len(modes) < len(sensitivities.active) else ""
         rows.append((*cells, change + which))
     yield from table(rows)
-    yield from notes(found.note)
+    yield from notes(sensitivities.note)
 
 
-def sensitivities_document(found: Sensitivities) -> Plain:
+def sensitivities_document(sensitivities: Sensitivities) -> Plain:
     """Return the derivatives as plain data."""
     return {
-        "spectral_radius": found.radius,
-        "active": [{"eigenvalue": document(value), "system": name} for value, name in found.active],
-        "derivatives": document(found.rows),
-        "note": found.note,
+        "spectral_radius": sensitivities.radius,
+        "active": [{"eigenvalue": document(value), "system": name} for value, name in sensitivities.active],
+        "derivatives": document(sensitivities.rows),
+        "note": sensitivities.note,
     }
 
 
-def analyses_text(found: Analyses) -> Lines:
+def analyses_text(analyses: Analyses) -> Lines:
     """Yield many analyses in a few lines: what varied, the verdicts."""
-    yield f"{found.topology}: {found.verdict.size:,} points"
-    yield from notes(*found.left_out)
-    for name, values in zip(found.parameters, found.values, strict=True):
+    yield f"{analyses.topology}: {analyses.verdict.size:,} points"
+    yield from notes(*analyses.left_out)
+    for name, values in zip(analyses.parameters, analyses.values, strict=True):
         yield f"  {name}: {values.min():g} … {values.max():g}"
     yield from _verdict_lines(
-        *(Counter(values.ravel().tolist()) for values in (found.verdict, found.message))
+        *(Counter(values.ravel().tolist()) for values in (analyses.verdict, analyses.message))
     )
 
 
-def analyses_document(found: Analyses) -> Plain:
+def analyses_document(analyses: Analyses) -> Plain:
     """Return many analyses as plain data, a list a column."""
-    columns = {heading: column.tolist() for heading, column in _analyses_columns(found).items()}
-    return {"topology": found.topology, "left_out": list(found.left_out), **document(columns)}
+    columns = {heading: column.tolist() for heading, column in _analyses_columns(analyses).items()}
+    return {"topology": analyses.topology, "left_out": list(analyses.left_out), **document(columns)}
 
 
-def analyses_table(found: Analyses) -> pandas.DataFrame:
+def analyses_table(analyses: Analyses) -> pandas.DataFrame:
     """Return many analyses as a pandas table, a row a point."""
-    return need("pandas", "data").DataFrame(_analyses_columns(found))
+    return need("pandas", "data").DataFrame(_analyses_columns(analyses))
 
 
-def _analyses_columns(found: Analyses) -> dict[str, NDArray[Any]]:
+def _analyses_columns(analyses: Analyses) -> dict[str, NDArray[Any]]:
     columns = {
-        "verdict": found.verdict,
-        "spectral_radius": found.spectral_radius,
-        "spectral_radius_error": found.spectral_radius_error,
-        "rigid_modes": found.rigid_modes,
-        "frequency [Hz]": found.frequency_hz,
-        "damping_ratio": found.damping_ratio,
-        "message": found.message,
+        "verdict": analyses.verdict,
+        "spectral_radius": analyses.spectral_radius,
+        "spectral_radius_error": analyses.spectral_radius_error,
+        "rigid_modes": analyses.rigid_modes,
+        "frequency [Hz]": analyses.frequency_hz,
+        "damping_ratio": analyses.damping_ratio,
+        "message": analyses.message,
     }
-    every = {**dict(zip(found.parameters, found.values, strict=True)), **columns}
+    every = {**dict(zip(analyses.parameters, analyses.values, strict=True)), **columns}
     return {heading: column.ravel() for heading, column in every.items()}
 
 
@@ -276,38 +280,38 @@ def _verdict_lines(verdicts: Counter[str], messages: Counter[str]) -> Lines:
         yield from notes(f"at {count:,} of them: {text}")
 
 
-def sweep_text(found: Sweep) -> Lines:
+def sweep_text(sweep: Sweep) -> Lines:
     """Yield a sweep in a few lines: where the rows are, what was swept, the verdicts."""
-    where = f" → {found.out}" if found.out else ""
-    yield f"{found.topology}: {found.points:,} points{where}"
-    yield from notes(*found.made_of["left_out"])
-    for axis in found.grid.axes:
+    where = f" → {sweep.out}" if sweep.out else ""
+    yield f"{sweep.topology}: {sweep.points:,} points{where}"
+    yield from notes(*sweep.made_of["left_out"])
+    for axis in sweep.grid.axes:
         ends = span(float(axis.values[0]), float(axis.values[-1]), axis.unit)
         yield f"  {axis.free.label}: {ends}, {counted(len(axis.values), 'value')}"
-    yield from _verdict_lines(found.counts, found.messages)
-    yield from (f"  note: {note}" for note in found.notes)
+    yield from _verdict_lines(sweep.counts, sweep.messages)
+    yield from (f"  note: {note}" for note in sweep.notes)
 
 
-def sweep_document(found: Sweep) -> Plain:
+def sweep_document(sweep: Sweep) -> Plain:
     """Return what a sweep is and how it came out, without its rows, as plain data."""
     return {
-        **found.made_of,
-        "columns": list(found.headings),
-        "verdicts": dict(found.verdicts),
-        "out": str(found.out) if found.out else None,
-        "notes": list(found.notes),
+        **sweep.made_of,
+        "columns": list(sweep.headings),
+        "verdicts": dict(sweep.verdicts),
+        "out": str(sweep.out) if sweep.out else None,
+        "notes": list(sweep.notes),
     }
 
 
-def sweep_table(found: Sweep) -> pandas.DataFrame:
+def sweep_table(sweep: Sweep) -> pandas.DataFrame:
     """Return a sweep as a pandas table, with the headings as its columns."""
-    return need("pandas", "data").DataFrame(dict(zip(found.headings, found.columns, strict=True)))
+    return need("pandas", "data").DataFrame(dict(zip(sweep.headings, sweep.columns, strict=True)))
 
 
-def parameters_text(found: Parameters) -> Lines:
+def parameters_text(parameters: Parameters) -> Lines:
     """Yield a line a number: name, value, limits, and what it is."""
-    yield f"{found.topology}: what may be set\n"
-    rows = [(row.name, _value(row), _limits(row), _told(row)) for row in found.rows]
+    yield f"{parameters.topology}: what may be set\n"
+    rows = [(row.name, _value(row), _limits(row), _told(row)) for row in parameters.rows]
     yield from table([("name", "value", "limits", ""), *rows], later=6)
     yield ""
     yield from sentences(HOW)

@@ -45,7 +45,7 @@ def parse_axes(
         E901 not of that form, or missing; E902 the same parameter twice; E903 a parameter that can't be an
         axis, or a range too narrow for floats; E622, E881, E204, E624 as `grid.parse_axis`.
     """
-    found = []
+    intervals = []
     for letter, text, place in (("x", x, 0), ("y", y, 1)):
         if text is None and len(system.region) == 2:
             own = system.region[place]
@@ -75,8 +75,8 @@ def parse_axes(
             expected = with_unit(f"a width of at least {float(least):.2g}", axis.unit)
             what, got = f"the range of {axis.free.label}", with_unit(f"{float(high - low):.2g}", axis.unit)
             raise ApcError(Mistake("E903", Place(f"--{letter}"), what, expected, got))
-        found.append(Range(axis.free, axis.unit, axis.values[0], axis.values[-1]))
-    first, second = found
+        intervals.append(Range(axis.free, axis.unit, axis.values[0], axis.values[-1]))
+    first, second = intervals
     if first.free.meets(second.free):
         item, other = first.free.label, second.free.label
         what = f"{item} is on both axes; a region has two parameters"

@@ -155,14 +155,14 @@ class _Knots:
         return unit
 
 
-def trace(deciding: Eigenvalues, found: Survey, *, tolerance: float, offset: Floats) -> tuple[Arc, ...]:
+def trace(deciding: Eigenvalues, survey: Survey, *, tolerance: float, offset: Floats) -> tuple[Arc, ...]:
     """Follow the boundary through all crossings of a survey.
 
     Parameters
     ----------
     deciding
         What decides over the unit square.
-    found
+    survey
         Where the boundary crosses the cells' edges, and in what order.
     tolerance
         Largest distance between curves and boundary, relative to one of the two coordinates: that in which
@@ -170,13 +170,13 @@ def trace(deciding: Eigenvalues, found: Survey, *, tolerance: float, offset: Flo
     offset
         What to add to unit coordinates to have them count from zero (2,): lower end over width of the range.
     """
-    if not found.chains:
+    if not survey.chains:
         return ()
-    points, pairs = cross(deciding, found.stable, found.unstable, found.growth)
+    points, pairs = cross(deciding, survey.stable, survey.unstable, survey.growth)
     members: list[int] = []
     chain: list[int] = []
     key: list[int] = []
-    for number, (listed, closed) in enumerate(zip(found.chains, found.closed, strict=True)):
+    for number, (listed, closed) in enumerate(zip(survey.chains, survey.closed, strict=True)):
         whole = [*listed, listed[0]] if closed else list(listed)
         members += whole
         chain += [number] * len(whole)
@@ -192,7 +192,7 @@ def trace(deciding: Eigenvalues, found: Survey, *, tolerance: float, offset: Flo
         intervals = _halve(deciding, knots, intervals, tolerance, offset, guarded=not halving)
     for a, b in intervals.tolist():  # given up: the chord is all that is known
         knots.error[a] = max(knots.error[a], float(np.linalg.norm(knots.points[b] - knots.points[a])))
-    return _arcs(deciding, knots, found.closed)
+    return _arcs(deciding, knots, survey.closed)
 
 
 def _apart(knots: _Knots, intervals: Integers) -> Integers:
@@ -348,19 +348,19 @@ def _search(
     turns = (growth[:-1] < 0) & (growth[1:] >= 0)
     away = np.abs(np.arange(2 * reach - 1) - reach + 1)
     nearest = np.argmin(np.where(turns, away[:, None], reach), axis=0)
-    found, every = turns.any(axis=0), np.arange(len(a))
+    result, every = turns.any(axis=0), np.arange(len(a))
     stable, unstable = (places.reshape(2 * reach, -1, 2)[nearest + number, every] for number in (0, 1))
     ends = np.stack([growth[nearest + number, every] for number in (0, 1)], axis=1)
-    knots.error[a[~found]] = np.linalg.norm(chord[~found], axis=1)
-    a, b = a[found], b[found]
+    knots.error[a[~result]] = np.linalg.norm(chord[~result], axis=1)
+    a, b = a[result], b[result]
     if not len(a):
         return intervals[:0]
     tries = 1 if knots.jumps[np.stack([a, b])].any(axis=0).all() else MOST_TRIES
-    place, pairs = cross(deciding, stable[found], unstable[found], ends[found], tries=tries)
+    place, pairs = cross(deciding, stable[result], unstable[result], ends[result], tries=tries)
     new = knots.add(place, pairs, a, (knots.key[a] + knots.key[b]) / 2)
     straight = knots.jumps[np.stack([a, new, b])].all(axis=0)
-    off = _norm(place - middle[found])
-    straight &= off <= FILLED * tolerance * relative_to(place, across[found], offset)
+    off = _norm(place - middle[result])
+    straight &= off <= FILLED * tolerance * relative_to(place, across[result], offset)
     knots.error[a[straight]] = knots.error[new[straight]] = off[straight]
     a, b, new = a[~straight], b[~straight], new[~straight]
     return np.concatenate([np.stack([a, new], axis=1), np.stack([new, b], axis=1)])
@@ -432,7 +432,7 @@ def _rounding(deciding: Eigenvalues, pairs: Pairs) -> Floats:
 def trace_steps(
     growth: Callable[[Floats], Floats],
     leading: Callable[[Floats], complex],
-    found: Survey,
+    survey: Survey,
     *,
     halvings: int = 0,
 ) -> tuple[Arc, ...]:
@@ -448,15 +448,15 @@ def trace_steps(
         Gives the logarithm of the spectral radius (k,), or what stands for it, at points (k, 2).
     leading
         Gives the eigenvalue that decides at a point (2,).
-    found
+    survey
         Where the boundary crosses the cells' edges, and in what order.
     halvings
         How often the middle of a line is put onto the boundary, where that has no steps; the error is then by
         how far it was off.
     """
-    stable, unstable = _closed_in(growth, found.stable, found.unstable)
+    stable, unstable = _closed_in(growth, survey.stable, survey.unstable)
     arcs = []
-    for number, (chain, closed) in enumerate(zip(found.chains, found.closed, strict=True)):
+    for number, (chain, closed) in enumerate(zip(survey.chains, survey.closed, strict=True)):
         members = [*chain, chain[0]] if closed else list(chain)
         points = (stable[members] + unstable[members]) / 2
         errors = np.maximum(_norm(np.diff(points, axis=0)), RESOLUTION)
@@ -552,9 +552,9 @@ def traced(
     -------
     The arcs, the survey they are of, and the stable area with its error, of the unit square.
     """
-    found = survey(samples, cells=cells)
-    arcs = trace(deciding, found, tolerance=tolerance, offset=offset)
-    area, off = stable_area(arcs, found)
+    result = survey(samples, cells=cells)
+    arcs = trace(deciding, result, tolerance=tolerance, offset=offset)
+    area, off = stable_area(arcs, result)
     for halving in range(1, MOST_HALVED + 1):
         if off >= 1 or max((float(arc.errors.max()) for arc in arcs), default=0.0) <= LOST:
             break
@@ -562,11 +562,11 @@ def traced(
         again = trace(deciding, finer, tolerance=tolerance, offset=offset)
         better = stable_area(again, finer)
         if better[1] < off:  # not at a cusp, say
-            arcs, found, (area, off) = again, finer, better
-    return arcs, found, area, off
+            arcs, result, (area, off) = again, finer, better
+    return arcs, result, area, off
 
 
-def stable_area(arcs: Sequence[Arc], found: Survey) -> tuple[float, float]:
+def stable_area(arcs: Sequence[Arc], survey: Survey) -> tuple[float, float]:
     """Return the stable share of the unit square, by Green's theorem, and a bound on its error.
 
     ∮ x dy around the stable side: along the curves, and up the right edge where that is stable.
@@ -580,9 +580,9 @@ def stable_area(arcs: Sequence[Arc], found: Survey) -> tuple[float, float]:
         ends.setdefault(arc.chain, []).append(arc.points)
     turns = []
     for chain, pieces in ends.items():
-        if not found.closed[chain]:
+        if not survey.closed[chain]:
             turns += [float(end[1]) for end in (pieces[0][0], pieces[-1][-1]) if end[0] == 1.0]
-    stable, below = found.corners[1], 0.0
+    stable, below = survey.corners[1], 0.0
     for turn in [*sorted(turns), 1.0]:
         area += (turn - below) if stable else 0.0
         stable, below = not stable, turn

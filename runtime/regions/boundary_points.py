@@ -71,7 +71,7 @@ def cross(
         looked_at, arrived = middle, np.zeros(len(rest), dtype=bool)
         if bracket < tries:
             start = stable[rest] + guess[rest, None] * along[rest]
-            place, found = polish(deciding, start, moved(pairs.at(rest), start - points[rest]), along[rest])
+            place, result = polish(deciding, start, moved(pairs.at(rest), start - points[rest]), along[rest])
             length = np.square(along[rest]).sum(axis=1)
             reached = ((place - stable[rest]) * along[rest]).sum(axis=1) / length
             arrived = np.isfinite(reached) & (reached >= low[rest]) & (reached <= high[rest])
@@ -80,9 +80,9 @@ def cross(
         top = deciding.growth(spots)
         good = arrived.copy()
         if arrived.any():
-            good[arrived] = top[arrived] <= rounded_growth(spots[arrived], found.gradient[arrived])
+            good[arrived] = top[arrived] <= rounded_growth(spots[arrived], result.gradient[arrived])
             points[rest[good]] = place[good]
-            _put(pairs, rest[good], found.at(good))
+            _put(pairs, rest[good], result.at(good))
         out = ~good & (top > 0)
         low[rest[~good & ~out]] = looked_at[~good & ~out]
         high[rest[out]] = looked_at[out]
@@ -110,9 +110,9 @@ def _quadratic_root(growth: Floats, slope: Floats) -> Floats:
     bend = slope - (high - low)  # g = high + slope (t − 1) + bend (t − 1)²
     root = np.sqrt(np.maximum(slope**2 - 4 * bend * high, 0.0))
     # The root next to t = 1, in the form that cancels nothing.
-    found = 1 - 2 * high / np.where(slope + root > 0, slope + root, np.inf)
-    fits = (found > 0) & (found < 1) & (slope > 0)
-    guess: Floats = np.where(fits, found, low / (low - high))
+    result = 1 - 2 * high / np.where(slope + root > 0, slope + root, np.inf)
+    fits = (result > 0) & (result < 1) & (slope > 0)
+    guess: Floats = np.where(fits, result, low / (low - high))
     return guess
 
 
@@ -158,7 +158,7 @@ def polish(
     along
         Directions to stay on (k, 2); left out, each point moves down its gradient.
     """
-    found, rest = np.full(points.shape, np.nan), np.arange(len(points))
+    values, rest = np.full(points.shape, np.nan), np.arange(len(points))
     whole = guess
     for _ in range(MOST_STEPS):
         guess = deciding.follow(points, guess)
@@ -168,8 +168,8 @@ def polish(
         size = np.hypot(*step.T)
         points, guess = points + step, moved(guess, step)
         done = size <= SHORT
-        found[rest[done]] = points[done]
-        if len(rest) == len(found):
+        values[rest[done]] = points[done]
+        if len(rest) == len(values):
             whole = guess
         else:
             _put(whole, rest, guess)
@@ -178,4 +178,4 @@ def polish(
             break
         rest, points, guess = rest[left], points[left], guess.at(left)
         along = along if along is None else along[left]
-    return found, whole
+    return values, whole

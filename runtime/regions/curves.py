@@ -42,15 +42,15 @@ def between(points: Floats, handles: Floats, share: float) -> Floats:
     """Return the points (k − 1, 2) at a share, from 0 to 1, of each segment of a curve."""
     s, t = share, 1 - share
     ends = t**3 * points[:-1] + s**3 * points[1:]
-    found: Floats = ends + 3 * s * t * (t * handles[:, 0] + s * handles[:, 1])
-    return found
+    values: Floats = ends + 3 * s * t * (t * handles[:, 0] + s * handles[:, 1])
+    return values
 
 
 def tangents(points: Floats, handles: Floats) -> Floats:
     """Return the unit tangents (k, 2) at the points of a curve."""
     along = np.concatenate([handles[:, 0] - points[:-1], points[-1:] - handles[-1:, 1]])
-    found: Floats = along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), np.finfo(float).tiny)
-    return found
+    values: Floats = along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), np.finfo(float).tiny)
+    return values
 
 
 def area_beside(points: Floats, handles: Floats) -> float:

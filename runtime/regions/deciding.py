@@ -64,10 +64,10 @@ def join(parts: list[Pairs]) -> Pairs:
 
 def log_magnitudes(matrices: Sequence[Floats], count: int) -> Floats:
     """Return the logarithms of the `count` largest magnitudes of all systems (k, count), descending."""
-    found = np.hstack([np.abs(np.linalg.eigvals(matrix)) for matrix in matrices])
-    if not found.shape[1]:  # nothing moves
-        found = np.zeros((len(found), 1))
-    largest = -np.sort(-found, axis=1)[:, :count]
+    values = np.hstack([np.abs(np.linalg.eigvals(matrix)) for matrix in matrices])
+    if not values.shape[1]:  # nothing moves
+        values = np.zeros((len(values), 1))
+    largest = -np.sort(-values, axis=1)[:, :count]
     logarithms: Floats = np.log(np.maximum(largest, LEAST_MAGNITUDE))
     return logarithms
 
@@ -107,8 +107,8 @@ class Eigenvalues:
         for s, own in enumerate(values):
             rows = np.flatnonzero(system == s)
             if len(rows):
-                found = own[rows, np.argmax(np.abs(own[rows]) + 1e-12 * (own[rows].imag > 0), axis=1)]
-                value[rows] = found.real + 1j * np.abs(found.imag)
+                result = own[rows, np.argmax(np.abs(own[rows]) + 1e-12 * (own[rows].imag > 0), axis=1)]
+                value[rows] = result.real + 1j * np.abs(result.imag)
                 # Any start will do that has a share of the vector wanted, and nearly every one has.
                 start[rows, : self.family.sizes[s]] = 1 / (1 + np.arange(self.family.sizes[s])) + 0.5j
         guess = Pairs(system, value, np.zeros((k, 2), complex), np.zeros((k, 2)), start, start.copy())
@@ -142,10 +142,10 @@ class Eigenvalues:
 
     def value_errors(self, pairs: Pairs) -> Floats:
         """Return by how much the eigenvalues (k,) may be off for what matrices are off: |w| E |v|/|w v|."""
-        found = np.zeros(len(pairs.value))
+        values = np.zeros(len(pairs.value))
         for s, rows in by_system(pairs.system):
             n = self.family.sizes[s]
             right, left = pairs.right[rows, :n, None], pairs.left[rows, None, :n]
             pair = Eigenpairs(pairs.value[rows, None], right, left)
-            found[rows] = pair.errors(self.family.errors[s])[:, 0]
-        return found
+            values[rows] = pair.errors(self.family.errors[s])[:, 0]
+        return values

@@ -62,7 +62,7 @@ def parse_overlay(system: CompiledSystem, text: str) -> Overlay:
     if condition is None:
         what = f"{name[:80]} is no published condition known here ({', '.join(CONDITIONS)})"
         raise ApcError(Mistake("E886", _PLACE, what, hint=nearest(name, CONDITIONS) or _FORM))
-    found: dict[str, Free | float] = {}
+    result: dict[str, Free | float] = {}
     for part in rest.split(","):
         symbol, equals, player = (piece.strip() for piece in part.partition("="))
         if not (equals and symbol and player):
@@ -70,15 +70,15 @@ def parse_overlay(system: CompiledSystem, text: str) -> Overlay:
         if symbol not in condition.symbols:
             what = f"{condition.formula} has no {symbol[:80]}; it has {', '.join(condition.symbols)}"
             raise ApcError(Mistake("E886", _PLACE, what, hint=nearest(symbol, condition.symbols)))
-        if symbol in found:
+        if symbol in result:
             raise ApcError(Mistake("E886", _PLACE, f"{symbol} is given twice"))
-        found[symbol] = _role(system, symbol, player)
-    missing = [symbol for symbol in condition.symbols if symbol not in found]
+        result[symbol] = _role(system, symbol, player)
+    missing = [symbol for symbol in condition.symbols if symbol not in result]
     if missing:
         wanted = ", ".join(f"{symbol}, the {MEANINGS[symbol]}" for symbol in missing)
         hint = f"{text.strip()},{missing[0]}=… (a parameter or a quantity in {UNITS[missing[0]]})"
         raise ApcError(Mistake("E886", _PLACE, f"{condition.formula} needs {wanted}", hint=hint))
-    return Overlay(condition, tuple(found[symbol] for symbol in condition.symbols))
+    return Overlay(condition, tuple(result[symbol] for symbol in condition.symbols))
 
 
 def _role(system: CompiledSystem, symbol: str, player: str) -> Free | float:

@@ -147,7 +147,7 @@ def compare_regions(
             gain = gain_factor(system, axes[1]) if normalize else 1
             work.append((system, parse_axes(system, x, y, scale=Fraction(gain)), gain))
         jobs.append((", ".join(settings), work, [parse_overlay(work[0][0], text) for text in overlays]))
-    found = []
+    result = []
     for title, work, laid in jobs:
         regions = tuple(
             region(system, axes, cells=cells, criterion=criterion, told=told) for system, axes, _ in work
@@ -156,8 +156,8 @@ def compare_regions(
         lines = tuple(
             (overlay.label, overlay_points(first, overlay, *axes) * [1.0, gain]) for overlay in laid
         )
-        found.append(Panel(title, regions, tuple(gain for _, _, gain in work), lines))
-    return Panels(tuple(found), normalize)
+        result.append(Panel(title, regions, tuple(gain for _, _, gain in work), lines))
+    return Panels(tuple(result), normalize)
 
 
 def _refuse_set(axes: Sequence[Range], system: CompiledSystem, settings: Sequence[str]) -> None:
@@ -185,7 +185,7 @@ def gain_factor(system: CompiledSystem, axis: Range) -> int:
     value = axis.low + (axis.high - axis.low) * (MOVE - 1)
     second = resolve(apply(system, [Override(axis.free, value)]))
     exchange = build_exchange(system, first.timings)
-    found: set[int] = set()
+    numbers: set[int] = set()
     sites = linear_sites(system, first.timings)
     for place, group in enumerate(system.groups):
         built = sites[group.kind]
@@ -197,13 +197,13 @@ def gain_factor(system: CompiledSystem, axis: Range) -> int:
             for column in np.flatnonzero((tick_a.r != tick_b.r).any(axis=0)).tolist():
                 receive = partition.receives[column]
                 if receive.operator == "mean":
-                    found.add(1)
+                    numbers.add(1)
                 elif exchange.is_complete(receive.link):
-                    found.add(system.peers - 1)
+                    numbers.add(system.peers - 1)
                 else:
                     heard = np.bincount(exchange.arcs(receive.link)[0][:, 1], minlength=system.peers)
-                    found |= set(heard.tolist())
-    if len(found) > 1:
-        what = f"{axis.free.label} weighs what is heard of {' and '.join(map(str, sorted(found)))} others"
+                    numbers |= set(heard.tolist())
+    if len(numbers) > 1:
+        what = f"{axis.free.label} weighs what is heard of {' and '.join(map(str, sorted(numbers)))} others"
         raise ApcError(Mistake("E906", PLACE, f"{what}, so that there is no one effective gain"))
-    return max(found, default=1)
+    return max(numbers, default=1)

@@ -112,12 +112,12 @@ def _sized(matrices: Floats, size: int) -> Floats:
     n = matrices.shape[1]
     if n == size:
         return matrices
-    found = np.zeros((len(matrices), size, size))
+    values = np.zeros((len(matrices), size, size))
     both = min(n, size)
-    found[:, :both, :both] = matrices[:, :both, :both]
+    values[:, :both, :both] = matrices[:, :both, :both]
     lost = matrices[:, both:].any(axis=(1, 2)) | matrices[:, :, both:].any(axis=(1, 2))
-    found[lost | ~np.isfinite(matrices).all(axis=(1, 2))] = np.nan
-    return found
+    values[lost | ~np.isfinite(matrices).all(axis=(1, 2))] = np.nan
+    return values
 
 
 def family_over(source: MatrixSource, rectangle: Rectangle, errors: Errors, *, split: bool) -> DirectFamily:

@@ -131,7 +131,7 @@ class Curve:
         places = {middle} if self.smooth else set(range(len(self.knots)))
         if np.any(angles < FOLD) or np.any(angles > np.pi - FOLD):  # it may fold on the way
             places |= {0, len(self.knots) - 1}
-        found: list[float] = []
+        values: list[float] = []
         for place in sorted(places):
             _, turn, frame = _identify(self.closed_at, self.knots[place], complex(self.eigenvalues[place]))
             if np.isnan(turn):
@@ -143,8 +143,8 @@ class Curve:
             ]
             own = min(candidates, key=lambda listed: abs(float(listed[place]) - turn))
             listed = own if len(places) == 1 else own[[place]]
-            found += (np.abs(listed) / (2 * np.pi * frame)).tolist()
-        return min(found), max(found)
+            values += (np.abs(listed) / (2 * np.pi * frame)).tolist()
+        return min(values), max(values)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -295,13 +295,13 @@ def region(
         times = [] if by_growth else times
         suffice = all(site.parameters_suffice for site in used)
         plane = _plane(system, free, rectangle, prepared, meant, timed=bool(times))
-        found: Striped | None = None
+        striped: Striped | None = None
         anywhere = not (by_growth or times or suffice)
         start = prepare_at_start(system, prepared, free) if anywhere or len(times) == 1 else None
         if start is not None and anywhere:
             at_once = _plane(system, free, rectangle, start, meant, timed=False)
             try:
-                found = _surveyed(at_once, cells, tolerance, told)
+                striped = _surveyed(at_once, cells, tolerance, told)
                 plane = at_once
             except ApcError as error:
                 if error.mistakes[0].code != "E905":
@@ -311,21 +311,21 @@ def region(
                 family = replace(plane.family, evaluator=points)
                 plane = replace(plane, family=family, closed_at=points.closed_at)
         elif start is not None:
-            found = trace_strips(system, axes, times[0], start, cells=cells, tolerance=tolerance, told=told)
-        stepped = plane.stepped and found is None
-        found = found or _surveyed(plane, cells, tolerance, told)
-        curves = tuple(_curve(plane, arc, meant) for arc in found.arcs)
+            striped = trace_strips(system, axes, times[0], start, cells=cells, tolerance=tolerance, told=told)
+        stepped = plane.stepped and striped is None
+        striped = striped or _surveyed(plane, cells, tolerance, told)
+        curves = tuple(_curve(plane, arc, meant) for arc in striped.arcs)
     whole = float(rectangle.width.prod())
     return Region(
         topology=system.name,
         x=axes[0],
         y=axes[1],
         curves=curves,
-        stable_area=found.area * whole,
-        stable_area_error=found.off * whole,
-        cell=(found.cell[0] * float(rectangle.width[0]), found.cell[1] * float(rectangle.width[1])),
-        finest=found.finest,
-        corner=found.corner,
+        stable_area=striped.area * whole,
+        stable_area_error=striped.off * whole,
+        cell=(striped.cell[0] * float(rectangle.width[0]), striped.cell[1] * float(rectangle.width[1])),
+        finest=striped.finest,
+        corner=striped.corner,
         stepped=stepped,
         tolerance=tolerance,
         linearized=not affine,
@@ -403,20 +403,22 @@ def _surveyed(plane: _Plane, cells: int, tolerance: float, told: Told | None) ->
         return _samples(plane, points)
 
     if plane.stepped:
-        found = survey(samples, cells=cells)
+        result = survey(samples, cells=cells)
         arcs = trace_steps(
             lambda points: samples(points)[:, 0],
             lambda point: largest(plane.family.matrices(point[None])),
-            found,
+            result,
             halvings=plane.halvings,
         )
-        area, off = stable_area(arcs, found)
+        area, off = stable_area(arcs, result)
     else:
         offset = plane.family.rectangle.offset
-        arcs, found, area, off = traced(deciding, samples, cells=cells, tolerance=tolerance, offset=offset)
+        arcs, result, area, off = traced(deciding, samples, cells=cells, tolerance=tolerance, offset=offset)
     if off >= 1:  # of the unit square: the boundary may be anywhere in it
         raise blurred()
-    return Striped(arcs, area, off, found.corners[0], (found.cell, found.cell), found.finest / found.cell)
+    return Striped(
+        arcs, area, off, result.corners[0], (result.cell, result.cell), result.finest / result.cell
+    )
 
 
 def _samples(plane: _Plane, points: Floats) -> Floats:
@@ -463,20 +465,20 @@ def _relative_error(arc: Arc, offset: Floats) -> float:
 def _identify(closed_at: ClosedAt, value: Floats, eigenvalue: complex) -> tuple[str, float, float]:
     """Return the name of an eigenvalue's closed system, its turn in a frame, and the frame in s."""
     closed = closed_at(value.tolist())
-    found, frame_s = mode_near(closed, eigenvalue), closed[0].frame_s
-    return found.shape, 2 * np.pi * found.frequency_hz * frame_s, frame_s
+    mode, frame_s = mode_near(closed, eigenvalue), closed[0].frame_s
+    return mode.shape, 2 * np.pi * mode.frequency_hz * frame_s, frame_s
 
 
-def side_of_curves(found: Region, points: Floats) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def side_of_curves(region: Region, points: Floats) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Say of points (k, 2) of the unit square whether they are stable, and which are too near a curve to say.
 
     From the point straight down, then along the lower edge to its left corner: each crossing of a curve
     changes sides. Curves are replaced by their chords, which is right farther from them than their sagitta.
     """
-    rectangle = found.rectangle
-    stable = np.full(len(points), found.corner)
+    rectangle = region.rectangle
+    stable = np.full(len(points), region.corner)
     near = np.zeros(len(points), dtype=bool)
-    for curve in found.curves:
+    for curve in region.curves:
         knots = rectangle.points(curve.points)
         a, b = knots[:-1], knots[1:]
         middle = between(knots, rectangle.points(curve.handles), 0.5)
@@ -501,14 +503,14 @@ def side_of_curves(found: Region, points: Floats) -> tuple[NDArray[np.bool_], ND
     return stable, near
 
 
-def _decide(found: Region, values: Floats) -> NDArray[np.bool_]:
+def _decide(region: Region, values: Floats) -> NDArray[np.bool_]:
     """Say of parameter values (k, 2) whether they are stable, each by an analysis of its own."""
-    prepared = prepare(found.system)
+    prepared = prepare(region.system)
     decided = []
     for value in values.tolist():
-        changed = apply(found.system, overrides_at(found.system, (found.x.free, found.y.free), value))
-        if found.criterion in BY_GROWTH:
-            judged = growth_at(changed, prepared, [], PLACE, criterion=found.criterion)
+        changed = apply(region.system, overrides_at(region.system, (region.x.free, region.y.free), value))
+        if region.criterion in BY_GROWTH:
+            judged = growth_at(changed, prepared, [], PLACE, criterion=region.criterion)
             decided.append(bool(judged.stable))
         else:
             decided.append(bool(analyze(changed, prepared=prepared).stable))

@@ -179,11 +179,11 @@ def _standing(piece: Piece, other: Range, ends: Sequence[float], prepared: Prepa
     low, high, free = float(other.low), float(other.high), other.free
     family = evaluator_of_many(piece.inside, [free], PLACE, prepared=prepared)
     line = MatrixLine(family, np.array([parameter_of(piece.inside, free).value]), 0, low, high)
-    found = search(line)
-    if not found.stable or any(edge.proof == ESTIMATE for edge in found.edges):
+    result = search(line)
+    if not result.stable or any(edge.proof == ESTIMATE for edge in result.edges):
         return None
     arcs, heights = [], [0.0]
-    for crossing in found.edges:
+    for crossing in result.edges:
         height = min(max((crossing.value - low) / (high - low), 0.0), 1.0)
         heights.append(height)
         # The stable side is on the left: to the west it is below, to the east above.
@@ -197,7 +197,7 @@ def _standing(piece: Piece, other: Range, ends: Sequence[float], prepared: Prepa
                 complex(values[np.argmax(np.abs(values))]),
             )
         )
-    first = found.stable[0]
+    first = result.stable[0]
     steps = np.diff([*heights, 1.0])
     area = float(steps[0 if first else 1 :: 2].sum())
     off = sum(float(arc.errors[0]) for arc in arcs)
@@ -220,7 +220,7 @@ def _moving(
     family = _within(source, piece, rectangle)
     if family is None:
         return None
-    arcs, found, area, off = traced(
+    arcs, survey, area, off = traced(
         Eigenvalues(family),
         lambda points: log_magnitudes(family.matrices(points), BRANCHES),
         cells=cells,
@@ -228,7 +228,7 @@ def _moving(
         offset=rectangle.offset,
     )
     placed = tuple(_placed(arc, ends) for arc in arcs)
-    return _Strip(ends[0], ends[1], placed, (found.corners[0], found.corners[1]), area, off)
+    return _Strip(ends[0], ends[1], placed, (survey.corners[0], survey.corners[1]), area, off)
 
 
 def _within(source: PointEvaluator, piece: Piece, rectangle: Rectangle) -> DirectFamily | None:
@@ -301,7 +301,7 @@ def _join(
             ]
     marks.sort()
     state = [strips[place - 1].stable[1], strips[place].stable[0]]
-    found, below = [], 0.0
+    result, below = [], 0.0
     for height, side, number, end in [*marks, (1.0, -1, 0, 0)]:
         if state[0] != state[1]:
             if side >= 0 and below > 0.0 and height - below <= same:
@@ -309,11 +309,11 @@ def _join(
                 arcs[place - 1 + side][number] = _ended(own, end, np.array([edge, below]))
                 height = below
             elif height > below:
-                found.append(_edge_piece(edge, below, height, state[0], strips, place, source, rectangle))
+                result.append(_edge_piece(edge, below, height, state[0], strips, place, source, rectangle))
         if side >= 0:
             state[side] = not state[side]
         below = height
-    return found
+    return result
 
 
 def _ended(arc: Arc, end: int, point: Floats) -> Arc:
@@ -347,19 +347,19 @@ def _edge_piece(
 
 def _joined(arcs: Sequence[Arc], mode_of: Callable[[Arc], str]) -> list[Arc]:
     """Return the arcs, straight ones of one mode that follow one another as one."""
-    found = [arc for arc in arcs if arc.smooth]
+    result = [arc for arc in arcs if arc.smooth]
     alike: dict[str, list[Arc]] = {}
     for arc in arcs:
         if not arc.smooth:
             alike.setdefault(mode_of(arc), []).append(arc)
     for listed in alike.values():
-        found += _chained(listed)
-    return found
+        result += _chained(listed)
+    return result
 
 
 def _chained(listed: list[Arc]) -> list[Arc]:
     """Return straight arcs, those that follow one another as one."""
-    found = []
+    arcs = []
     while listed:
         arc = listed.pop()
         for tail, head in ((-1, 0), (0, -1)):  # first what follows it, then what it follows
@@ -372,8 +372,8 @@ def _chained(listed: list[Arc]) -> list[Arc]:
                     break
                 other = listed.pop(place)
                 arc = _after(arc, other) if tail else _after(other, arc)
-        found.append(arc)
-    return found
+        arcs.append(arc)
+    return arcs
 
 
 def _after(arc: Arc, other: Arc) -> Arc:

@@ -238,12 +238,12 @@ def _second(values: Floats, *, axis: int) -> Floats:
 def _changes(lattice: _Lattice, corner: Node, size: int) -> list[tuple[Edge, bool]]:
     """Return a cell's crossed stretches counter-clockwise, each with whether it leaves the stable side."""
     ring = lattice.around(corner, size)
-    found = []
+    pairs = []
     for a, b in zip(ring, [*ring[1:], ring[0]], strict=True):
         if lattice.stable(a) != lattice.stable(b):
             leaving = lattice.stable(a)
-            found.append(((a, b) if leaving else (b, a), leaving))
-    return found
+            pairs.append(((a, b) if leaving else (b, a), leaving))
+    return pairs
 
 
 def _linked(

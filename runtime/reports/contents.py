@@ -120,13 +120,13 @@ def report(paths: Sequence[Path], settings: Sequence[str] = ()) -> Report:
 
 def _versions() -> tuple[tuple[str, str], ...]:
     """Return the versions of the program and of those libraries that are there."""
-    found = list(versions())
+    result = list(versions())
     for name in LIBRARIES:
         try:
-            found.append(versions(name)[1])
+            result.append(versions(name)[1])
         except ImportError:
-            found.append((name, "not installed"))
-    return tuple(found)
+            result.append((name, "not installed"))
+    return tuple(result)
 
 
 def _scene(path: Path, system: CompiledSystem, settings: Sequence[str]) -> SceneReport:
@@ -184,9 +184,9 @@ def _answered(system: CompiledSystem) -> tuple[Answer, str]:
 
 
 def _verdict(system: CompiledSystem, call: str) -> Section:
-    found, option = _answered(system)
+    answer, option = _answered(system)
     command = f"apc analyze {call}{option} --plot eigenvalues.svg"
-    return Section("verdict", command, (), (found,), (found.analysis,))
+    return Section("verdict", command, (), (answer,), (answer.analysis,))
 
 
 def _limits(system: CompiledSystem, call: str) -> Section:
@@ -214,16 +214,16 @@ def _criticals(
     commands = [] if verdict is None else [f"apc analyze {call}"]
     for axis, name, why in asked:
         try:
-            found = critical(system, name) if name else None
+            result = critical(system, name) if name else None
         except ApcError as error:
-            found, why = None, _why(error)
-        if found is None:
+            result, why = None, _why(error)
+        if result is None:
             told.append(f"{axis}: {why}")
             continue
         stiff = axis == STIFFNESS
         commands.append(f"apc critical {name} {call}{f' --plot {axis}.svg' if stiff else ''}")
-        results.append(found)
-        drawn += [found] if stiff else []
+        results.append(result)
+        drawn += [result] if stiff else []
     if not results:
         return Section(key, "", refused=" ".join(told))
     return Section(key, " && ".join(commands), tuple(told), tuple(results), tuple(drawn))
@@ -242,13 +242,13 @@ def _region(system: CompiledSystem, call: str) -> Section:
         ]
     unreliable = any(link.channel is not None for link in system.links)
     criterion = NOMINAL if unreliable else None
-    found = region(system, parse_axes(system, *asked), criterion=criterion)
+    result = region(system, parse_axes(system, *asked), criterion=criterion)
     words = [f" --{axis} {shlex.quote(text)}" for axis, text in zip("xy", asked, strict=True) if text]
     words += [f" --in {NOMINAL}"] if criterion else []
     command = f"apc region {call}{''.join(words)} --out region.svg"
     lossy = command.replace(f"--in {NOMINAL}", f"--in {MEAN_SQUARE}")
     told = f"Stable here means with every packet on time. As they are lost and late: {lossy}"
-    return Section("region", command, (told,) if unreliable else (), (found,), (found,))
+    return Section("region", command, (told,) if unreliable else (), (result,), (result,))
 
 
 def _response(system: CompiledSystem, call: str) -> Section:
@@ -257,14 +257,14 @@ def _response(system: CompiledSystem, call: str) -> Section:
         return Section("response", "", refused=f"{why}; apc simulate does")
     duration, told = system.experiment.duration, []
     length = "" if duration else f" --duration {shlex.quote(f'{float(SECONDS):g} s')}"
-    found = simulate(system, duration=duration or SECONDS)
-    if found.summary.verdict == "rests" and (push := _push(system)):
+    trajectory = simulate(system, duration=duration or SECONDS)
+    if trajectory.summary.verdict == "rests" and (push := _push(system)):
         told.append(f"At rest as it stands: here it starts with {push}.")
         length += f" --set {shlex.quote(push)}"
         pushed = apply(system, [parse_override(system, push)])
-        found = simulate(pushed, duration=duration or SECONDS)
+        trajectory = simulate(pushed, duration=duration or SECONDS)
     command = f"apc simulate {call}{length} --plot run.svg"
-    return Section("response", command, tuple(told), (found,), (found,))
+    return Section("response", command, tuple(told), (trajectory,), (trajectory,))
 
 
 def _push(system: CompiledSystem) -> str:
@@ -277,8 +277,8 @@ def _push(system: CompiledSystem) -> str:
 
 def _feel(system: CompiledSystem, call: str) -> Section:
     low, count = FEEL
-    found = feel(system, read_frequencies(system, None, low, None, count))
-    return Section("feel", f"apc feel {call} --points {count} --out feel.svg", (), (found,), (found,))
+    result = feel(system, read_frequencies(system, None, low, None, count))
+    return Section("feel", f"apc feel {call} --points {count} --out feel.svg", (), (result,), (result,))
 
 
 # ---- computed anew ----

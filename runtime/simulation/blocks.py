@@ -106,11 +106,11 @@ def unsolved(simulation: Simulation, frame: int) -> ApcError:
 
 def pushes(simulation: Simulation, first: int) -> list[Floats | None]:
     """Return the impulses of the frames from `first` on, of each member (frames, rows, sites), if any."""
-    found: list[Floats | None] = []
+    result: list[Floats | None] = []
     numbers = first + np.arange(simulation.length)
     for member, forces in zip(simulation.population.members, simulation.forces, strict=True):
         if not forces:
-            found.append(None)
+            result.append(None)
             continue
         program = member.program
         begin = np.array([at for at, _ in program.intervals], dtype=np.int64)
@@ -121,8 +121,8 @@ def pushes(simulation: Simulation, first: int) -> list[Floats | None]:
             impulses(force, starts, which)[:, program.rates.pushed].reshape(len(numbers), -1)
             for force in forces
         ]
-        found.append(np.ascontiguousarray(np.stack(own, axis=-1)))
-    return found
+        result.append(np.ascontiguousarray(np.stack(own, axis=-1)))
+    return result
 
 
 def instants_of(

@@ -158,10 +158,10 @@ def buzz(
     seconds = _seconds(system, prepared, modes)
     names = [item.name for item in measured] + [state for item in measured for state in item.states]
     played = simulate(system, duration=seconds, signals=tuple(dict.fromkeys(names)))
-    found = _compare(system.name, predicted, played, measured)
+    result = _compare(system.name, predicted, played, measured)
     if all(link.channel is None for link in system.links):
-        return found
-    return replace(found, notes=(*found.notes, BY_CHANCE))
+        return result
+    return replace(result, notes=(*result.notes, BY_CHANCE))
 
 
 def _seconds(system: CompiledSystem, prepared: Prepared, modes: ContactModes | None) -> Fraction:
@@ -190,7 +190,7 @@ def _contacts(
     """Return the contacts that are measured, those of the first peers of each group."""
     exchange = build_exchange(system, resolve(system).timings)
     each = max(1, MOST_PEERS // len(groups))
-    found = []
+    result = []
     for group, pushes in groups:
         for peer in list(group.peers[:each]):
             name = exchange.peer_name(int(peer))
@@ -200,7 +200,7 @@ def _contacts(
                 if push.slopes[push.states :].any() or not places:
                     raise _refused(system, f"{push.part} follows more than positions and velocities")
                 stiffness = float(np.abs(push.slopes[places]).max())
-                found.append(
+                result.append(
                     _Measured(
                         f"{name}.{push.part}",
                         tuple(f"{name}.{states[k].name}" for k in places),
@@ -209,7 +209,7 @@ def _contacts(
                         stiffness,
                     )
                 )
-    return found
+    return result
 
 
 def _compare(
@@ -256,29 +256,29 @@ def _compare(
 
 def _notes(known: Predicted | None, *, bounded: bool, steady: bool, lines: Sequence[Line]) -> list[str]:
     """Say what a prediction is worth beside what was played."""
-    found = []
+    texts = []
     if not bounded:
-        found.append("the motion played leaves every bound: it comes to no cycle")
+        texts.append("the motion played leaves every bound: it comes to no cycle")
     elif not steady:
-        found.append("the motion played still changes at its end: its figures are those of its last part")
+        texts.append("the motion played still changes at its end: its figures are those of its last part")
     if len(lines) > 1:
         several = " and ".join(f"{line.frequency_hz:.4g} Hz" for line in lines)
-        found.append(
+        texts.append(
             f"lines stand in the spectrum at {several}, none of which repeats another: one sinusoid says "
             "nothing of such a motion, and what was played counts"
         )
     if known and lines and abs(lines[0].frequency_hz / known.frequency_hz - 1) > APART:
-        found.append(
+        texts.append(
             "what was played is far from what is predicted: the motion is no sinusoid, and what was played "
             "counts"
         )
     if known and not known.attracts:
-        found.append("the cycle predicted is one that motions leave: what swings less dies out, more grows")
+        texts.append("the cycle predicted is one that motions leave: what swings less dies out, more grows")
     if known and known.attracts and steady and not lines:
-        found.append("the motion played came to rest and does not show the cycle predicted")
+        texts.append("the motion played came to rest and does not show the cycle predicted")
     if not known and lines:
-        found.append("it buzzes all the same, in a way that one sinusoid does not describe")
-    return found
+        texts.append("it buzzes all the same, in a way that one sinusoid does not describe")
+    return texts
 
 
 def _lines(time: Floats, values: Floats) -> tuple[Line, ...]:
@@ -288,14 +288,14 @@ def _lines(time: Floats, values: Floats) -> tuple[Line, ...]:
     spectrum = 2 / window.sum() * np.abs(np.fft.rfft((values - values.mean()) * window, size))
     apart = 2 / (step * len(time))  # what a window of this length tells apart
     places, _ = find_peaks(spectrum, height=SECOND * spectrum[1:-1].max())
-    found: list[Line] = []
+    lines: list[Line] = []
     for place in places[np.argsort(-spectrum[places])].tolist():
         near = np.log(spectrum[place - 1 : place + 2])
         aside = 0.5 * (near[0] - near[2]) / (near[0] - 2 * near[1] + near[2])
         frequency = float(place + aside) / (size * step)
-        if not _is_mixed(frequency, [line.frequency_hz for line in found], apart):
-            found.append(Line(frequency, float(np.exp(near[1] - 0.25 * (near[0] - near[2]) * aside))))
-    return tuple(found)
+        if not _is_mixed(frequency, [line.frequency_hz for line in lines], apart):
+            lines.append(Line(frequency, float(np.exp(near[1] - 0.25 * (near[0] - near[2]) * aside))))
+    return tuple(lines)
 
 
 def _is_mixed(frequency: float, known: Sequence[float], apart: float) -> bool:

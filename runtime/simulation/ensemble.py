@@ -123,10 +123,10 @@ class Ensemble(Result):
 
         Where they don't they are about something else: they are too short, or something goes on pushing.
         """
-        found = self.mean_square
-        if found is None or found.stable is None or found.linearized:
+        mean_square = self.mean_square
+        if mean_square is None or mean_square.stable is None or mean_square.linearized:
             return None
-        if found.stable:
+        if mean_square.stable:
             return self.calm == len(self.runs)
         return any(run.verdict in SHAKEN for run in self.runs)
 
@@ -198,8 +198,8 @@ def play_many(
     interrupted = False
     try:
         with _workers(system, settings, min(jobs, len(parts)), place) as workers:
-            for found in results(workers, parts, Patience(), place):
-                done += found
+            for result in results(workers, parts, Patience(), place):
+                done += result
                 if progress is not None:
                     progress(len(done))
     except KeyboardInterrupt:
@@ -218,14 +218,14 @@ def _mean_square(system: CompiledSystem) -> MeanSquare | None:
     try:
         with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
             prepared = analysis.prepare(system)
-            found = growth(system, prepared)
+            result = growth(system, prepared)
     except ApcError as error:  # what can't be analysed can be played
         return MeanSquare("", None, None, False, error.mistakes[0].what)
     linearized = not all(prepared.jacobians[group.kind].affine for group in system.groups)
     settles_in = None
-    if 0 < found.radius < 1:
-        settles_in = 2 * math.log(BAND) / math.log(found.radius) * float(prepared.schedules[0].frame_s)
-    return MeanSquare(verdict_of(found), found.stable, settles_in, linearized, found.why)
+    if 0 < result.radius < 1:
+        settles_in = 2 * math.log(BAND) / math.log(result.radius) * float(prepared.schedules[0].frame_s)
+    return MeanSquare(verdict_of(result), result.stable, settles_in, linearized, result.why)
 
 
 def _workers(
@@ -250,7 +250,7 @@ def _opened(model: bytes, settings: Settings) -> Simulation:
 
 def _runs(simulation: Simulation, numbers: range) -> list[Run]:
     """Play some runs."""
-    player, found = simulation.player(), []
+    player, runs = simulation.player(), []
     lengths = {signal.local for signal in simulation.signals if signal.unit == LENGTH}
     for number in numbers:
         watch = Watch(simulation)
@@ -259,5 +259,5 @@ def _runs(simulation: Simulation, numbers: range) -> list[Run]:
         told = watch.summary(block)
         force = None if told.largest_force is None else told.largest_force[1]
         copies = max((distance for name, distance in told.copies if name in lengths), default=None)
-        found.append(Run(number, told.verdict, told.settled, force, copies))
-    return found
+        runs.append(Run(number, told.verdict, told.settled, force, copies))
+    return runs

@@ -192,19 +192,19 @@ def integrals(rate: Any) -> tuple[tuple[int, int], ...]:
     arguments = [type_.sym(f"a{i}", rate.numel_in(i)) for i in range(4)]
     speed = rate(*arguments)
     slopes = casadi.horzcat(*(jacobian(speed, argument) for argument in arguments))
-    found: dict[int, int] = {}
+    result: dict[int, int] = {}
     for i in range(speed.numel()):
         columns = slopes[i, :].sparsity().get_triplet()[1]
         if len(columns) == 1 and columns[0] < speed.numel():
             slope = slopes[i, columns[0]]
             if slope.is_constant() and float(slope) == 1:
-                found[i] = columns[0]
+                result[i] = columns[0]
     ordered: list[tuple[int, int]] = []
-    while found:
-        ready = [i for i, j in found.items() if j not in found]
+    while result:
+        ready = [i for i, j in result.items() if j not in result]
         if not ready:  # states that are each other's rates: none comes first
             break
-        ordered += [(i, found.pop(i)) for i in ready]
+        ordered += [(i, result.pop(i)) for i in ready]
     return tuple(ordered)
 
 

@@ -85,8 +85,8 @@ class Integrated(casadi.Callback):
             places = casadi.vertcat(casadi.repmat(held, 1, LOOKS + 1), at, casadi.MX.zeros(1, LOOKS + 1))
             signs = self.signs.map(LOOKS + 1)(every, places)
             crossed = casadi.norm_inf(casadi.vec(signs[:, 1:] - signs[:, :-1]))
-            found = [every[:, -1] * scale, crossed, every, at, signs]
-            self.looks = casadi.Function("looks", [start, held, first, last], found)
+            result = [every[:, -1] * scale, crossed, every, at, signs]
+            self.looks = casadi.Function("looks", [start, held, first, last], result)
         self.construct("move", {})
 
     def get_n_in(self) -> int:

@@ -39,9 +39,9 @@ def native(text: str, *, many: bool = False) -> ctypes.CDLL | None:
     many
         Whether its loops run often enough to be put into lanes; it sees the macro MANY then.
     """
-    found = compiler()
+    pair = compiler()
     options = (*(MANY if many else FEW), *OPTIONS)
-    library = _library(text, found, options) if found is not None else None
+    library = _library(text, pair, options) if pair is not None else None
     try:
         return None if library is None else ctypes.CDLL(str(library))
     except OSError:  # it can't be loaded: of another machine, or the folder forbids it
@@ -63,9 +63,9 @@ def compiler() -> tuple[str, str] | None:
     return None
 
 
-def _library(text: str, found: tuple[str, str], options: tuple[str, ...]) -> Path | None:
+def _library(text: str, pair: tuple[str, str], options: tuple[str, ...]) -> Path | None:
     """Return the library of a text, compiled now or before; None if it can't be had."""
-    path, version = found
+    path, version = pair
     digest = hashlib.sha256("\0".join((text, path, version, *options)).encode()).hexdigest()
     folder = cache_folder()
     if folder is None:

@@ -84,7 +84,7 @@ def exchanges_within(schedules: Sequence[Schedule]) -> tuple[int, ...]:
     slots = {heard.sent for schedule in schedules for heard in schedule.heard if heard.lag == 0}
     # Over an unreliable link anything may be heard as soon as it is sent.
     any_time = {selected.way.link for schedule in schedules for selected in schedule.selected}
-    found = {
+    numbers = {
         at
         for schedule in schedules
         for sent, at in zip(schedule.sent, schedule.sent_times, strict=True)
@@ -94,19 +94,19 @@ def exchanges_within(schedules: Sequence[Schedule]) -> tuple[int, ...]:
         for now, event in timed_events(schedule):
             heard = (row for rows in event.heard for row in rows) if isinstance(event, Tick) else ()
             if any(schedule.received[row].way.edge for row in heard):
-                found.add(now)
-    return tuple(sorted(found))
+                numbers.add(now)
+    return tuple(sorted(numbers))
 
 
 def instants_within(schedules: Sequence[Schedule]) -> tuple[int, ...]:
     """Return the instants, in quanta, at which anything is computed or sent within the frame."""
-    found = {
+    numbers = {
         now
         for schedule in schedules
         for now, event in timed_events(schedule)
         if not isinstance(event, Propagate)
     }
-    return tuple(sorted(found))
+    return tuple(sorted(numbers))
 
 
 def refuse_unheard_of(system: CompiledSystem) -> None:

@@ -175,20 +175,20 @@ def transition_rows(rates_of: Rates, vectors: Floats, durations: Sequence[Fracti
     one_column_at_least = np.hstack([flat, np.zeros((len(flat), 1))])
     _, first, which = np.unique(one_column_at_least, axis=0, return_index=True, return_inverse=True)
     exactly = np.ones(len(first), np.bool_)
-    found = [np.empty((len(first), n_x, width)) for _ in durations]
+    result = [np.empty((len(first), n_x, width)) for _ in durations]
     if len(first) > MOST_EXACT:
         whole = flat[first].reshape(len(first), width, n_x).swapaxes(1, 2)
         exactly[:] = False
-        for matrix, duration in zip(found, durations, strict=True):
+        for matrix, duration in zip(result, durations, strict=True):
             step = exponential_rows(whole[:, :, :n_x], whole[:, :, n_x:], float(duration))
             matrix[:] = step.matrix
             error, size = step.roundings * UNIT * step.size, np.abs(matrix)
             exactly |= ~(error <= CLOSE * size.max(axis=(1, 2), keepdims=True)).all(axis=(1, 2))
     for place in np.flatnonzero(exactly).tolist():
         whole = exact_rates(rates_of, vectors[first[place]])
-        for matrix, step in zip(found, discretize(whole[:, :n_x], whole[:, n_x:], durations), strict=True):
+        for matrix, step in zip(result, discretize(whole[:, :n_x], whole[:, n_x:], durations), strict=True):
             matrix[place] = step.matrix
-    return tuple(matrix[which.reshape(-1)] for matrix in found)
+    return tuple(matrix[which.reshape(-1)] for matrix in result)
 
 
 def _symbols(kind: Kind) -> tuple[Any, Any, Any, Any]:

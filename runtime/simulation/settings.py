@@ -124,14 +124,14 @@ def parse_method(text: str) -> Method:
 
 def _tolerance(text: str, place: Place) -> float:
     try:
-        found = plain_float(text)
+        value = plain_float(text)
     except ValueError:
-        found = 0.0
-    if not TIGHTEST <= found <= LOOSEST:
+        value = 0.0
+    if not TIGHTEST <= value <= LOOSEST:
         expected = f"a number from {TIGHTEST:g} to {LOOSEST:g}"
         what, got = "the relative tolerance of cvodes", text[:80] or "none"
         raise ApcError(Mistake("E912", place, what, expected, got, EXAMPLES[CVODES]))
-    return found
+    return value
 
 
 def check_step(system: CompiledSystem, method: Method, fastest: Fraction, longest: Fraction) -> None:

@@ -46,13 +46,13 @@ def local_signals(kind: Kind, schedule: Schedule) -> tuple[LocalSignal, ...]:
     A value that a hold puts out as soon as it is computed is one signal; one that acts later is two:
     `contact.f` as newly computed, and `contact.f acting`.
     """
-    found = [
+    signals = [
         LocalSignal(state.name, state.unit, "state", (place,)) for place, state in enumerate(kind.states)
     ]
     ticking = ticking_partitions(schedule)
     for p in ticking:
         partition = kind.clocks[p]
-        found += [
+        signals += [
             LocalSignal(name, unit, "output", (p, o))
             for o, (name, unit) in enumerate(zip(partition.outputs, partition.units, strict=True))
         ]
@@ -62,29 +62,29 @@ def local_signals(kind: Kind, schedule: Schedule) -> tuple[LocalSignal, ...]:
         p = numbers[hold.clock]
         if h in late:
             unit = kind.clocks[p].units[hold.output]
-            found.append(LocalSignal(f"{hold.name} acting", unit, "hold", (h,)))
-    found += [
+            signals.append(LocalSignal(f"{hold.name} acting", unit, "hold", (h,)))
+    signals += [
         LocalSignal(limit.name, limit.unit, "limited", (place,))
         for place, limit in enumerate(kind.limits)
         if limit.value is not None
     ]
-    return tuple(found)
+    return tuple(signals)
 
 
 def sent_states(kind: Kind) -> tuple[int, ...]:
     """Return the states, by their places, that a site sends to others as they are."""
-    found = []
+    numbers = []
     for sending in kind.sends:
         if sending.send.is_a("SXFunction"):
             inputs = sending.send.sx_in()
             channels = sending.send(*inputs)
-            found += [
+            numbers += [
                 place
                 for row in range(channels.numel())
                 for place in range(len(kind.states))
                 if casadi.is_equal(channels[row], inputs[0][place])
             ]
-    return tuple(dict.fromkeys(found))
+    return tuple(dict.fromkeys(numbers))
 
 
 def ticking_partitions(schedule: Schedule) -> list[int]:
@@ -158,10 +158,10 @@ def choose(
     tests = [(pattern, _test(pattern)) for pattern in patterns]
     used: set[str] = set()
     choices = []
-    for group, found in zip(system.groups, available, strict=True):
-        wanted = np.full((group.count, len(found)), not patterns)
+    for group, local_signals in zip(system.groups, available, strict=True):
+        wanted = np.full((group.count, len(local_signals)), not patterns)
         for pattern, test in tests:
-            for place, local in enumerate(found):
+            for place, local in enumerate(local_signals):
                 fits = [any(test.fullmatch(text) for text in (local.name, f"{group.name}.{local.name}"))]
                 if not fits[0] and ("[" in pattern or pattern.startswith(("*", group.name))):
                     names = (f"{group.name}[{i + 1}].{local.name}" for i in range(group.count))
@@ -169,7 +169,7 @@ def choose(
                 wanted[:, place] |= fits
                 used |= {pattern} if any(fits) else set()
         recorded = np.flatnonzero(wanted.any(axis=0))
-        locals_ = tuple(found[place] for place in recorded.tolist())
+        locals_ = tuple(local_signals[place] for place in recorded.tolist())
         choices.append(Choice(locals_, np.ascontiguousarray(wanted[:, recorded])))
     for pattern in patterns:
         if pattern not in used:
@@ -194,11 +194,11 @@ def _test(pattern: str) -> re.Pattern[str]:
 
 
 def _refuse(system: CompiledSystem, available: Sequence[Sequence[LocalSignal]], pattern: str) -> None:
-    names = dict.fromkeys(local.name for found in available for local in found)
+    names = dict.fromkeys(local.name for local_signals in available for local in local_signals)
     names |= dict.fromkeys(
         f"{group.name}[1].{local.name}"
-        for group, found in zip(system.groups, available, strict=True)
-        for local in found
+        for group, local_signals in zip(system.groups, available, strict=True)
+        for local in local_signals
     )
     what = f"no signal fits {pattern[:80]!r}; the signals of a peer are {', '.join(list(names)[:12])}"
     hint = f"--signals {nearest(pattern, names)}" if nearest(pattern, names) else f"names such as {EXAMPLE}"

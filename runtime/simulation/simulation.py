@@ -384,12 +384,12 @@ def _flow(
 
 def _tolerances(system: CompiledSystem, flows: Sequence[Flow | None]) -> tuple[Tolerance, ...]:
     """Return the tolerances of all states, each state of several kinds once, with the smallest."""
-    found: dict[str, Tolerance] = {}
+    result: dict[str, Tolerance] = {}
     for kind, flow in zip(system.kinds, flows, strict=True):
         for tolerance in flow.tolerances(kind) if flow else ():
-            if tolerance.state not in found or tolerance.absolute < found[tolerance.state].absolute:
-                found[tolerance.state] = tolerance
-    return tuple(found.values())
+            if tolerance.state not in result or tolerance.absolute < result[tolerance.state].absolute:
+                result[tolerance.state] = tolerance
+    return tuple(result.values())
 
 
 def _check_step(

@@ -40,9 +40,9 @@ def strike(system: CompiledSystem, peer: str = "") -> tuple[CompiledSystem, str]
         E983 no such peer, or nothing of it that a push could move.
     """
     names = [group.name for group in system.groups]
-    found = _PEER.fullmatch(peer.strip() or names[0])
-    number = int(found["number"] or 1) if found else 0
-    place = names.index(found["group"]) if found and found["group"] in names else -1
+    result = _PEER.fullmatch(peer.strip() or names[0])
+    number = int(result["number"] or 1) if result else 0
+    place = names.index(result["group"]) if result and result["group"] in names else -1
     if place < 0 or not 1 <= number <= system.groups[place].count:
         what = f"there is no peer {peer.strip()[:60]} to strike"
         raise ApcError(

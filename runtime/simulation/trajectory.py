@@ -297,15 +297,15 @@ def duration_of(system: CompiledSystem, duration: Fraction | None, *, runs: int 
     ApcError
         E877 neither call nor scene says it; E915 nobody will wait for it.
     """
-    found = system.experiment.duration if duration is None else duration
-    if found is None:
+    number = system.experiment.duration if duration is None else duration
+    if number is None:
         what = "the scene says no duration"
         hint = 'experiment: {duration: 3 s}  (or --duration "3 s")'
         raise ApcError(Mistake("E877", Place(system.origin.topology), what, hint=hint))
-    if found <= 0:
-        expected, got = "more than 0 s", f"{float(found):g} s"
+    if number <= 0:
+        expected, got = "more than 0 s", f"{float(number):g} s"
         raise ApcError(
             Mistake("E877", Place(system.origin.topology), "the duration", expected=expected, got=got)
         )
-    check_length(system, found, runs=runs)
-    return found
+    check_length(system, number, runs=runs)
+    return number

@@ -62,11 +62,11 @@ class Grid:
 
     def values(self, point: int) -> tuple[Fraction, ...]:
         """Return the value of each axis at a point."""
-        found = []
+        numbers = []
         for axis in reversed(self.axes):
             point, place = divmod(point, len(axis.values))
-            found.append(axis.values[place])
-        return tuple(reversed(found))
+            numbers.append(axis.values[place])
+        return tuple(reversed(numbers))
 
     def places(self, points: Sequence[int]) -> NDArray[np.int64]:
         """Return which of each axis's values some points have (k, axes)."""

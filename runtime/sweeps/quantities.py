@@ -112,13 +112,13 @@ def _analyze(system: CompiledSystem, argument: str) -> Quantity:
                 for exact in [axis.values.__getitem__]
             ]
             made[:] = [(grid, many_analyses(system, varied))]
-        found = made[0][1].at(grid.places(points))
+        rows = made[0][1].at(grid.places(points))
         return (
-            found.verdict,
-            *map(_finite, (found.spectral_radius, found.spectral_radius_error)),
-            np.where(found.rigid_modes < 0, np.nan, found.rigid_modes),
-            *map(_finite, (found.frequency_hz, found.damping_ratio)),
-            found.message,
+            rows.verdict,
+            *map(_finite, (rows.spectral_radius, rows.spectral_radius_error)),
+            np.where(rows.rigid_modes < 0, np.nan, rows.rigid_modes),
+            *map(_finite, (rows.frequency_hz, rows.damping_ratio)),
+            rows.message,
         )
 
     return Quantity(columns, cells, by_matrices(system))
@@ -145,9 +145,9 @@ def _growth(system: CompiledSystem, argument: str) -> Quantity:
 
     def evaluate(changed: CompiledSystem) -> Row:
         with np.errstate(all="ignore"):
-            found = growth(changed, prepared)
-        error = max(found.high - found.radius, found.radius - found.low)
-        return (verdict_of(found), finite(found.radius), finite(error), found.why or found.note)
+            result = growth(changed, prepared)
+        error = max(result.high - result.radius, result.radius - result.low)
+        return (verdict_of(result), finite(result.radius), finite(error), result.why or result.note)
 
     return Quantity(columns, _one_by_one(system, columns, evaluate))
 
@@ -167,12 +167,12 @@ def _passive(system: CompiledSystem, argument: str) -> Quantity:
     )
 
     def evaluate(changed: CompiledSystem) -> Row:
-        found = passive_hands(changed)
-        worst = found.worst
+        hands = passive_hands(changed)
+        worst = hands.worst
         if worst is None or worst.more is None or worst.error is None:
-            return (found.verdict, None, None, None, found.why or "no damping is enough")
+            return (hands.verdict, None, None, None, hands.why or "no damping is enough")
         return (
-            found.verdict,
+            hands.verdict,
             finite(-worst.more),
             finite(worst.error),
             finite(worst.frequency_hz or 0.0),
@@ -225,12 +225,12 @@ def _critical(system: CompiledSystem, argument: str, criterion: str = "nominal")
     )
 
     def evaluate(changed: CompiledSystem) -> Row:
-        found = critical(changed, argument, criterion=criterion)
-        if found.value is None or found.error is None:
-            return (found.verdict, None, None, 0, None, "")
-        verdict = f"stable {found.stable_side} the value"
-        proof = next(crossing.proof for crossing in found.crossings if crossing.value == found.value)
-        return (verdict, finite(found.value), finite(found.error), len(found.crossings), proof, "")
+        result = critical(changed, argument, criterion=criterion)
+        if result.value is None or result.error is None:
+            return (result.verdict, None, None, 0, None, "")
+        verdict = f"stable {result.stable_side} the value"
+        proof = next(crossing.proof for crossing in result.crossings if crossing.value == result.value)
+        return (verdict, finite(result.value), finite(result.error), len(result.crossings), proof, "")
 
     return Quantity(columns, _one_by_one(system, columns, evaluate))
 

@@ -64,10 +64,10 @@ class Parts:
     def read(self, part: int) -> Cells | None:
         """Return the cells of a part, or None if it is damaged, not of this user's or isn't there."""
         try:
-            found, _, body = read_file(self._path(part), _LARGEST).partition(b"\n")
+            text, _, body = read_file(self._path(part), _LARGEST).partition(b"\n")
         except RefusedError:
             return None
-        if not hmac.compare_digest(found, self._seal(part, body)):
+        if not hmac.compare_digest(text, self._seal(part, body)):
             return None
         return _unpacked(read_arrays(body, _ARRAYS, _LARGEST))
 
@@ -125,11 +125,11 @@ def _packed(cells: Cells) -> bytes:
     return file.getvalue()
 
 
-def _unpacked(found: Mapping[str, NDArray[Any]]) -> Cells:
+def _unpacked(result: Mapping[str, NDArray[Any]]) -> Cells:
     """Return the columns of `_packed`."""
-    numbers, codes = iter(found["numbers"]), iter(found["codes"])
-    texts = np.array([*json.loads(found["texts"].tobytes()), None], dtype=object)
-    return tuple(texts[next(codes)] if text else next(numbers) for text in found["is_text"].tolist())
+    numbers, codes = iter(result["numbers"]), iter(result["codes"])
+    texts = np.array([*json.loads(result["texts"].tobytes()), None], dtype=object)
+    return tuple(texts[next(codes)] if text else next(numbers) for text in result["is_text"].tolist())
 
 
 def open_parts(target: Path, description: Mapping[str, Any]) -> Parts:

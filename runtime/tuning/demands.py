@@ -234,10 +234,10 @@ def read_seconds(text: str) -> float:
     """Return how long a search may take, without end if nothing is said. Raises ApcError E996."""
     if not text:
         return math.inf
-    found = option_value("--time", text, what="a time", unit="s")
-    if found <= 0:
+    number = option_value("--time", text, what="a time", unit="s")
+    if number <= 0:
         raise ApcError(Mistake("E996", Place("--time"), "a time", "more than 0 s", text[:80]))
-    return float(found)
+    return float(number)
 
 
 def _range(system: CompiledSystem, text: str, place: Place) -> Range:

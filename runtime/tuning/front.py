@@ -123,9 +123,9 @@ def front(
             notes = (*notes, f"the time was up after {place} of {points} bounds, the largest first")
             break
         asked = replace(demands, felt=(*demands.felt, replace(against, most=bound)))
-        found = tune(system, asked, seconds=left, told=told)
-        if found.met:
-            designs.append(_design(found, felt(np.array([float(gain.value) for gain in found.gains]))))
+        tuning = tune(system, asked, seconds=left, told=told)
+        if tuning.met:
+            designs.append(_design(tuning, felt(np.array([float(gain.value) for gain in tuning.gains]))))
     designs.sort(key=lambda design: design.felt)
     return Front(
         topology=system.name,
@@ -142,9 +142,9 @@ def front(
     )
 
 
-def _design(found: Tuning, felt: float) -> Design:
-    gains = tuple((gain.parameter, float(gain.value), gain.unit) for gain in found.gains)
-    return Design(gains, found.value, felt, found.proved)
+def _design(tuning: Tuning, felt: float) -> Design:
+    gains = tuple((gain.parameter, float(gain.value), gain.unit) for gain in tuning.gains)
+    return Design(gains, tuning.value, felt, tuning.proved)
 
 
 def _knee(designs: list[Design]) -> int:

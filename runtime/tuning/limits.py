@@ -111,7 +111,7 @@ class Limits:
     def settings(self) -> list[tuple[tuple[Override, ...], CompiledSystem]]:
         """Every number of peers with every delay that stands for others, and the scene with these."""
         listed = [range(int(count.low), int(count.high) + 1) for count in self.demands.counts]
-        found = []
+        pairs = []
         for counts in itertools.product(*listed):
             numbers = tuple(
                 Override(item.free, Fraction(count))
@@ -119,12 +119,12 @@ class Limits:
             )
             scene, delay = apply(self.system, numbers), self.demands.delay
             if delay is None:
-                found.append((numbers, scene))
+                pairs.append((numbers, scene))
                 continue
             for value in dict.fromkeys(number for number, _ in standing_delays(scene, delay)):
                 late = Override(delay.free, value)
-                found.append(((*numbers, late), apply(scene, [late])))
-        return found
+                pairs.append(((*numbers, late), apply(scene, [late])))
+        return pairs
 
     @cached_property
     def allowed(self) -> float:
@@ -167,7 +167,7 @@ class Limits:
 
     def worst(self, scenarios: Sequence[Scenario], chosen: Floats) -> Floats:
         """Return the largest value in each scenario (k, s) with columns (k, m)."""
-        found = np.full((len(chosen), len(scenarios)), BEYOND)
+        values = np.full((len(chosen), len(scenarios)), BEYOND)
         size = 1 if self.slow else len(chosen)
         for begin in range(0, len(chosen), size):
             if begin and self.late:
@@ -179,8 +179,8 @@ class Limits:
                     _sizes(matrix) for matrix in self.family(scenario.setting).matrices(self._numbers(points))
                 ]
                 grown = np.max([np.full(len(points), NONE), *sizes], axis=0) - self.allowed
-                found[some, place] = np.max([grown, *self.asked(scenario.setting, points).T], axis=0)
-        return found
+                values[some, place] = np.max([grown, *self.asked(scenario.setting, points).T], axis=0)
+        return values
 
     def _numbers(self, points: Floats) -> Floats:
         """Return the gains and the box of points (k, m + b), without the level of an aim."""
@@ -257,8 +257,8 @@ class Limits:
         felt = self.measured(setting, self._numbers(points), demands)
         off = felt[..., 1] if bounded else np.zeros(felt.shape[:2])
         count = len(demands.felt)
-        found = np.log(np.maximum(felt[:, :count, 0] + off[:, :count], TINY))
-        found -= np.log([felt.most for felt in demands.felt])
+        values = np.log(np.maximum(felt[:, :count, 0] + off[:, :count], TINY))
+        values -= np.log([felt.most for felt in demands.felt])
         if aim.level or aim.fixed is not None:
             level = points[:, len(demands.free)] if aim.fixed is None else np.full(len(points), aim.fixed)
             weights = [abs(weight) for weight, item in aim.terms if isinstance(item, Felt)]
@@ -267,9 +267,9 @@ class Limits:
             # Far beyond by its logarithm: gains beside a resonance are large, and slopes still lead away.
             far = beyond / aim.scale
             far = np.where(far > 1, 1 + np.log(np.maximum(far, 1)), far)
-            found = np.column_stack([found, far])
-        found = np.nan_to_num(found, nan=BEYOND, posinf=BEYOND, neginf=NONE)
-        return np.asarray(np.maximum(found, NONE))
+            values = np.column_stack([values, far])
+        values = np.nan_to_num(values, nan=BEYOND, posinf=BEYOND, neginf=NONE)
+        return np.asarray(np.maximum(values, NONE))
 
     def sums(self, setting: int, points: Floats, view: Demands | None = None) -> Floats:
         """Return the weighted sum that is the aim (k,) at points (k, m + b), NaN where nothing is known."""
@@ -289,11 +289,11 @@ class Limits:
         """
         views = (self.demands, *self.views)
         asked = list(dict.fromkeys(felt for demands in views for felt in demands.measured))
-        found = np.full((len(numbers), len(asked), 3), np.inf)
+        values = np.full((len(numbers), len(asked), 3), np.inf)
         _, scene = self.settings[setting]
         free = [interval.free for interval in (*self.demands.free, *self.demands.box)]
         for place, point in enumerate(map(tuple, numbers.tolist()) if asked else ()):
-            row = found[place]
+            row = values[place]
             if (setting, point, len(asked)) not in self.felt:
                 if place and self.late:
                     break
@@ -303,7 +303,7 @@ class Limits:
                     row[:] = felt_in(changed, asked, self.prepared)
                 self.felt[setting, point, len(asked)] = row.copy()
             row[:] = self.felt[setting, point, len(asked)]
-        return found[:, [asked.index(felt) for felt in view.measured]]
+        return values[:, [asked.index(felt) for felt in view.measured]]
 
     def sampled(self, scenario: Scenario, chosen: Floats) -> Floats:
         """Return the largest value in a scenario (k,) with columns (k, m), the same whenever it is asked."""
@@ -333,8 +333,8 @@ class Limits:
             else:
                 at = np.tile(self._numbers(point), (len(along), 1))
                 for pair in family.slopes(at, self._numbers(along)):
-                    values, slopes, found = _largest(*pair)
-                    parts.append((values - self.allowed, slopes, found, math.nan, place))
+                    values, slopes, result = _largest(*pair)
+                    parts.append((values - self.allowed, slopes, result, math.nan, place))
             still = self.asked(scenario.setting, moved)[:, np.logical_not(peaks)]
             parts.append((*_differences(still, inwards), math.nan, place))
             for frequency, view in zip(self.frequencies, self.views if any(peaks) else (), strict=False):
@@ -345,7 +345,7 @@ class Limits:
             np.concatenate([values for values, *_ in parts]),
             np.concatenate([slopes for _, slopes, *_ in parts]),
             np.repeat(np.arange(len(parts)), counts),
-            np.concatenate([found for *_, found, _, _ in parts]),
+            np.concatenate([values for *_, values, _, _ in parts]),
             np.repeat([frequency for *_, frequency, _ in parts], counts),
             np.repeat([place for *_, place in parts], counts),
         )
@@ -374,7 +374,7 @@ def felt_in(
     beside = {PART_OF[felt.name] for felt in asked if felt.name in PART_OF}
     # Beside what is stable, too, the slopes of a search want what is felt wherever there is something to say.
     told = feel(system, hertz, unstable="h2" not in beside, beside=beside, prepared=prepared)
-    found = []
+    result = []
     for felt in asked:
         value, off, hz = 0.0, 0.0, felt.frequency_hz
         if felt.name in RESPONSES:
@@ -397,8 +397,8 @@ def felt_in(
                 value, off, hz = max((value, off, hz), own)
         if value == 0:
             raise ApcError(Mistake("E996", SUBJECT, f"of {felt.label} nothing is felt in this scene"))
-        found.append((value, off, hz))
-    return found
+        result.append((value, off, hz))
+    return result
 
 
 def _differences(values: Floats, along: Floats) -> tuple[Floats, Floats, Complexes]:
@@ -414,11 +414,11 @@ def _differences(values: Floats, along: Floats) -> tuple[Floats, Floats, Complex
 def _sizes(matrices: Floats) -> Floats:
     """Return ln |λ| of the largest eigenvalue of each matrix (k, n, n)."""
     known = np.isfinite(matrices).all(axis=(1, 2))
-    found = np.full(len(matrices), BEYOND)
+    values = np.full(len(matrices), BEYOND)
     if matrices.shape[-1] and known.any():
         largest = np.abs(np.linalg.eigvals(matrices[known])).max(axis=1)
-        found[known] = np.log(np.clip(largest, math.exp(NONE), None))
-    return found if matrices.shape[-1] else np.full(len(matrices), NONE)
+        values[known] = np.log(np.clip(largest, math.exp(NONE), None))
+    return values if matrices.shape[-1] else np.full(len(matrices), NONE)
 
 
 def _largest(matrix: Floats, slope: Floats) -> tuple[Floats, Floats, Complexes]:

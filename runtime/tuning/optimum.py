@@ -217,8 +217,8 @@ class Search:
 
     def best(self, starts: Sequence[Floats]) -> Optimum:
         """Return the best that descents from starts (shares of the ranges) find."""
-        found = [self._descended(start) for start in starts]
-        chosen = min(found, key=self._rank)
+        optimums = [self._descended(start) for start in starts]
+        chosen = min(optimums, key=self._rank)
         count = SLOW_BESIDE if self.limits.slow else BESIDE
         cloud = _even(count, len(self._low)) - 0.5
         looked = 0
@@ -237,17 +237,17 @@ class Search:
             chosen = again
         return replace(chosen, looked=looked)
 
-    def shares(self, found: Optimum) -> Floats:
+    def shares(self, optimum: Optimum) -> Floats:
         """Return the gains of an optimum as shares of their ranges."""
-        return np.asarray((found.gains - self._low) / self._width)
+        return np.asarray((optimum.gains - self._low) / self._width)
 
-    def _own_merit(self, found: Optimum) -> float:
-        return float(self._merit(self.shares(found)[None], np.array([found.worst]))[0])
+    def _own_merit(self, optimum: Optimum) -> float:
+        return float(self._merit(self.shares(optimum)[None], np.array([optimum.worst]))[0])
 
-    def _rank(self, found: Optimum) -> tuple[bool, float]:
+    def _rank(self, optimum: Optimum) -> tuple[bool, float]:
         """Return what the best of several has least of."""
-        met = self.column is None or found.worst <= BINDS
-        return not met, self._own_merit(found) if met else found.worst
+        met = self.column is None or optimum.worst <= BINDS
+        return not met, self._own_merit(optimum) if met else optimum.worst
 
     def _descended(self, start: Floats) -> Optimum:
         """Return where a descent ends."""
@@ -282,11 +282,11 @@ class Search:
                 rough = np.clip(np.nan_to_num(ended.x[:size], nan=0.5), *self._ends)
                 for end in self._ends:
                     rough = np.where(np.abs(rough - end) < OPEN, end, rough)
-                found = self._polished(rough, rows_of)
-                (unmet, value), known_rank = self._rank(found), self._rank(best)
+                optimum = self._polished(rough, rows_of)
+                (unmet, value), known_rank = self._rank(optimum), self._rank(best)
                 far = (unmet, value + max(OPEN, self._near)) < known_rank
                 if (unmet, value) < known_rank:
-                    best, here = found, np.append(rough, ended.x[size:])
+                    best, here = optimum, np.append(rough, ended.x[size:])
                 if far and ended.success and reach == 1:
                     break
                 reach *= 1.0 if far and reach < 1 else SHORTER
@@ -325,9 +325,9 @@ class Search:
 
         def conditions(y: Floats) -> Floats:
             shares, rest = unpacked(y)
-            found = rows_of(shares)
-            same = [_same(found, here, number) for number in active]
-            values, slopes = found.values[same], found.slopes[same]
+            rows = rows_of(shares)
+            same = [_same(rows, here, number) for number in active]
+            values, slopes = rows.values[same], rows.slopes[same]
             weights = rest[:-1] if spare else rest
             along = self._aim() + weights @ slopes
             last = [weights.sum() - 1] if spare else []
@@ -345,10 +345,10 @@ class Search:
 
     def _aim(self) -> Floats:
         """Return how what is to be small follows the shares (m,)."""
-        found = np.zeros(len(self._low))
+        values = np.zeros(len(self._low))
         if self.column is not None:
-            found[self.column] = -self.sign
-        return found
+            values[self.column] = -self.sign
+        return values
 
     def _value(self, shares: Floats, rows_of: Callable[[Floats], Rows]) -> float:
         """Return the value of the aim: a gain, or the largest ln |λ| of a frame."""
@@ -380,10 +380,10 @@ class Search:
         return Optimum(tuple(self.scenarios), self.gains(shares), value, error, worst, rows, multipliers, 0)
 
 
-def _same(found: Rows, here: Rows, number: int) -> int:
+def _same(rows: Rows, here: Rows, number: int) -> int:
     """Return the row that goes on a mode of another point: of its block, the nearest eigenvalue."""
-    own = np.flatnonzero(found.block == here.block[number])
-    return int(own[np.argmin(np.abs(found.eigenvalue[own] - here.eigenvalue[number]))])
+    own = np.flatnonzero(rows.block == here.block[number])
+    return int(own[np.argmin(np.abs(rows.eigenvalue[own] - here.eigenvalue[number]))])
 
 
 def _even(count: int, size: int) -> Floats:

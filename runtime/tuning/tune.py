@@ -281,22 +281,22 @@ class _Work:
         aim = self.demands.aim
         starts: list[Floats] = []
         while True:
-            found = self._borne(aim.column, starts)
-            if aim.column is not None and found.worst > BINDS:  # perhaps they only were not found
+            optimum = self._borne(aim.column, starts)
+            if aim.column is not None and optimum.worst > BINDS:  # perhaps they only were not found
                 least = self._borne(None, [])
                 if least.worst > 0:
                     return self._unmet(least)
-                found = self._borne(aim.column, [self._shares(least)])
-            if aim.column is None and self.demands.decay < 1 and found.worst > BINDS:
-                return self._unmet(found)
-            gains, proofs, failed = self._settled(found)
+                optimum = self._borne(aim.column, [self._shares(least)])
+            if aim.column is None and self.demands.decay < 1 and optimum.worst > BINDS:
+                return self._unmet(optimum)
+            gains, proofs, failed = self._settled(optimum)
             if failed is None or self.late:
-                return self._answer(found, gains, proofs)
+                return self._answer(optimum, gains, proofs)
             self.scenarios.append(failed)
-            starts = [self._shares(found)]
+            starts = [self._shares(optimum)]
 
-    def _shares(self, found: Optimum) -> Floats:
-        return Search(self.limits, self.scenarios, None).shares(found)
+    def _shares(self, optimum: Optimum) -> Floats:
+        return Search(self.limits, self.scenarios, None).shares(optimum)
 
     def _borne(self, column: int | None, starts: list[Floats]) -> Optimum:
         """Return the best of all scenarios, those added that limit it more than those there are."""
@@ -309,20 +309,20 @@ class _Work:
                 starts = begun = search.start(self.present, self.every)
                 for start in starts:
                     self.limits.heard(self.scenarios, search.gains(start))
-            found = search.best(starts)
-            self.looked += found.looked
-            bound = found.rows.scenario[found.multipliers > 0]
+            optimum = search.best(starts)
+            self.looked += optimum.looked
+            bound = optimum.rows.scenario[optimum.multipliers > 0]
             if turn < DROPPING and len(bound):  # what limits nothing is looked at again with all others
                 self.scenarios = [scenario for place, scenario in enumerate(self.scenarios) if place in bound]
-            level = max(found.worst, 0.0 if column is not None else -math.inf)
-            starts = [search.shares(found)]
-            if self._added(found.gains, level) or self.limits.heard(self.scenarios, found.gains):
+            level = max(optimum.worst, 0.0 if column is not None else -math.inf)
+            starts = [search.shares(optimum)]
+            if self._added(optimum.gains, level) or self.limits.heard(self.scenarios, optimum.gains):
                 if not self.late:
                     continue
-                return search.at(begun[0]) if begun else found
-            ahead = search.start(self.present, self.every, than=found)
+                return search.at(begun[0]) if begun else optimum
+            ahead = search.start(self.present, self.every, than=optimum)
             if self.late or not ahead:
-                return found
+                return optimum
             starts += ahead
         raise AssertionError("turns never end")
 
@@ -343,22 +343,22 @@ class _Work:
         self.scenarios += new
         return bool(new)
 
-    def _settled(self, found: Optimum) -> tuple[list[Fraction], list[Proved], Scenario | None]:
+    def _settled(self, optimum: Optimum) -> tuple[list[Fraction], list[Proved], Scenario | None]:
         """Return gains as they are typed, what is proved of them, and a scenario that they don't bear."""
         column = self.demands.aim.column
         shares = [0.0] if column is None else BACK if self._unproved or not self.demands.over else BACK_IN_BOX
-        if not found.multipliers.any():  # the end of a range, which leaves room
+        if not optimum.multipliers.any():  # the end of a range, which leaves room
             shares = [0.0, *shares]
         place, middle = 0, None
         while True:
-            gains = [_decimal(value, DIGITS) for value in found.gains.tolist()]
+            gains = [_decimal(value, DIGITS) for value in optimum.gains.tolist()]
             if column is not None:
-                gains[column] = self._back(float(found.gains[column]), shares[place])
+                gains[column] = self._back(float(optimum.gains[column]), shares[place])
                 if column < len(self.demands.free):
                     own = self.demands.free[column]
                     gains[column] = min(max(gains[column], own.low), own.high)
             if column is None or len(gains) > 1:
-                middle = self._middle(gains, column, found) if middle is None else middle
+                middle = self._middle(gains, column, optimum) if middle is None else middle
                 gains = self._typed(gains, column, middle)
             if self.demands.aim.level:
                 gains[-1] = self._worth(gains)
@@ -408,14 +408,14 @@ class _Work:
         demands, heard = replace(self.demands, free=others), self.limits.frequencies
         return Limits(fixed, self.limits.prepared, demands, self.until, frequencies=heard)
 
-    def _middle(self, gains: Sequence[Fraction], column: int | None, found: Optimum) -> Floats:
+    def _middle(self, gains: Sequence[Fraction], column: int | None, optimum: Optimum) -> Floats:
         """Return the other gains where there is most room beside the one in a column."""
         if column is None:
-            return found.gains
+            return optimum.gains
         if self.late:  # where no time is left to see if other scenarios bear the middle
-            return np.delete(found.gains, column)
+            return np.delete(optimum.gains, column)
         search = Search(self._rest(gains, column), self.scenarios, None, steps=STEPS)
-        begin = replace(found, gains=np.delete(found.gains, column))
+        begin = replace(optimum, gains=np.delete(optimum.gains, column))
         return search.rough(search.shares(begin)).gains
 
     def _typed(self, gains: list[Fraction], column: int | None, middle: Floats) -> list[Fraction]:
@@ -458,17 +458,19 @@ class _Work:
         for place in np.argsort(-worst, kind="stable"):
             numbers, _ = self.limits.settings[self.every[place].setting]
             order[numbers[: len(counts)]] = None
-        found: list[Proved] = []
+        proveds: list[Proved] = []
         for numbers in order:
             named = tuple((number.free.label, int(number.value)) for number in numbers)
             if self.late:
-                found.append(Proved(named, _unlooked(self.system.name, ranges)))
+                proveds.append(Proved(named, _unlooked(self.system.name, ranges)))
                 continue
-            self.told(f"proving {len(found) + 1} of {len(order)}")
+            self.told(f"proving {len(proveds) + 1} of {len(order)}")
             scene = apply(self.system, [*changes, *numbers])
             passive = self.demands.criterion == PASSIVE
             if passive and self.demands.box:
-                found.append(Proved(named, replace(_unlooked(self.system.name, ranges), notes=(ONE_BY_ONE,))))
+                proveds.append(
+                    Proved(named, replace(_unlooked(self.system.name, ranges), notes=(ONE_BY_ONE,)))
+                )
                 continue
             inner = 1.0 if self.limits.by_growth else inside
             try:
@@ -480,18 +482,18 @@ class _Work:
                 proof = replace(_unlooked(self.system.name, ranges), notes=(error.mistakes[0].what,))
             if proof.stable and (self._unproved or not self._felt(numbers, point)):
                 proof = replace(proof, verdict=UNDECIDED, stable=None, notes=(*proof.notes, SLOWER))
-            found.append(Proved(named, proof))
+            proveds.append(Proved(named, proof))
             if proof.stable is False:
-                return found, self._failed(numbers, proof, ranges)
+                return proveds, self._failed(numbers, proof, ranges)
             if not (proof.stable or whole):
                 break
-        return found, None
+        return proveds, None
 
     def _felt(self, numbers: tuple[Override, ...], point: Floats) -> bool:
         """Say whether it is proved that what is felt is as asked, where only numbers of peers vary."""
         places = [place for place, (own, _) in enumerate(self.limits.settings) if own == numbers]
-        found = [self.limits.asked(place, point, bounded=True).max(initial=-1.0) for place in places]
-        return max(found, default=-1.0) < 0
+        result = [self.limits.asked(place, point, bounded=True).max(initial=-1.0) for place in places]
+        return max(result, default=-1.0) < 0
 
     def _inside(self, gains: Sequence[Fraction]) -> float:
         """Return what the spectral radius is to be proved below: of the least there is, a little above it."""
@@ -511,8 +513,8 @@ class _Work:
             here = len(own) == len(numbers) or float(own[-1].value) == late
             if own[: len(numbers)] == numbers and here:
                 box = tuple(values[interval.free] for interval in self.demands.box)
-                found = Scenario(place, box)
-                return None if found in self.scenarios else found
+                scenario = Scenario(place, box)
+                return None if scenario in self.scenarios else scenario
         return None
 
     def _unmet(self, least: Optimum) -> Tuning:
@@ -523,7 +525,7 @@ class _Work:
         return self._answer(least, gains, [], met=False)
 
     def _answer(
-        self, found: Optimum, gains: Sequence[Fraction], proofs: Sequence[Proved], *, met: bool = True
+        self, optimum: Optimum, gains: Sequence[Fraction], proofs: Sequence[Proved], *, met: bool = True
     ) -> Tuning:
         demands, column = self.demands, self.demands.aim.column
         worst = float(self.limits.worst(self.every, np.array([[float(gain) for gain in gains]])).max())
@@ -532,10 +534,10 @@ class _Work:
         if column is None and self.limits.by_growth:
             value = math.exp(worst + self.limits.allowed)
         best, error = (
-            (found.value, found.error) if column is not None else (math.exp(found.value), found.error)
+            (optimum.value, optimum.error) if column is not None else (math.exp(optimum.value), optimum.error)
         )
         if column is not None and not met:
-            best = value if demands.aim.level else float(found.gains[column])
+            best = value if demands.aim.level else float(optimum.gains[column])
         return Tuning(
             topology=self.system.name,
             aim=demands.aim.label,
@@ -558,7 +560,7 @@ class _Work:
                     float(now),
                 )
                 for interval, typed, before, now in zip(
-                    demands.free, gains, found.gains, self.present, strict=False
+                    demands.free, gains, optimum.gains, self.present, strict=False
                 )
             ),
             over=demands.over,
@@ -568,10 +570,10 @@ class _Work:
             frame_s=float(self.limits.prepared.schedules[0].frame_s),
             allowed=self.limits.allowed,
             proofs=tuple(proofs),
-            binding=tuple(self._binding(found, met=met)),
+            binding=tuple(self._binding(optimum, met=met)),
             looked=self.looked
             + sum(int((sample != BEYOND).sum()) for sample in self.limits.samples.values()),
-            bounded=self._bounded(found, gains) if met else None,
+            bounded=self._bounded(optimum, gains) if met else None,
             notes=(
                 *[why for why in (self._why(),) if why and not met],
                 *[CORNERS] * bool(demands.box and self.limits.slow),
@@ -586,19 +588,19 @@ class _Work:
                 ),
             ),
             ranges=demands.free,
-            scenes=tuple(map(self._scene, self._binding_scenarios(found) or self.every[:1])),
+            scenes=tuple(map(self._scene, self._binding_scenarios(optimum) or self.every[:1])),
         )
 
     def _why(self) -> str:
         """Return why no gains bear passive hands, where that follows from the equations alone."""
         return passive_hands(self.system).why if self.demands.criterion == PASSIVE else ""
 
-    def _bounded(self, found: Optimum, gains: Sequence[Fraction]) -> int | None:
+    def _bounded(self, optimum: Optimum, gains: Sequence[Fraction]) -> int | None:
         """Return in how many cells it is proved that no gains do better, see `none_better`."""
         demands, column = self.demands, self.demands.aim.column
         if (
             column is None
-            or not found.multipliers.any()
+            or not optimum.multipliers.any()
             or self.limits.by_growth
             or demands.measured
             or demands.aim.level
@@ -606,7 +608,7 @@ class _Work:
             return None
         worst = self.limits.worst(self.every, np.array([[float(gain) for gain in gains]]))[0]
         order = np.argsort(-worst, kind="stable").tolist()
-        listed = dict.fromkeys([*self._binding_scenarios(found), *(self.every[place] for place in order)])
+        listed = dict.fromkeys([*self._binding_scenarios(optimum), *(self.every[place] for place in order)])
         self.told("proving that no gains do better")
         return none_better(
             [self._scene(item) for item in list(listed)[:LIMITING]],
@@ -619,26 +621,26 @@ class _Work:
             until=self.until,
         )
 
-    def _binding_scenarios(self, found: Optimum) -> list[Scenario]:
+    def _binding_scenarios(self, optimum: Optimum) -> list[Scenario]:
         """Return the scenario of each mode that binds."""
-        return [found.scenarios[place] for place in found.rows.scenario[found.multipliers > 0].tolist()]
+        return [optimum.scenarios[place] for place in optimum.rows.scenario[optimum.multipliers > 0].tolist()]
 
     def _scene(self, scenario: Scenario) -> CompiledSystem:
         _, scene = self.limits.settings[scenario.setting]
         pairs = zip(self.demands.box, map(Fraction, scenario.point), strict=True)
         return apply(scene, [Override(interval.free, value) for interval, value in pairs])
 
-    def _binding(self, found: Optimum, *, met: bool) -> list[Binding]:
+    def _binding(self, optimum: Optimum, *, met: bool) -> list[Binding]:
         """Return what binds: each mode with a multiplier, and what less of the ends that meet there buys."""
         listed = []
         aim = self.demands.aim.column
-        rows = self.limits.rows(found.scenarios, found.gains, wide=True)
+        rows = self.limits.rows(optimum.scenarios, optimum.gains, wide=True)
         scale = 1.0
         if aim is not None and met:
             column = self.demands.columns[aim]
             scale = float(column.high - column.low) * (1 if self.demands.aim.larger else -1)
-        for place in np.flatnonzero(found.multipliers > 0):
-            scenario = found.scenarios[rows.scenario[place]]
+        for place in np.flatnonzero(optimum.multipliers > 0):
+            scenario = optimum.scenarios[rows.scenario[place]]
             numbers, _ = self.limits.settings[scenario.setting]
             buys = []
             slopes = rows.slopes[place][len(self.demands.columns) :]
@@ -646,7 +648,7 @@ class _Work:
                 if value in (float(own.low), float(own.high)):
                     share = 0.01 * abs(value) / float(own.high - own.low)
                     change = -share if value == float(own.high) else share
-                    better = -scale * float(found.multipliers[place]) * float(slope) * change
+                    better = -scale * float(optimum.multipliers[place]) * float(slope) * change
                     buys.append((own.free.label, value, own.unit, better))
             where = [
                 (number.free.label, float(number.value), "1")
@@ -660,18 +662,18 @@ class _Work:
                 (own.free.label, value, own.unit)
                 for own, value in zip(self.demands.box, scenario.point, strict=True)
             ]
-            shape, frequency = self._mode(found, scenario, complex(rows.eigenvalue[place]))
+            shape, frequency = self._mode(optimum, scenario, complex(rows.eigenvalue[place]))
             if not math.isnan(rows.frequency_hz[place]):
                 frequency = float(rows.frequency_hz[place])
             listed.append(Binding(tuple(where), shape, frequency, tuple(buys)))
         return listed
 
-    def _mode(self, found: Optimum, scenario: Scenario, eigenvalue: complex) -> tuple[str, float]:
+    def _mode(self, optimum: Optimum, scenario: Scenario, eigenvalue: complex) -> tuple[str, float]:
         """Return the shape and the frequency of a mode, "" and NaN where there is none."""
         passive = self.demands.criterion == PASSIVE
         if np.isnan(eigenvalue) and not (passive and not self.demands.measured):
             return "", math.nan
-        pairs = zip(self.demands.free, map(Fraction, found.gains.tolist()), strict=False)
+        pairs = zip(self.demands.free, map(Fraction, optimum.gains.tolist()), strict=False)
         changed = apply(self._scene(scenario), [Override(interval.free, value) for interval, value in pairs])
         if passive:
             worst = passive_hands(changed).worst

@@ -193,18 +193,20 @@ class BatchEvaluator:
 
     def errors(self, values: Floats) -> tuple[Floats, ...]:
         """Return bounds (k, n, n) on the errors of the matrices at values (k, m), entry by entry."""
-        found = self.bounded(partial(self.vectors, values=values))
+        bounded_systems = self.bounded(partial(self.vectors, values=values))
         return tuple(
-            np.broadcast_to(bounded.error, (len(values), *bounded.error.shape[1:])) for bounded in found
+            np.broadcast_to(bounded.error, (len(values), *bounded.error.shape[1:]))
+            for bounded in bounded_systems
         )
 
     def slopes(self, values: Floats, along: Floats) -> tuple[tuple[Floats, Floats], ...]:
         """Return each system's matrices (k, n, n) and their derivatives along directions (k, m)."""
         lifted = self.lifted(values + (STEP * 1j) * along)
-        found = (reduced(wiring, closed_loop(wiring, lifted), len(values)) for wiring in self.wirings)
+        generator = (reduced(wiring, closed_loop(wiring, lifted), len(values)) for wiring in self.wirings)
         # Squares of the step stand where nothing should: balancing would take them for entries.
         return tuple(
-            (np.where(np.abs(values.real) <= STEP, 0.0, values.real), values.imag / STEP) for values in found
+            (np.where(np.abs(values.real) <= STEP, 0.0, values.real), values.imag / STEP)
+            for values in generator
         )
 
     def vectors(self, group: PeerGroup, values: Matrices) -> Matrices:
@@ -247,11 +249,11 @@ class BatchEvaluator:
 
     def lifted(self, values: Matrices) -> dict[tuple[int, int], FrameMap]:
         """Return the maps of all groups, each once, by the identity of site and schedule."""
-        found: dict[tuple[int, int], FrameMap] = {}
+        result: dict[tuple[int, int], FrameMap] = {}
         for group in self.groups:
-            if site_key(group) not in found:
-                found[site_key(group)] = self._lift(group, values)
-        return found
+            if site_key(group) not in result:
+                result[site_key(group)] = self._lift(group, values)
+        return result
 
     def bounded(self, vectors: Callable[[PeerGroup], Floats]) -> tuple[Bounded, ...]:
         """Return each system at k points with bounds on all its errors; no time varies.
@@ -266,7 +268,7 @@ class BatchEvaluator:
         for group in self.groups:
             if site_key(group) not in lifts:
                 lifts[site_key(group)] = self._lift_bounded(group, vectors(group))
-        found = []
+        bounded_systems = []
         for wiring in self.wirings:
             system = wiring.system
             sites, maps = zip(*(lifts[site_key(group)] for group in system.sites), strict=True)
@@ -278,8 +280,8 @@ class BatchEvaluator:
             sound = sound & np.isfinite(error.sum(axis=(1, 2)))
             if not sound.all():
                 matrix = np.where(sound[:, None, None], matrix, np.nan)
-            found.append(Bounded(matrix, error, whole, tuple(map(value_of, closed.heard)), sites))
-        return tuple(found)
+            bounded_systems.append(Bounded(matrix, error, whole, tuple(map(value_of, closed.heard)), sites))
+        return tuple(bounded_systems)
 
     def _lift_bounded(self, group: PeerGroup, vectors: Floats) -> tuple[LinearSite, FrameMap]:
         rows = linearize_rows(group.jacobians, vectors)
@@ -375,7 +377,7 @@ def batch_evaluator(
             if isinstance(event, Propagate)
         }
     tangents = {group.jacobians.kind.name: _tangent(group.jacobians) for group in groups} if follows else {}
-    found = BatchEvaluator(
+    evaluator = BatchEvaluator(
         system=system,
         free=tuple(free),
         exchange=exchange,
@@ -385,8 +387,8 @@ def batch_evaluator(
         tangents=tangents,
         fixed={},
     )
-    found = replace(found, fixed=_fixed(found))
-    return replace(found, wirings=_told_apart(found)) if follows else found
+    evaluator = replace(evaluator, fixed=_fixed(evaluator))
+    return replace(evaluator, wirings=_told_apart(evaluator)) if follows else evaluator
 
 
 def _told_apart(evaluator: BatchEvaluator) -> tuple[Wiring, ...]:
@@ -396,16 +398,16 @@ def _told_apart(evaluator: BatchEvaluator) -> tuple[Wiring, ...]:
     base = np.array([value_now(evaluator.system, free) for free in evaluator.free])
     other = (base * (1 + _generic(len(base))[0][0]) + 1e-3).tolist()
     lifted = evaluator.lifted(np.array([other]))
-    found = []
+    wirings = []
     for place, wiring in enumerate(evaluator.wirings):
         matrix = closed_loop(wiring, lifted)
         moves = bool(np.isfinite(matrix).all() and not are_rigid(wiring, matrix).all())
         if moves and not wiring.rigid.drifts:
             there = find_rigid_modes(evaluator.with_sites(evaluator.closed, other)[place], with_drifts=False)
-            found.append(told_by_constants(wiring, there))
+            wirings.append(told_by_constants(wiring, there))
         else:
-            found.append(wiring)
-    return tuple(found)
+            wirings.append(wiring)
+    return tuple(wirings)
 
 
 def _generic(count: int) -> tuple[Floats, Floats]:
@@ -418,16 +420,16 @@ def _fixed(evaluator: BatchEvaluator) -> dict[tuple[int, int], Mapping[int, Step
     """Return the exponentials of the groups whose A and B no free parameter moves, at a meaningless point."""
     if evaluator.timed:
         return {}
-    found: dict[tuple[int, int], Mapping[int, Step]] = {}
+    result: dict[tuple[int, int], Mapping[int, Step]] = {}
     point, along = _generic(len(evaluator.free))
     for group in evaluator.groups:
-        if site_key(group) in found:
+        if site_key(group) in result:
             continue
         vectors = evaluator.vectors(group, point + (STEP * 1j) * along)
         site = site_of(group.jacobians, evaluator.rows(group.jacobians, vectors))
         if not (np.iscomplexobj(site.a) and (site.a.imag.any() or site.b.imag.any())):
-            found[site_key(group)] = evaluator.steps(site, point, exponential_rows)
-    return found
+            result[site_key(group)] = evaluator.steps(site, point, exponential_rows)
+    return result
 
 
 def lifted_here(systems: Sequence[Wired]) -> tuple[Wired, ...]:

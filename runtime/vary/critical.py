@@ -172,7 +172,7 @@ def critical(
             return analyze(changed, prepared=prepared).stable
 
         if counted:
-            found = search(
+            result = search(
                 CountLine(system, free, stable_of, *count_range(system, free, limits, present, _PLACE)),
                 told=told,
             )
@@ -180,30 +180,30 @@ def critical(
             refuse_time(system, free, _PLACE, chosen_criterion)
             low, high = (None if limit is None else float(limit) for limit in limits)
             points = growth_points(system, free, low, high, present)
-            found = search(
+            result = search(
                 GrowthLine(GrowthEvaluator(system, (free,), prepared, _PLACE, chosen_criterion), points),
                 told=told,
             )
             if chosen_criterion == PASSIVE and not passive_hands(system, prepared).why:
-                found = replace(found, enters=True)  # where clamped devices shake all values are one
+                result = replace(result, enters=True)  # where clamped devices shake all values are one
         elif timed:
             start = _at_start(system, prepared, free)
             begin = limits[0] or Fraction(0)
             end = limits[1] or delay_reach(system, free, begin, pieces=PIECES, further=FURTHER)[0]
             tell = pace(system, free, begin, end, place=_PLACE, told=told)
-            found = search(DelayLine(system, free, start, begin, end, tell))
+            result = search(DelayLine(system, free, start, begin, end, tell))
         else:
             at_start = None if reaches_start(system, free) else prepare_at_start(system, prepared)
-            found = search(_line(system, free, limits, at_start or prepared), told=told)
-            if at_start is not None and not found.sided:
+            result = search(_line(system, free, limits, at_start or prepared), told=told)
+            if at_start is not None and not result.sided:
                 # Contacts close or open along the way, and other motions are left out of the verdict.
-                found = search(_line(system, free, limits, prepared), told=told)
+                result = search(_line(system, free, limits, prepared), told=told)
 
         def stable_now() -> bool | None:
             return stable_of(system)
 
-        chosen = _chosen(found, present, stable_now)
-        verdict = "" if chosen else _everywhere(found, present, stable_now, chosen_criterion)
+        chosen = _chosen(result, present, stable_now)
+        verdict = "" if chosen else _everywhere(result, present, stable_now, chosen_criterion)
     return Critical(
         topology=system.name,
         parameter=free.label,
@@ -212,12 +212,12 @@ def critical(
         value=chosen.value if chosen else None,
         error=chosen.error if chosen else None,
         stable_side=chosen.stable_side if chosen else None,
-        crossings=found.edges,
-        scanned=found.scanned,
+        crossings=result.edges,
+        scanned=result.scanned,
         cell=CELL,
-        whole=found.whole,
-        looked=found.looked,
-        enters=found.enters,
+        whole=result.whole,
+        looked=result.looked,
+        enters=result.enters,
         verdict=verdict,
         system=system,
         left_out=(
@@ -228,18 +228,18 @@ def critical(
         criterion=chosen_criterion,
         groups=values_by_group(system, free),
         counted=counted,
-        left_open=found.left_open,
+        left_open=result.left_open,
     )
 
 
-def _everywhere(found: Search, present: float, stable_now: Callable[[], bool | None], criterion: str) -> str:
+def _everywhere(search: Search, present: float, stable_now: Callable[[], bool | None], criterion: str) -> str:
     """Return the one verdict of all values, where none was found at which it changes."""
-    side = found.stable[0] if found.stable else None
-    if found.scanned[0] <= present <= found.scanned[1]:
+    side = search.stable[0] if search.stable else None
+    if search.scanned[0] <= present <= search.scanned[1]:
         # Floats alone say of which side all samples are; the analysis bounds its error.
         side = side if stable_now() == side else None
     words = {True: "stable", False: "unstable", None: "undecided"}[side]
-    if found.enters:
+    if search.enters:
         return f"{words} at every value scanned"
     if criterion == PASSIVE and side is False:
         return f"{words} whatever its value: apc analyze --hands passive says why"
@@ -268,10 +268,10 @@ def _line(system: CompiledSystem, free: Free, limits: Sequence[Fraction | None],
 
 def _at_start(system: CompiledSystem, prepared: Prepared, free: Free) -> Prepared:
     """Return what was prepared, as the parameters say; refuse a delay of a scene where they don't suffice."""
-    found = prepare_at_start(system, prepared, [free])
-    if found is None:
+    result = prepare_at_start(system, prepared, [free])
+    if result is None:
         raise hangs_on_heard(system)
-    return found
+    return result
 
 
 def _limit(option: str, text: str | None, free: Free, unit: str) -> Fraction | None:
@@ -300,15 +300,15 @@ def _check_limits(
         raise ApcError(Mistake("E842", _PLACE, what, "an upper limit above the lower", got))
 
 
-def _chosen(found: Search, present: float, stable_now: Callable[[], bool | None]) -> Crossing | None:
+def _chosen(search: Search, present: float, stable_now: Callable[[], bool | None]) -> Crossing | None:
     """Return the crossing that matters, see `Critical`; on a jump, the scene itself tells its side."""
-    if not found.edges:
+    if not search.edges:
         return None
-    below = sum(edge.boundary < present for edge in found.edges)
-    upto = sum(edge.boundary <= present for edge in found.edges)
-    if upto > below and found.stable[below] != stable_now():
+    below = sum(edge.boundary < present for edge in search.edges)
+    upto = sum(edge.boundary <= present for edge in search.edges)
+    if upto > below and search.stable[below] != stable_now():
         below = upto
-    if found.stable[below]:
-        return found.edges[below] if below < len(found.edges) else found.edges[below - 1]
-    lost = [edge for edge in found.edges if edge.stable_side == "below"]
-    return lost[0] if lost else found.edges[0]
+    if search.stable[below]:
+        return search.edges[below] if below < len(search.edges) else search.edges[below - 1]
+    lost = [edge for edge in search.edges if edge.stable_side == "below"]
+    return lost[0] if lost else search.edges[0]

@@ -250,15 +250,15 @@ def search(line: Line, *, first: bool = False, told: Told | None = None) -> Sear
             stable.append(side[0])
         for place in range(len(side) - 1):
             if side[place] != side[place + 1]:
-                found = _crossing(
+                crossing = _crossing(
                     stretch,
                     samples.points[place : place + 2].tolist(),
                     samples.growth[place : place + 2].tolist(),
                     rising=side[place],
                     half=FIRST_HALF if first else HALF,
                 )
-                if found is not None:
-                    edges.append(found)
+                if crossing is not None:
+                    edges.append(crossing)
                     stable.append(side[place + 1])
         before = stretch
         if why or (first and any(edge.stable_side == "below" for edge in edges)):
@@ -346,9 +346,9 @@ def _sided(samples: _Samples, *, ends: bool = True) -> _Samples:
 def _may_hide(samples: _Samples, cells: NDArray[np.intp]) -> NDArray[np.bool_]:
     """Say of the cells that begin at these samples whether another crossing than the ends show may hide."""
     shares = np.linspace(0, 1, PLACES)[:, None]
-    found = np.zeros(len(cells), dtype=bool)
+    values = np.zeros(len(cells), dtype=bool)
     if not samples.values.shape[1]:  # nothing moves: of devices that are held fast, say
-        return found
+        return values
     for number, place in enumerate(cells):
         width = samples.points[place + 1] - samples.points[place]
         (value, end), (slope, end_slope) = (
@@ -368,8 +368,8 @@ def _may_hide(samples: _Samples, cells: NDArray[np.intp]) -> NDArray[np.bool_]:
         changes = np.abs(np.diff((size > 1).astype(np.int8), axis=0)).sum(axis=0)
         through = (changes == 1) & (doubt < np.abs(size[-1] - size[0]))
         touches = (most >= 1) & (least <= 1) & ~through
-        found[number] = touches.any() or (through & (value.imag >= 0)).sum() > 1
-    return found
+        values[number] = touches.any() or (through & (value.imag >= 0)).sum() > 1
+    return values
 
 
 def _cubic(t: Floats, start: Complexes, end: Complexes, slope: Complexes, end_slope: Complexes) -> Complexes:
@@ -422,12 +422,12 @@ def _root(stretch: Stretch, ends: Sequence[float], growth: Sequence[float], off:
     """Return where floats see the largest magnitude pass 1, off by so much; by Newton's or Brent's method."""
 
     def at(value: float) -> tuple[float, float]:
-        found = _sampled(stretch, np.array([value]))
-        if not len(found.points):
+        result = _sampled(stretch, np.array([value]))
+        if not len(result.points):
             return 0.0, math.nan  # no matrix: what is beside it is judged
-        largest = np.argmax(np.abs(found.values[0]))
-        rate = found.slopes[0, largest] / found.values[0, largest]
-        return float(found.growth[0]), float(rate.real)
+        largest = np.argmax(np.abs(result.values[0]))
+        rate = result.slopes[0, largest] / result.values[0, largest]
+        return float(result.growth[0]), float(rate.real)
 
     (low, high), (at_low, at_high) = ends, growth
     value = low + (high - low) * at_low / (at_low - at_high)

@@ -71,20 +71,20 @@ def prove_over_delay(
     cells, left, verdict = 0, Fraction(0), UNDECIDED
     open_point: tuple[float, ...] = ()
     for value, share in standing_delays(system, delay):
-        found = prove(system_with_delay(system, delay.free, value), rest)
-        cells += found.cells
-        point = (*found.point[:place], float(value), *found.point[place:])
-        if found.stable is False:
-            return replace(found, ranges=tuple(ranges), cells=cells, open_share=1.0, point=point)
-        if found.stable is None:
-            left += (share or Fraction(1, 10**9)) / width * Fraction(found.open_share or 1.0)
+        proof = prove(system_with_delay(system, delay.free, value), rest)
+        cells += proof.cells
+        point = (*proof.point[:place], float(value), *proof.point[place:])
+        if proof.stable is False:
+            return replace(proof, ranges=tuple(ranges), cells=cells, open_share=1.0, point=point)
+        if proof.stable is None:
+            left += (share or Fraction(1, 10**9)) / width * Fraction(proof.open_share or 1.0)
             open_point = open_point or point
         else:
-            verdict = found.verdict
+            verdict = proof.verdict
     stable = None if left else True
     told = changing(system, delay) if nominal and stable and not rest else None
-    notes = (*found.notes, *[CONSTANT] * (told is None))
-    whole = replace(found, ranges=tuple(ranges), cells=cells, notes=notes, stable=stable, changing=told)
+    notes = (*proof.notes, *[CONSTANT] * (told is None))
+    whole = replace(proof, ranges=tuple(ranges), cells=cells, notes=notes, stable=stable, changing=told)
     return replace(whole, verdict=UNDECIDED if left else verdict, open_share=float(left), point=open_point)
 
 

@@ -214,7 +214,7 @@ def borders(system: CompiledSystem, free: Free, *, place: Place) -> Callable[[Fr
         *itertools.product(holds, [*ticks, *holds]),
         *itertools.product(packets, ticks),
     ]
-    found = set()
+    result = set()
     for item, other in meetings:
         first, second = (
             (clocks[clock], at[0].get(delay, Fraction(0)), slopes.get(delay, Fraction(0)))
@@ -224,12 +224,12 @@ def borders(system: CompiledSystem, free: Free, *, place: Place) -> Callable[[Fr
         if slope:
             apart = at[0][first[0].phase] + first[1] - at[0][second[0].phase] - second[1]
             divisor = common_divisor([at[0][first[0].period], at[0][second[0].period]])
-            found.add((apart - slope * now, slope, divisor))
+            result.add((apart - slope * now, slope, divisor))
 
     def following(value: Fraction) -> Fraction:
         """Return the least larger value at which some constant + slope·value is a multiple of its divisor."""
         nearest = []
-        for constant, slope, divisor in found:
+        for constant, slope, divisor in result:
             count = (constant + slope * value) / divisor
             number = math.floor(count) + 1 if slope > 0 else math.ceil(count) - 1
             nearest.append((number * divisor - constant) / slope)
@@ -280,13 +280,13 @@ def _piece(
     if not follows and not any(slope for _, slope in durations.values()):
         return Piece(low, high, None, inside)
     groups, exchange = lifted_groups(inside, prepared=shared)
-    found = batch_evaluator(inside, (free,), groups, exchange, durations=durations, follows=follows)
-    return Piece(low, high, found, inside)
+    evaluator = batch_evaluator(inside, (free,), groups, exchange, durations=durations, follows=follows)
+    return Piece(low, high, evaluator, inside)
 
 
 def _steps(schedule: Schedule, kind: Kind, slopes: Mapping[str, Fraction]) -> Mapping[int, Fraction]:
     """Return how fast each step grows, by its quanta: only what is held moves, all else is at its ticks."""
-    found: dict[int, Fraction] = {}
+    result: dict[int, Fraction] = {}
     step, start, moving = 0, Fraction(0), set[Fraction]()
     for event in (*schedule.events, Propagate(0)):
         if not isinstance(event, Propagate):
@@ -294,6 +294,6 @@ def _steps(schedule: Schedule, kind: Kind, slopes: Mapping[str, Fraction]) -> Ma
             continue
         (end,) = moving or {Fraction(0)}
         if step:
-            assert found.setdefault(step, end - start) == end - start, "two steps are equal by accident"
+            assert result.setdefault(step, end - start) == end - start, "two steps are equal by accident"
         step, start, moving = event.duration, end, set()
-    return found
+    return result

@@ -123,8 +123,8 @@ class PointEvaluator:
             rows = np.flatnonzero(which == place)
             if len(rows):
                 those = self._differences if place < 0 else self.alike[place].slopes
-                for found, slope in those(values[rows], along[rows]):
-                    _put_in(matrices, rows, found)
+                for result, slope in those(values[rows], along[rows]):
+                    _put_in(matrices, rows, result)
                     _put_in(slopes, rows, slope)
         return ((_filled_up(matrices), _filled_up(slopes)),)
 
@@ -202,7 +202,7 @@ class PointEvaluator:
             systems = self.closed_at(value.tolist())
         except ApcError:
             return NOTHING
-        found = []
+        pairs = []
         for system in systems:
             free = find_rigid_modes(system, with_drifts=False)
             reduced = _reduced(system, free)
@@ -210,8 +210,8 @@ class PointEvaluator:
                 return NOTHING
             if free.names and np.abs(np.linalg.eigvals(reduced[0]) - 1).min(initial=np.inf) < DRIFT:
                 reduced = _reduced(system, find_rigid_modes(system))
-            found.append(reduced)
-        return found
+            pairs.append(reduced)
+        return pairs
 
 
 def _put_in(listed: list[list[Floats]], rows: Places, blocks: Floats) -> None:
@@ -223,8 +223,8 @@ def _put_in(listed: list[list[Floats]], rows: Places, blocks: Floats) -> None:
 def _around(source: PointEvaluator, value: Floats, start: Prepared) -> BatchEvaluator:
     """Return what serves the points at which the same motions are free as at one (m,)."""
     at = apply(source.system, overrides_at(source.system, source.free, value.tolist()))
-    found = batch_evaluator(at, source.free, *Asked.of(at, source.free, start).lifted_anywhere())
-    return replace(found, wirings=tuple(map(wire, found.closed)))  # none that serve other points, too
+    evaluator = batch_evaluator(at, source.free, *Asked.of(at, source.free, start).lifted_anywhere())
+    return replace(evaluator, wirings=tuple(map(wire, evaluator.closed)))  # none that serve other points, too
 
 
 def _is_apart(matrices: Floats) -> Truths:
@@ -237,8 +237,8 @@ def _is_apart(matrices: Floats) -> Truths:
 def _filled_up(blocks: Sequence[Sequence[Floats]]) -> Floats:
     """Return the blocks of each point as one matrix (k, n, n), all of it NaN where a block is."""
     size = max((sum(len(values) for values in listed) for listed in blocks), default=0)
-    found = np.zeros((len(blocks), size, size))
-    for matrix, listed in zip(found, blocks, strict=True):
+    result = np.zeros((len(blocks), size, size))
+    for matrix, listed in zip(result, blocks, strict=True):
         if not all(np.isfinite(values).all() for values in listed):
             matrix[:] = np.nan
             continue
@@ -247,7 +247,7 @@ def _filled_up(blocks: Sequence[Sequence[Floats]]) -> Floats:
             rows = slice(start, start + len(values))
             matrix[rows, rows] = values
             start = rows.stop
-    return found
+    return result
 
 
 def _reduced(system: ClosedSystem, free: RigidModes) -> tuple[Floats, Floats]:
@@ -343,8 +343,8 @@ def evaluator_of_many(
     """
     hint = "apc sweep, which analyses value by value"
     try:
-        found = evaluator(system, free, prepared=prepared)
-        states = found.states()
+        result = evaluator(system, free, prepared=prepared)
+        states = result.states()
     except ApcError as error:  # an analysis has methods that spare the matrix, a range of values has none
         raise ApcError(
             [
@@ -358,7 +358,7 @@ def evaluator_of_many(
             f"{MOST_STATES:,} are the most"
         )
         raise ApcError(Mistake("E804", place, what, hint=hint))
-    return found
+    return result
 
 
 def generic(system: CompiledSystem, free: Sequence[Free]) -> CompiledSystem:

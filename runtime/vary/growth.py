@@ -146,14 +146,14 @@ def growth_at(
     changed = apply(system, overrides)
     if criterion == PASSIVE:
         return passive_growth(changed, prepared, bounded=bounded)
-    found = growth(changed, prepared, bounded=bounded)
-    if found.why:
-        what = f"the scene can't be judged in mean square: {found.why}"
+    result = growth(changed, prepared, bounded=bounded)
+    if result.why:
+        what = f"the scene can't be judged in mean square: {result.why}"
         hint = f"--in {NOMINAL}"
         if any(override.free.name in channel_numbers(system) for override in overrides):
             hint = "apc simulate" if aged(system) else "a narrower range between --lower and --upper"
         raise ApcError(Mistake("E898", place, what, hint=hint))
-    return found
+    return result
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -188,12 +188,12 @@ class GrowthEvaluator:
             return [math.sqrt(self.growth(value).radius)]
         changes = [Override(*pair) for pair in zip(self.free, map(Fraction, value), strict=True)]
         try:
-            found = loop_growths(apply(self.system, changes), self.prepared, bounded=False)
+            growths = loop_growths(apply(self.system, changes), self.prepared, bounded=False)
         except ApcError as error:
             if error.mistakes[0].code not in NOWHERE:
                 raise
             return [math.nan]
-        return [math.sqrt(growth.radius) for growth in found]
+        return [math.sqrt(growth.radius) for growth in growths]
 
     def matrices(self, values: Floats) -> tuple[Floats, ...]:
         """Return the root (k, 1, 1) at values (k, m)."""
@@ -213,17 +213,17 @@ class GrowthEvaluator:
 
     def _allowed(self, values: Floats) -> NDArray[np.bool_]:
         """Say which values (k, m) are within what each parameter may be."""
-        found = np.ones(len(values), dtype=bool)
+        result = np.ones(len(values), dtype=bool)
         for own, free in zip(values.T, self.free, strict=True):
             least, most = allowed(self.system, free)
-            found &= (own >= least) & (own <= most)
-        return found
+            result &= (own >= least) & (own <= most)
+        return result
 
     def errors(self, values: Floats) -> tuple[Floats, ...]:
         """Return bounds (k, 1, 1) on the errors of the root at values (k, m)."""
-        found = [self.growth(value, bounded=True) for value in values.tolist()]
+        growths = [self.growth(value, bounded=True) for value in values.tolist()]
         return (
-            np.array([(growth.high - growth.low) / max(growth.radius, LEAST) for growth in found])[
+            np.array([(growth.high - growth.low) / max(growth.radius, LEAST) for growth in growths])[
                 :, None, None
             ],
         )
@@ -258,15 +258,15 @@ class GrowthLine(OneStretch):
         for value in values.tolist():
             if value not in self.known:
                 self.known[value] = self.source.growth([value])
-        found = np.array([self.known[value].radius for value in values.tolist()], np.complex128)[:, None]
-        return found, np.full(found.shape, np.nan, np.complex128)
+        result = np.array([self.known[value].radius for value in values.tolist()], np.complex128)[:, None]
+        return result, np.full(result.shape, np.nan, np.complex128)
 
     def judge(self, value: Fraction) -> Verdict:
         """Return the verdict at a value, bounded."""
-        found = self.source.growth([float(value)], bounded=True)
-        proof = BOUNDED[self.source.criterion] if found.proved else ITERATED
-        error = max(found.high - found.radius, found.radius - found.low)
-        return Verdict(found.stable, found.radius, error, (), proof if found.exact else TAGGED)
+        growth = self.source.growth([float(value)], bounded=True)
+        proof = BOUNDED[self.source.criterion] if growth.proved else ITERATED
+        error = max(growth.high - growth.radius, growth.radius - growth.low)
+        return Verdict(growth.stable, growth.radius, error, (), proof if growth.exact else TAGGED)
 
     def stretches(self) -> Iterator[Stretch]:
         """Yield the one stretch."""

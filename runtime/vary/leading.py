@@ -175,9 +175,9 @@ def _angles(
         covectors[:, at.held] = -covectors[:, at.rest] @ at.weights
     shares = np.abs(vectors * covectors)
     motion = np.array(system.motion, dtype=np.intp)
-    found = np.full(count, np.nan)
+    result = np.full(count, np.nan)
     if not len(motion):
-        return found
+        return result
     leads = motion[shares[:, motion].argmax(axis=1)]
     moving = shares[np.arange(count), leads] > LEAST_SHARE * shares.sum(axis=1)
     site_of = np.searchsorted(system.offsets, leads, side="right") - 1
@@ -189,5 +189,5 @@ def _angles(
         start = vectors[own, offset : offset + len(group.z_names)]
         received = (here.heard[g] @ vectors[own, :, None])[:, :, 0]
         states = leads[own] - offset
-        found[own] = turns(here.sites[g], group.schedule, start, received, states, values[own])
-    return found
+        result[own] = turns(here.sites[g], group.schedule, start, received, states, values[own])
+    return result

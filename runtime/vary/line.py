@@ -70,21 +70,21 @@ EVERY, FURTHER = 32, 1.25
 
 def judged(systems: Sequence[ClosedSystem]) -> Verdict:
     """Return the verdict of closed systems; what drifts does so on both sides of a crossing."""
-    found = solve_spectrum(systems)
-    return _verdict(found, found.stable if found.verdict != DRIFTS else True)
+    spectrum = solve_spectrum(systems)
+    return _verdict(spectrum, spectrum.stable if spectrum.verdict != DRIFTS else True)
 
 
 def analysed(system: CompiledSystem, prepared: Prepared) -> Verdict:
     """Return the verdict of a scene, open where it drifts or can't be analysed."""
     try:
-        found = analyze(system, prepared=prepared)
+        analysis = analyze(system, prepared=prepared)
     except ApcError:
         return Verdict(None, math.nan, math.inf, (), "")
-    return _verdict(found, found.stable if found.verdict != DRIFTS else None)
+    return _verdict(analysis, analysis.stable if analysis.verdict != DRIFTS else None)
 
 
-def _verdict(found: Spectrum | Analysis, stable: bool | None) -> Verdict:
-    return Verdict(stable, found.spectral_radius, found.spectral_radius_error, found.modes, found.proof)
+def _verdict(result: Spectrum | Analysis, stable: bool | None) -> Verdict:
+    return Verdict(stable, result.spectral_radius, result.spectral_radius_error, result.modes, result.proof)
 
 
 def sided(stable: bool | None) -> Verdict:
@@ -130,9 +130,9 @@ class MatrixLine(OneStretch):
 
     def point(self, value: float) -> Floats:
         """Return the point (m,) of a value."""
-        found = self.base.copy()
-        found[self.column] = value
-        return found
+        text = self.base.copy()
+        text[self.column] = value
+        return text
 
     def look(self, values: Floats) -> tuple[Complexes, Complexes]:
         """Return the eigenvalues of all systems (k, n) and their slopes at values (k,)."""
@@ -170,13 +170,13 @@ def matrix_look(family: Evaluator, points: Floats, column: int) -> tuple[Complex
     """
     along = np.zeros_like(points)
     along[:, column] = 1.0
-    found = [np.empty((2, len(points), 0), np.complex128)]
+    result = [np.empty((2, len(points), 0), np.complex128)]
     for matrix, slope in family.slopes(points, along):
         known = np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(slope).all(axis=(1, 2))
         both = np.full((2, len(points), matrix.shape[1]), np.nan, np.complex128)
         both[:, known] = eigenvalues(matrix[known], slope[known])
-        found.append(both)
-    values, slopes = np.concatenate(found, axis=2)
+        result.append(both)
+    values, slopes = np.concatenate(result, axis=2)
     return values, slopes
 
 
@@ -190,8 +190,8 @@ def _one_by_one(judge: Callable[[Fraction], Verdict], values: Floats) -> tuple[C
         beside = abs(verdict.radius - 1) <= 2 * UNSURE
         nearest = 1 - 2 * UNSURE if verdict.stable else 1 + 2 * UNSURE
         radii.append(math.nan if verdict.stable is None else nearest if beside else verdict.radius)
-    found = np.array(radii, dtype=np.complex128)[:, None]
-    return found, np.full(found.shape, np.nan, np.complex128)
+    result = np.array(radii, dtype=np.complex128)[:, None]
+    return result, np.full(result.shape, np.nan, np.complex128)
 
 
 @dataclass(frozen=True, eq=False)

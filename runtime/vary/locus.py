@@ -48,30 +48,34 @@ class Locus:
 
 
 @part("locus")
-def root_locus(system: CompiledSystem, found: Critical) -> Locus:
+def root_locus(system: CompiledSystem, critical: Critical) -> Locus:
     """Follow the eigenvalues of a scene over the values at which its stability was looked at.
 
     Parameters
     ----------
     system
         The compiled scene, all other numbers as they are.
-    found
+    critical
         What `critical` says of one of its parameters: that one is varied.
     """
-    free = find(system, found.parameter, counts=True)
-    low, high = found.scanned
+    free = find(system, critical.parameter, counts=True)
+    low, high = critical.scanned
     most = max(
-        [abs(found.present), *(crossing.value for crossing in found.crossings[:1]), found.value or 0.0]
+        [
+            abs(critical.present),
+            *(crossing.value for crossing in critical.crossings[:1]),
+            critical.value or 0.0,
+        ]
     )
     high = min(high, BEYOND * most) if most > low else high
     values = np.linspace(low, high, POINTS)
-    if found.counted:
+    if critical.counted:
         values = np.unique(np.round(values))
     prepared = prepare(system)
     here = analyze(system, prepared=prepared)
     now = np.array([mode.eigenvalue for mode in here.modes])
     places, eigenvalues = eigenvalues_at(system, free, values.tolist(), prepared=prepared)
-    return Locus(found, here.frame_s, values[places], eigenvalues, now)
+    return Locus(critical, here.frame_s, values[places], eigenvalues, now)
 
 
 def eigenvalues_at(

@@ -158,7 +158,7 @@ class ManyAnalyses:
 
     def at(self, places: Integers) -> Rows:
         """Return what the analyses of points give, whose values are at these places (k, m) of the varied."""
-        found = Rows.nothing(len(places))
+        rows = Rows.nothing(len(places))
         still_open = np.ones(len(places), dtype=np.bool_)
         if len(places):
             timings, which = np.unique(places[:, list(self.times)], axis=0, return_inverse=True)
@@ -166,10 +166,10 @@ class ManyAnalyses:
                 some = np.flatnonzero(which.ravel() == number)
                 family = self._family(tuple(timing), len(some))
                 if family is not None:
-                    still_open[some] = ~_filled(family, self.varied, places, some, found)
+                    still_open[some] = ~_filled(family, self.varied, places, some, rows)
         for point in np.flatnonzero(still_open).tolist():
-            self._alone(places[point], point, found)
-        return found
+            self._alone(places[point], point, rows)
+        return rows
 
     def _family(self, timing: tuple[int, ...], count: int) -> _Family | None:
         """Return what points of these times share, None where each of them has an analysis of its own."""
@@ -185,7 +185,7 @@ class ManyAnalyses:
             self.families[timing] = _family(asked, self.times, given)
         return self.families[timing]
 
-    def _alone(self, places: Integers, row: int, found: Rows) -> None:
+    def _alone(self, places: Integers, row: int, rows: Rows) -> None:
         """Analyse one point by itself."""
         try:
             overrides = [
@@ -194,15 +194,15 @@ class ManyAnalyses:
             analysis: Analysis = analyze(apply(self.system, overrides), prepared=self.prepared)
         except ApcError as error:
             first = error.mistakes[0]
-            found.verdict[row], found.message[row] = FAULT + first.code, first.sentence
+            rows.verdict[row], rows.message[row] = FAULT + first.code, first.sentence
             return
-        found.verdict[row] = analysis.verdict
-        found.spectral_radius[row] = analysis.spectral_radius
-        found.spectral_radius_error[row] = analysis.spectral_radius_error
-        found.rigid_modes[row] = analysis.rigid_modes
+        rows.verdict[row] = analysis.verdict
+        rows.spectral_radius[row] = analysis.spectral_radius
+        rows.spectral_radius_error[row] = analysis.spectral_radius_error
+        rows.rigid_modes[row] = analysis.rigid_modes
         if analysis.modes:
-            found.frequency_hz[row] = analysis.modes[0].frequency_hz
-            found.damping_ratio[row] = analysis.modes[0].damping_ratio
+            rows.frequency_hz[row] = analysis.modes[0].frequency_hz
+            rows.damping_ratio[row] = analysis.modes[0].damping_ratio
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -276,7 +276,7 @@ def analyze_many(system: CompiledSystem, values: Mapping[str, Any]) -> Analyses:
         numbers, which = np.unique(array.ravel(), return_inverse=True)
         varied.append(Varied(free, numbers, partial(_shortest, numbers)))
         places.append(which)
-    found = many_analyses(system, varied).at(np.stack(places, axis=1))
+    rows = many_analyses(system, varied).at(np.stack(places, axis=1))
     shape = arrays[0].shape
     units = [unit_of(system, free.name) for free in frees]
     return Analyses(
@@ -286,7 +286,7 @@ def analyze_many(system: CompiledSystem, values: Mapping[str, Any]) -> Analyses:
             for free, unit in zip(frees, units, strict=True)
         ),
         values=tuple(arrays),
-        **{field.name: getattr(found, field.name).reshape(shape) for field in fields(found)},
+        **{field.name: getattr(rows, field.name).reshape(shape) for field in fields(rows)},
         left_out=(*near_start(system), *left_out(system, varied=frees), *notes_for_all_groups(system, frees)),
     )
 
@@ -385,25 +385,25 @@ def _family(of: Asked, times: tuple[int, ...], given: tuple[Override, ...]) -> _
 def _reaching(system: CompiledSystem, columns: Sequence[int], free: Sequence[Free]) -> tuple[_Reaching, ...]:
     """Return the varied numbers from which any others follow, those together of which the same does."""
     scopes = [scope_of(system), *(scope_of(system, group.values) for group in system.groups)]
-    found: list[_Reaching] = []
+    reachings: list[_Reaching] = []
     for column, item in zip(columns, free, strict=True):
         reached = [scope.follow({item.name: None}, lambda *_: None, lambda _: None) for scope in scopes]
         mine = _Reaching((column,), frozenset[str]().union(*reached))
         if len(mine.names) > 1:
-            shared = [other for other in found if other.names & mine.names]
+            shared = [other for other in reachings if other.names & mine.names]
             every = [*shared, mine]
-            found = [other for other in found if other not in shared]
-            found.append(
+            reachings = [other for other in reachings if other not in shared]
+            reachings.append(
                 _Reaching(
                     tuple(column for other in every for column in other.columns),
                     frozenset[str]().union(*(other.names for other in every)),
                 )
             )
-    return tuple(found)
+    return tuple(reachings)
 
 
 def _filled(
-    family: _Family, varied: Sequence[Varied], places: Integers, some: Integers, found: Rows
+    family: _Family, varied: Sequence[Varied], places: Integers, some: Integers, rows: Rows
 ) -> Truths:
     """Fill in what the matrices of some points decide, and say of each whether they do."""
     done = np.zeros(len(some), dtype=np.bool_)
@@ -412,7 +412,7 @@ def _filled(
     with single_threaded(), np.errstate(all="ignore"):
         for start in range(0, len(some), together):
             mine = slice(start, start + together)
-            done[mine] = _decided(family, varied, places[some[mine]], some[mine], found)
+            done[mine] = _decided(family, varied, places[some[mine]], some[mine], rows)
     return done
 
 
@@ -421,7 +421,7 @@ def _decided(
     varied: Sequence[Varied],
     places: Integers,
     rows: Integers,
-    found: Rows,
+    result: Rows,
 ) -> Truths:
     """Do so for few points at a time."""
     allowed, vectors = _vectors(family, varied, places)
@@ -438,11 +438,11 @@ def _decided(
     into = into[~_loose(known.error[into])]
     some = some[into]
     place, radius = rows[some], known.radius[into]
-    found.verdict[place] = judge([True], family.rigid, family.drifts)[0]
-    found.verdict[place[radius > 1]] = UNSTABLE
-    found.spectral_radius[place], found.spectral_radius_error[place] = radius, known.error[into]
-    found.rigid_modes[place] = family.rigid
-    found.frequency_hz[place], found.damping_ratio[place] = (
+    result.verdict[place] = judge([True], family.rigid, family.drifts)[0]
+    result.verdict[place[radius > 1]] = UNSTABLE
+    result.spectral_radius[place], result.spectral_radius_error[place] = radius, known.error[into]
+    result.rigid_modes[place] = family.rigid
+    result.frequency_hz[place], result.damping_ratio[place] = (
         known.frequency_hz[into],
         known.damping_ratio[into],
     )
@@ -487,13 +487,13 @@ def _vectors(
     def vectors(group: PeerGroup) -> Floats:
         place, peer = family.evaluator.first_peer(group)
         names, own = group.jacobians.kind.parameters, family.system.groups[place].name
-        found = group.parameters[None]
+        vectors = group.parameters[None]
 
         def put(where: list[int], values: Floats) -> None:
-            nonlocal found
+            nonlocal vectors
             if where:
-                found = np.array(np.broadcast_to(found, (len(places), len(names))))
-                found[:, where] = values
+                vectors = np.array(np.broadcast_to(vectors, (len(places), len(names))))
+                vectors[:, where] = values
 
         for reached, there, which in settled:
             rows = [
@@ -506,7 +506,7 @@ def _vectors(
             free = varied[column].free
             if free.name in names and free.group in (None, own):
                 put([names.index(free.name)], numbers[column][:, None])
-        return found
+        return vectors
 
     return allowed, vectors
 

@@ -124,10 +124,10 @@ def margins(system: CompiledSystem, *, prepared: Prepared | None = None, quick: 
         if not any(states):
             return Margins((), "none: nothing moves")
         lines = _lines(system, chosen, at, slow=slow)
-        found = [row for pair in zip(chosen, lines, strict=True) if (row := _along(system, *pair))]
-        found += rest
-        found += [_delay_margin(system, delay, at, largest) for delay in delays]
-        return Margins(tuple(found), _notes(found, start))
+        result = [row for pair in zip(chosen, lines, strict=True) if (row := _along(system, *pair))]
+        result += rest
+        result += [_delay_margin(system, delay, at, largest) for delay in delays]
+        return Margins(tuple(result), _notes(result, start))
 
 
 def _loops(system: CompiledSystem, prepared: Prepared, *, most: float) -> list[int]:
@@ -205,12 +205,12 @@ def _along(system: CompiledSystem, free: Free, line: MatrixLine | AnalysedLine |
     """Return the margin of a parameter, None where it can't grow or nothing depends on it."""
     if line is None:
         return None
-    found = search(line, first=True)
-    if not found.enters:
+    result = search(line, first=True)
+    if not result.enters:
         return None
-    lost = [edge for edge in found.edges if edge.stable_side == "below"]
+    lost = [edge for edge in result.edges if edge.stable_side == "below"]
     present, unit = value_now(system, free), Unit.of(parameter_of(system, free))
-    return _margin(free.label, unit, present, lost[0] if lost else None, found.scanned[1])
+    return _margin(free.label, unit, present, lost[0] if lost else None, result.scanned[1])
 
 
 def _delay_margin(system: CompiledSystem, free: Free, prepared: Prepared, largest: int) -> Margin:
@@ -223,11 +223,11 @@ def _delay_margin(system: CompiledSystem, free: Free, prepared: Prepared, larges
     if largest > MOST_DELAYED and not late:
         return not_looked(system, free, f"{largest:,} states in each order of events")
     try:
-        found = search(DelayLine(system, free, prepared, now, end), first=True)
+        result = search(DelayLine(system, free, prepared, now, end), first=True)
     except ApcError as error:
         return not_looked(system, free, error.mistakes[0].what)
-    crossing = found.edges[0] if found.edges else None
-    return _margin(free.name, "s", float(now), crossing, found.scanned[1])
+    crossing = result.edges[0] if result.edges else None
+    return _margin(free.name, "s", float(now), crossing, result.scanned[1])
 
 
 def not_looked(system: CompiledSystem, free: Free, why: str) -> Margin:

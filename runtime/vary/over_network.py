@@ -102,15 +102,15 @@ def network_margins(
             line = GrowthLine(
                 GrowthEvaluator(system, (item,), prepared, PLACE), np.array(samples), {samples[0]: here}
             )
-            found = search(line, first=True)
-            looked += found.looked
-            if not found.enters:
+            result = search(line, first=True)
+            looked += result.looked
+            if not result.enters:
                 continue
-            rows.append(_margin(system, item, found))
-            if found.why:
-                beyond.setdefault(found.why, []).append(item.label)
-            if found.edges and found.edges[0].proof != BOUNDED[MEAN_SQUARE]:
-                open_sides.append(f"{item.label} ({found.edges[0].proof})")
+            rows.append(_margin(system, item, result))
+            if result.why:
+                beyond.setdefault(result.why, []).append(item.label)
+            if result.edges and result.edges[0].proof != BOUNDED[MEAN_SQUARE]:
+                open_sides.append(f"{item.label} ({result.edges[0].proof})")
     notes += [f"beyond these values of {', '.join(labels)}, {why}" for why, labels in beyond.items()]
     if open_sides:
         notes.append(f"not bounded on either side: {', '.join(open_sides)}")
@@ -164,9 +164,9 @@ def _samples(system: CompiledSystem, free: Free, scales: dict[str, float]) -> li
     return [present, *(float(item) for item in ahead if present < item <= most)]
 
 
-def _margin(system: CompiledSystem, free: Free, found: Search) -> Margin:
+def _margin(system: CompiledSystem, free: Free, search: Search) -> Margin:
     """Return a margin that was found, or how far it was looked for."""
-    present, crossing = value_now(system, free), found.edges[0] if found.edges else None
+    present, crossing = value_now(system, free), search.edges[0] if search.edges else None
     return Margin(
         parameter=free.label,
         unit=unit_of(system, free.name),
@@ -176,7 +176,7 @@ def _margin(system: CompiledSystem, free: Free, found: Search) -> Margin:
         factor=crossing.value / present if crossing is not None and present else None,
         frequency_hz=None,
         kind="" if crossing is None else crossing.kind,
-        scanned=found.scanned[1],
+        scanned=search.scanned[1],
     )
 
 

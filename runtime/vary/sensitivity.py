@@ -117,9 +117,11 @@ def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -
 
         @cache
         def clusters_of(*together: Free) -> list[_Cluster] | None:
-            found = _clusters(system, together, start)
+            result = _clusters(system, together, start)
             # Equations have edges that points step over.
-            return _clusters(system, together, prepared) if found is None and start is not prepared else found
+            return (
+                _clusters(system, together, prepared) if result is None and start is not prepared else result
+            )
 
         def frees(*together: Free) -> bool:
             """Say whether something that is rigid in the scene as it is moves where these vary."""
@@ -137,11 +139,11 @@ def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -
         clusters: list[_Cluster] = []
         notes, untied = [], [free.label for free in loose]
         for together in listed:
-            found = clusters_of(*together)
-            if found is None:
+            result = clusters_of(*together)
+            if result is None:
                 return Sensitivities(0.0, (), (), NO_MATRIX)
-            clusters, first = clusters or found, 0
-            for cluster in found:
+            clusters, first = clusters or result, 0
+            for cluster in result:
                 if not cluster.condition < WORST:
                     continue
                 for column, own in enumerate(together):
@@ -244,7 +246,7 @@ def _clusters(system: CompiledSystem, free: Sequence[Free], prepared: Prepared) 
     still = np.ones(len(free), dtype=np.bool_)
     for values in beside:
         still &= np.isfinite(values).all(axis=(1, 2))
-    found = []
+    result = []
     for name, (matrix, slopes) in zip(family.names, pairs, strict=True):
         if not matrix.shape[1]:
             continue
@@ -256,10 +258,10 @@ def _clusters(system: CompiledSystem, free: Sequence[Free], prepared: Prepared) 
             for states in _alone(matrix[0], slopes):
                 block = np.index_exp[..., states[:, None], states]
                 own += _of_system(name, matrix[0][block], slopes[block][: len(free)], still)
-        found += own
-    sizes = [float(np.abs(item.values).max()) for item in found]
+        result += own
+    sizes = [float(np.abs(item.values).max()) for item in result]
     least = max(sizes, default=0.0) - SHARED * max(1.0, *sizes, 0.0)
-    kept = [item for item, size in zip(found, sizes, strict=True) if size >= least]
+    kept = [item for item, size in zip(result, sizes, strict=True) if size >= least]
     return sorted(kept, key=lambda item: -float(np.abs(item.values).max()))
 
 
@@ -280,7 +282,7 @@ def _of_system(name: str, matrix: Floats, slopes: Floats, still: NDArray[np.bool
     sizes = np.abs(pairs.values)
     least = sizes.max() - SHARED * max(1.0, sizes.max()) - 2 * CLOSE * max(sizes.max(), CLOSE)
     left_over = set(np.flatnonzero((pairs.values.imag >= 0) & (sizes >= least)).tolist())
-    found = []
+    result = []
     for place in np.argsort(-sizes, kind="stable").tolist():
         if place not in left_over:
             continue
@@ -295,5 +297,5 @@ def _of_system(name: str, matrix: Floats, slopes: Floats, still: NDArray[np.bool
         rates = np.zeros((len(slopes), len(near), len(near)), np.complex128)
         if condition < WORST:
             rates = np.asarray(np.linalg.solve(product, own.left) @ slopes @ own.right, np.complex128)
-        found.append(_Cluster(name, own.values, rates, still, condition))
-    return found
+        result.append(_Cluster(name, own.values, rates, still, condition))
+    return result

@@ -108,8 +108,8 @@ def reduced(wiring: Wiring, matrix: Matrices, count: int) -> Matrices:
     at, sound = relative_at(wiring, matrix)
     within = relative(matrix, at)
     sound = sound & np.isfinite(within).all(axis=(1, 2))
-    found = np.where(sound[:, None, None], within, np.nan)
-    return np.broadcast_to(found, (count, *found.shape[1:])).copy() if len(found) < count else found
+    values = np.where(sound[:, None, None], within, np.nan)
+    return np.broadcast_to(values, (count, *values.shape[1:])).copy() if len(values) < count else values
 
 
 def relative_at(wiring: Wiring, matrix: Matrices) -> tuple[Relative, NDArray[np.bool_]]:
