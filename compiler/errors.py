@@ -184,17 +184,17 @@ class Mistakes:
             raise ApcError(self.found)
 
 
-def nearest(name: str, known: Iterable[str], *, alike: float = 0.6) -> str:
+def nearest(name: str, texts: Iterable[str], *, alike: float = 0.6) -> str:
     """Return the known name closest to a misspelt one, or an empty string when none is close.
 
     Parameters
     ----------
-    name, known
+    name, texts
         The name as written, and those there are.
     alike
         How alike two names must be, from 0 to 1: what short names share by chance is more.
     """
     import difflib  # for a mistake only
 
-    close = difflib.get_close_matches(name[:200], list(known), n=1, cutoff=alike)
+    close = difflib.get_close_matches(name[:200], list(texts), n=1, cutoff=alike)
     return close[0] if close else ""

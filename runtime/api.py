@@ -307,8 +307,8 @@ def compare(
     """
     from apc.comparison import comparison
 
-    listed = _several(models, "compare")
-    return comparison.compare([_model(scene, set) for scene in listed], over=over, criterion=criterion, at=at)
+    scenes = _several(models, "compare")
+    return comparison.compare([_model(scene, set) for scene in scenes], over=over, criterion=criterion, at=at)
 
 
 @checked

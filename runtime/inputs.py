@@ -55,9 +55,9 @@ def find_input(file: str | None = None, *, compiled_too: bool) -> Path:
     """
     if file:
         return Path(file)
-    here = Path()
-    topologies = sorted(path for path in here.glob("*.yaml") if _is_topology(path))
-    models = sorted(here.glob("*.apc")) if compiled_too else []
+    path = Path()
+    topologies = sorted(path for path in path.glob("*.yaml") if _is_topology(path))
+    models = sorted(path.glob("*.apc")) if compiled_too else []
     orphans = [path for path in models if path.with_suffix(".yaml") not in topologies]
     candidates = [*topologies, *orphans]
     if len(candidates) == 1:

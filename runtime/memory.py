@@ -62,8 +62,8 @@ def refuse_beyond(needed: float, code: str, place: Place, what: str, hint: str) 
         The code given.
     """
     if needed > SMALL and needed > (free := free_memory()):
-        told = f"{what} take about {size_text(needed)} of memory, and {size_text(free)} are free"
-        raise ApcError(Mistake(code, place, told, hint=hint))
+        text = f"{what} take about {size_text(needed)} of memory, and {size_text(free)} are free"
+        raise ApcError(Mistake(code, place, text, hint=hint))
 
 
 def size_text(size: float) -> str:

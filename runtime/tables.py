@@ -297,8 +297,8 @@ def read_table(path: Path, columns: Sequence[Column]) -> tuple[NDArray[Any], ...
             for place, column in enumerate(columns)
         ]
     return tuple(
-        np.array(own, dtype=np.float64 if column.kind == "number" else object)
-        for column, own in zip(columns, cells, strict=True)
+        np.array(cell, dtype=np.float64 if column.kind == "number" else object)
+        for column, cell in zip(columns, cells, strict=True)
     )
 
 

@@ -79,8 +79,8 @@ def _pinned() -> bool:
 
     OpenBLAS looks at its own variable first, and MKL at its own; both, and OpenMP, at OMP_NUM_THREADS.
     """
-    own = (os.environ.get(name, "1") for name in POOLS)
-    return "OMP_NUM_THREADS" in os.environ and all(value == "1" for value in own)
+    limits = (os.environ.get(name, "1") for name in POOLS)
+    return "OMP_NUM_THREADS" in os.environ and all(value == "1" for value in limits)
 
 
 @lru_cache(maxsize=1)

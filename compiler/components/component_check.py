@@ -103,16 +103,19 @@ class ComponentNames:
                 named = entries(send.name, len(each) if len(each) > 1 else 0)
                 pairs = zip(named, each, strict=True)
                 sent += [replace(send, name=n, expression=item, dimension=dimension) for n, item in pairs]
-        own = self.component
+        component = self.component
         if not mistakes:
             for send in sends:
                 with mistakes:
                     self._check_sent(send)
-            for equation in own.equations:
+            for equation in component.equations:
                 with mistakes:
                     equations += self._checked(equation, mistakes)
         return replace(
-            own, locals=(*own.locals, *locals_), sends=(*own.sends, *sent), equations=tuple(equations)
+            component,
+            locals=(*component.locals, *locals_),
+            sends=(*component.sends, *sent),
+            equations=tuple(equations),
         )
 
     def _infer_locals(self, sends: Collection[Send]) -> list[tuple[str, Dimension]]:

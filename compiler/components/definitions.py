@@ -229,7 +229,7 @@ def _connectors(root: Body, library: Definitions) -> list[tuple[str, Connector, 
         text = text_of(kind, name, f"{name}: Flange")
         connector = library.connector(text)
         if connector is None:
-            known = [known for known in library.names if library.connector(known)]
+            known = [name for name in library.names if library.connector(name)]
             raise unknown("E206", kind.place, f"there is no connector type {brief(text)}", text, known)
         return name, connector, for_hands
 

@@ -251,8 +251,8 @@ def read_entry(entry: PartEntry, scope: Scope, mistakes: Mistakes, index: int = 
     def due(parameter: Parameter) -> str:
         """Return what to write for a parameter that must be given; nothing of one that may be left out."""
         if isinstance(parameter, Reference):
-            known = scope.references(parameter.role, "") if parameter.role in naming else [""]
-            return next(iter(known), "name")
+            texts = scope.references(parameter.role, "") if parameter.role in naming else [""]
+            return next(iter(texts), "name")
         if parameter.default is not None:
             return ""
         return parameter.words[0] if isinstance(parameter, Option) else _one(parameter.unit)
@@ -266,8 +266,8 @@ def read_entry(entry: PartEntry, scope: Scope, mistakes: Mistakes, index: int = 
                 return Binding(item.default, None, unit.dimension, entry.place, unit.text)
         if node is None or node is _FAULTY:
             return None
-        what, known = (item.name, unit.dimension, unit.text), (scope.dimension, scope.names)
-        return read_binding(node, *what, *known, words)
+        what, pair = (item.name, unit.dimension, unit.text), (scope.dimension, scope.names)
+        return read_binding(node, *what, *pair, words)
 
     def option(item: Option) -> str | None:
         name, words, node = item.name, item.words, nodes.get(item.name)
@@ -336,7 +336,7 @@ def _vector(node: Node, name: str, vector: Sequence[Number | Variable], scope: S
     """Return a node for each entry of a vector, which inside a component may be an expression."""
     if isinstance(node, Scalar) and scope.outer is not None and not is_quantity(node.text):
         place = text_place(node)
-        sizes = sizes_of(tuple(known.split(".")) for known in scope.names)
+        sizes = sizes_of(tuple(name.split(".")) for name in scope.names)
         tree = parse_expression(node.text, place)
         result = written_out(tree, lambda parts: sizes.get(parts, 0), node.text, place)
         if result is not None and len(result) == len(vector):

@@ -55,8 +55,8 @@ class Aliases:
         """Return an expression in which derivatives have their own names."""
         names = {}
         for s, (x, order) in self.moving.derivatives(expression).items():
-            known = next((k for k in range(order, 0, -1) if (x, k) in self.velocities), 0)
-            names[s] = derivative(self.velocities.get((x, known), x), order - known)
+            index = next((k for k in range(order, 0, -1) if (x, k) in self.velocities), 0)
+            names[s] = derivative(self.velocities.get((x, index), x), order - index)
         return expression.xreplace(names)
 
     def assignments(self) -> tuple[Assignment, ...]:

@@ -266,16 +266,16 @@ class _Clocks:
         if equation.origin == CONNECTION:  # of what a part's equation takes as it is
             sides = {format_expression(side) for side in (equation.left, equation.right)}
             taking = [
-                flat_equation
-                for flat_equation in self.given.values()
-                if sides & set(map(format_expression, _leaves(flat_equation)))
+                equation
+                for equation in self.given.values()
+                if sides & set(map(format_expression, _leaves(equation)))
             ]
         else:
             taking = [equation] if clock == CONTINUOUS else []
-        for own in taking if CONTINUOUS in (clock, others) else ():
-            if hint := _sampled(own):
-                what = f"`{own.text}` of {own.origin} is on clock {own.clock}, and samples what moves"
-                self.mistakes.add("E505", own.place, what, hint=hint)
+        for other in taking if CONTINUOUS in (clock, others) else ():
+            if hint := _sampled(other):
+                what = f"`{other.text}` of {other.origin} is on clock {other.clock}, and samples what moves"
+                self.mistakes.add("E505", other.place, what, hint=hint)
                 return
         hint = f"one clock for both, or sample(hold({name}))"
         if CONTINUOUS in (clock, others):

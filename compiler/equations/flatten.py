@@ -206,10 +206,10 @@ def flatten(scene: Scene) -> FlatSystem:
             for name in delays.intersection(name for name, _ in group.columns):
                 what = f"{name} can't differ from peer to peer within a group"
                 mistakes.add("E211", group.place, what, hint="a group of its own for each delay")
-            own = tuple(setting for setting in group.values if setting[0] in delays)
-            sharing.setdefault(group.name if own else "", ([], own))[0].append(group.name)
-        for members, own in sharing.values():
-            kinds.append(replace(kind, name=" and ".join(members), groups=tuple(members), delays=own))
+            pairs = tuple(setting for setting in group.values if setting[0] in delays)
+            sharing.setdefault(group.name if pairs else "", ([], pairs))[0].append(group.name)
+        for members, pairs in sharing.values():
+            kinds.append(replace(kind, name=" and ".join(members), groups=tuple(members), delays=pairs))
     mistakes.raise_if_any()
     return FlatSystem(scene, tuple(kinds))
 

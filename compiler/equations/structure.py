@@ -214,8 +214,8 @@ def _sorted_continuous(
     steps = solve_blocks(shown, [aliases.shown(s) for s in unknowns], problem)
     below = {v: aliases.shown(derivative(x, order - 1)).name for (x, order), v in aliases.velocities.items()}
     rates = [(f"der({x})", symbol(v)) for v, x in below.items() if x in states]
-    known = [rate for rate in rates if rate[1].name in states]
-    steps = (*known, *steps, *(rate for rate in rates if rate not in known))
+    pairs = [rate for rate in rates if rate[1].name in states]
+    steps = (*pairs, *steps, *(rate for rate in rates if rate not in pairs))
     return states, aliases.assignments(), steps, [aliases.shown(residual.expression) for residual in read]
 
 

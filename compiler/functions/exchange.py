@@ -210,10 +210,10 @@ def check_links(scene: Scene, kinds: Sequence[Kind], places: Sequence[int]) -> N
 
 def _taken(kind: Kind, link: str) -> str:
     """Return what a kind takes over those it hears over a link that is nothing over nobody, if anything."""
-    generator = (
+    operators = (
         receive.operator for clock in kind.clocks for receive in clock.receives if receive.link == link
     )
-    return next((text for text in generator if text in ("mean", "max", "min")), "")
+    return next((text for text in operators if text in ("mean", "max", "min")), "")
 
 
 def compiled_groups(

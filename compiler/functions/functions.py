@@ -204,7 +204,7 @@ def _kind(writer: Writer, heard: Iterable[str], timings: Timings) -> Kind:
         parameters,
         function("derivative", "dx", rates, {}),
         tuple(clock(name, list(computed)) for name, computed in outputs.items() if computed),
-        tuple(send(link, listed) for link, listed in channels.items()),
+        tuple(send(link, channel) for link, channel in channels.items()),
         Ports(tuple(part for part, *_ in ports), port) if ports else None,
         hands=tuple(part.name for part in hands if "." not in part.name and _answers(part)),
         limits=tuple(limit(variable) for variable in flat.variables if variable.limit),

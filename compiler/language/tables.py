@@ -210,10 +210,10 @@ def open_table(path: Path, named_at: Place, known: Collection[str] = ()) -> Iter
         raise fault("E702", Place(file, 1, 1), "a table", expected, hint=_EXAMPLE) from None
 
 
-def _is_table(headings: list[str], known: Collection[str]) -> bool:
+def _is_table(headings: list[str], texts: Collection[str]) -> bool:
     """Return whether a line is the first of a table: a heading has its unit, or there are several names."""
     parts = [_parts(heading) for heading in headings]
-    return any(name in known or (unit and _NAME.match(name)) for name, unit in parts) or (
+    return any(name in texts or (unit and _NAME.match(name)) for name, unit in parts) or (
         len(parts) > 1 and all(_NAME.match(name) and unit is None for name, unit in parts)
     )
 

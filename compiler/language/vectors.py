@@ -212,9 +212,9 @@ class _Writer:
 
     def agree(self, parts: Sequence[Expr], written: Sequence[Written]) -> None:
         """Refuse parts that are not of one size."""
-        known = [(part, other) for part, other in zip(parts, written, strict=True) if other is not None]
-        for part, other in known[1:]:
-            model, first = known[0]
+        pairs = [(part, other) for part, other in zip(parts, written, strict=True) if other is not None]
+        for part, other in pairs[1:]:
+            model, first = pairs[0]
             if len(first) == len(other):
                 continue
             text, hint = format_expression(part), "" if _is_vector(first) else self.of_vector(part)
@@ -227,8 +227,8 @@ class _Writer:
         size = max(len(part or ()) for part in parts)
         if None in parts and size < 2:
             return None
-        known = (part or (before,) for part, before in zip(parts, call.arguments, strict=True))
-        rows = zip(*(part if _is_vector(part) else part * size for part in known), strict=True)
+        replaced = (part or (before,) for part, before in zip(parts, call.arguments, strict=True))
+        rows = zip(*(part if _is_vector(part) else part * size for part in replaced), strict=True)
         return tuple(replace(call, arguments=row) for row in rows)
 
     def of_vector(self, expr: Expr) -> str:

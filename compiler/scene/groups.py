@@ -315,12 +315,12 @@ def _check_column(
     column: Column, lines: tuple[int, ...], item: Number | Variable, mistakes: Mistakes
 ) -> None:
     """Check a column's unit, and each of its numbers against the parameter's bounds."""
-    own, due = column.unit.dimension, item.unit.dimension
-    if own != due or own.clashes(due):
+    dimension, due = column.unit.dimension, item.unit.dimension
+    if dimension != due or dimension.clashes(due):
         expected = format_dimension(due)
         got = f"[{column.unit.text}]" if column.unit.text != "1" else "no unit"
         hint = f"{column.name} [{item.unit.text}]"
-        if own.clashes(due):
+        if dimension.clashes(due):
             hint += f", each {'divided by' if expected == 'Hz' else 'times'} 2*pi"
         raise fault("E702", column.place, f"the heading {column.name}", f"[{expected}]", got, hint)
     if isinstance(item, Number):

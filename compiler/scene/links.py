@@ -173,16 +173,16 @@ def read_link(part: Part, entry: PartEntry, numbers: NamedNumbers) -> SceneLink:
     if "delays" in nodes:
         with numbers.mistakes:
             delays = read_delays(nodes["delays"], numbers)
-    told = f"{part.name} is a {component.name}, which is no link:"
+    text = f"{part.name} is a {component.name}, which is no link:"
     if "clock" not in roles.values() or component.parameter("delay") is None:
-        raise fault("E210", part.place, f"{told} it has no clock and delay", hint="type: Link")
+        raise fault("E210", part.place, f"{text} it has no clock and delay", hint="type: Link")
     # Of a link's component nothing may be declared that no link obeys.
     obeyed = {*OBEYED, *(name for name, role in roles.items() if role != "link")}
     declared = [item.name for item in (*component.variables, *component.parameters)]
     idle = [name for name in (*dict(component.connectors), *declared) if name not in obeyed]
     idle += ["equations"] * bool(component.equations or component.inner)
     if idle:
-        raise fault("E210", part.place, f"{told} a link has no {idle[0]}", hint="type: Link")
+        raise fault("E210", part.place, f"{text} a link has no {idle[0]}", hint="type: Link")
     channel, within = _read_channel(part, nodes, numbers), None
     if isinstance(node := nodes.get("delay"), Sequence):
         if channel is not None and (channel.jitter or channel.trace is not None):

@@ -141,8 +141,8 @@ class Body:
             if key.text not in allowed:
                 left = [known for known in allowed if known not in self.nodes]  # what is there was meant
                 close = nearest(key.text, left)
-                told = f"{what} has no key {brief(key.text)}"
-                mistakes.take(unknown("E202", key.place, told, close, [close] if close else allowed))
+                text = f"{what} has no key {brief(key.text)}"
+                mistakes.take(unknown("E202", key.place, text, close, [close] if close else allowed))
                 if close:
                     self.nodes.setdefault(close, value)
 
@@ -170,7 +170,7 @@ class Body:
         return result
 
 
-def unknown(code: str, place: Place, what: str, name: str, known: Collection[str]) -> ApcError:
+def unknown(code: str, place: Place, what: str, name: str, texts: Collection[str]) -> ApcError:
     """Return the mistake of an unknown name, with the nearest known one or, failing that, a list of them.
 
     Parameters
@@ -179,22 +179,22 @@ def unknown(code: str, place: Place, what: str, name: str, known: Collection[str
         The mistake's code, where it is, and its first words.
     name
         The name as written.
-    known
+    texts
         The names there are.
     """
-    close = nearest(name, known)
+    close = nearest(name, texts)
     if close:
         return fault(code, place, f"{what}; the nearest is {close}", hint=close)
-    listed = ", ".join(list(known)[:12]) + (", …" if len(known) > 12 else "")
+    listed = ", ".join(list(texts)[:12]) + (", …" if len(texts) > 12 else "")
     return fault(code, place, f"{what}; there are: {listed}" if listed else f"{what}; there is none")
 
 
-def among(name: str, known: Collection[str], place: Place, what: str, code: str = "E206") -> str:
+def among(name: str, texts: Collection[str], place: Place, what: str, code: str = "E206") -> str:
     """Return a name that is known.
 
     Parameters
     ----------
-    name, known
+    name, texts
         The name as written, and the names there are.
     place, what, code
         Where it stands, what is wrong with another, whose name takes the place of `{}`, and the code of that.
@@ -204,6 +204,6 @@ def among(name: str, known: Collection[str], place: Place, what: str, code: str 
     ApcError
         The name is not known.
     """
-    if name in known:
+    if name in texts:
         return name
-    raise unknown(code, place, what.replace("{}", brief(name)), name, known)
+    raise unknown(code, place, what.replace("{}", brief(name)), name, texts)

@@ -215,8 +215,8 @@ def _schedule_lines(facts: dict[str, Any]) -> Iterator[str]:
         return
     yield f"  frame of {seconds(Fraction(frame))}, after which every clock stands as before"
     for row in chain(*tables):
-        told = (_shown(key, value) for key, value in row.items() if value)
-        yield from wrapped(", ".join(told), "  ", "    ")
+        texts = (_shown(key, value) for key, value in row.items() if value)
+        yield from wrapped(", ".join(texts), "  ", "    ")
 
 
 def _shown(key: str, value: Any) -> str:

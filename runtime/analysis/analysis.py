@@ -257,8 +257,8 @@ def analyze(
         stands = _what_stands(spectrum, plan.loops, population)
         verdict, stable = spectrum.verdict, spectrum.stable
         if verdict in (STABLE_TRANSLATING, DRIFTS):
-            told = up_to(stands.translations, stands.rotations)
-            verdict, stable = (DRIFTS, False) if stands.drifts else (told, True)
+            text = up_to(stands.translations, stands.rotations)
+            verdict, stable = (DRIFTS, False) if stands.drifts else (text, True)
         proof = spectrum.proof if verdict == DRIFTS else spectrum.proof.replace(TO_DRIFT, "stable")
         of = (("linearization", linearized), ("nominal network", bool(unreliable(system))))
         if proof and any(is_so for _, is_so in of):

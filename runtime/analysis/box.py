@@ -138,8 +138,8 @@ def _check_limits(parameter: Parameter, low: Fraction, high: Fraction, name: str
     if not low < high:
         mistakes.add("E833", _PLACE, what, expected="a low below the high", got=" to ".join(shown(low, high)))
     for side, end in (("lower", low), ("upper", high)):
-        told = f"the {side} end of {what}"
-        check_bounds(replace(parameter, value=float(end), exact=None), told, mistakes, "E833", _PLACE)
+        text = f"the {side} end of {what}"
+        check_bounds(replace(parameter, value=float(end), exact=None), text, mistakes, "E833", _PLACE)
     if mistakes and low < high:
         # What lies within the bounds; next to one that must not be met, a hundredth of the way.
         least, most = float(parameter.minimum or 0.0), parameter.maximum
@@ -234,10 +234,11 @@ def open_sites(
     at = apply(system, point)
     groups, exchange = lifted(at)
     members = [_members(group, exchange.starts) for group in groups]
-    apart = all(len({_reach(opened[place]) for place in own}) == 1 for own in members)
+    apart = all(len({_reach(opened[place]) for place in member}) == 1 for member in members)
     assert apart, "peers of different groups are alike at a generic place of the box"
     vectors = {
-        group.name: _open_vector(group, opened[own[0]]) for group, own in zip(groups, members, strict=True)
+        group.name: _open_vector(group, opened[member[0]])
+        for group, member in zip(groups, members, strict=True)
     }
     sites = {group.name: _open_site(group, vectors[group.name], system) for group in groups}
     return OpenSites(at, groups, exchange, sites, vectors)

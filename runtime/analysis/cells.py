@@ -315,12 +315,12 @@ def frames_over(asked: OpenFrames, cells: Sequence[Cell]) -> list[FrameMap]:
     for site, schedule in zip(asked.written, asked.schedules, strict=True):
         key = id(site), id(schedule)
         if key not in known:
-            here = every_matrix(site, over)
+            linear_site = every_matrix(site, over)
             steps = {
-                number: step_over(here.a, here.b, float(number * schedule.quantum))
+                number: step_over(linear_site.a, linear_site.b, float(number * schedule.quantum))
                 for number in step_durations(schedule)
             }
-            known[key] = compose(here, schedule, steps, numbers=numbers)
+            known[key] = compose(linear_site, schedule, steps, numbers=numbers)
         maps.append(known[key])
     return maps
 

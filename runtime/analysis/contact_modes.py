@@ -196,10 +196,10 @@ def _settings(
     nothing: frozenset[str] = frozenset()
     result = {tuple(has): EVERYONE, tuple(nothing for _ in has): NOBODY} if names else {}
     for place, group in enumerate(system.groups if names else ()):
-        alone = tuple(own if g == place else nothing for g, own in enumerate(has))
+        alone = tuple(texts if g == place else nothing for g, texts in enumerate(has))
         result.setdefault(alone, f"on at {group.name} alone")
     for name in names:
-        result.setdefault(tuple(own & {name} for own in has), f"{name} on alone")
+        result.setdefault(tuple(texts & {name} for texts in has), f"{name} on alone")
     return result
 
 

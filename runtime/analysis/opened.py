@@ -113,8 +113,8 @@ def contact_groups(
     switched = [find_switches(kind) for kind in kinds_now]
     parts = parts_of_kinds(system, switched, numbers)
     on = tuple(
-        bind(switched_kind, site, settings(listed, on=True)) if switched_kind.decisions else site
-        for switched_kind, site, listed in zip(switched, prepared.jacobians, parts, strict=True)
+        bind(switched_kind, site, settings(part, on=True)) if switched_kind.decisions else site
+        for switched_kind, site, part in zip(switched, prepared.jacobians, parts, strict=True)
     )
     for place, group in enumerate(system.groups):
         vector = numbers.parameters[place][0]
@@ -181,11 +181,11 @@ def open_loops(system: CompiledSystem, prepared: Prepared) -> list[OpenLoop] | s
         return loops
     result = []
     for loop in loops:
-        listed = [of_site[id(site.lifting)] for site in loop.sites]
-        size = loop.states + sum(len(opened.ticks) for opened in listed)
+        cut_groups = [of_site[id(site.lifting)] for site in loop.sites]
+        size = loop.states + sum(len(opened.ticks) for opened in cut_groups)
         if size > MOST_STATES:
             return f"{size:,} states and ticks of contacts move together, and {MOST_STATES} are the most"
-        one_open = _open_loop(loop, listed)
+        one_open = _open_loop(loop, cut_groups)
         if isinstance(one_open, str):
             return one_open
         result.append(one_open)

@@ -152,7 +152,7 @@ def analyze_paper(system: CompiledSystem) -> Analysis:
             raise _not_of_the_form(system, ["a scene in which nothing drifts"])
         spectrum = _with_turns(solve_spectrum([_without_rigid(loop, whole, rigid)]), solve_spectrum([whole]))
     stands = what_stands(whole)
-    told = up_to(stands.translations, stands.rotations)
+    text = up_to(stands.translations, stands.rotations)
     zero, size = (loop.ratio - 1) * len(loop.states), loop.starts[-1]
     return Analysis(
         topology=system.name,
@@ -160,7 +160,7 @@ def analyze_paper(system: CompiledSystem) -> Analysis:
         frame_s=loop.frame_s,
         states_per_peer=-(-(size - zero) // system.peers),
         method=PAPER,
-        verdict=told if spectrum.verdict == STABLE else spectrum.verdict,
+        verdict=text if spectrum.verdict == STABLE else spectrum.verdict,
         stable=spectrum.stable,
         spectral_radius=spectrum.spectral_radius,
         spectral_radius_error=spectrum.spectral_radius_error,

@@ -126,7 +126,7 @@ class _Walk:
 
         `names` are the arguments', "p" and "t" those that do not move.
         """
-        known = straight(function)
+        plain_function = straight(function)
         inputs = tuple(casadi.SX.sym(name, function.sparsity_in(i)) for i, name in enumerate(names))
         steps = [
             _Step(entry, self.number((name, place)), name not in ("p", "t"), decided=False)
@@ -135,14 +135,14 @@ class _Walk:
         ]
         steps += [
             _Step(casadi.SX(value), self.number(("constant", value)), False, False)
-            for value in known.constants
+            for value in plain_function.constants
         ]
         result = walk(
-            known,
+            plain_function,
             steps,
             lambda word: self.look if word == LOOK else functools.partial(self.apply, word),
         )
-        results = [result[place].expression for place in known.results[0]]
+        results = [result[place].expression for place in plain_function.results[0]]
         column = casadi.SX(function.sparsity_out(0), casadi.vertcat(*results)) if results else casadi.SX(0, 1)
         return inputs, casadi.densify(column)
 

@@ -216,7 +216,7 @@ def bench_analysis(system: CompiledSystem, *, rounds: int = ROUNDS) -> Compariso
         for name, result in results.items()
     ]
     balls = "the same equations in 512-bit balls, of the numbers as doubles: spectral radius"
-    said = truth if isinstance(truth, str) else f"{balls} {truth.digits}"
+    text = truth if isinstance(truth, str) else f"{balls} {truth.digits}"
     notes = [
         f"{WRONG}: {name} says {result.verdict}, {default.method} {default.verdict}"
         for name, result in results.items()
@@ -231,7 +231,7 @@ def bench_analysis(system: CompiledSystem, *, rounds: int = ROUNDS) -> Compariso
         relative="absolute",
         timed="an analysis, from the compiled scene to its verdict",
         measured=pareto_front(measured),
-        reference=said,
+        reference=text,
         refused=(*left_out, *refused),
         notes=tuple(notes),
         left_out=default.left_out,
@@ -276,10 +276,10 @@ def bench_simulation(
         )
         for name, item in ready.items()
     ]
-    said = dict(refused).get(
+    text = dict(refused).get(
         EXACT, "the exact transition, itself off by what one rounding of each number makes"
     )
-    return _simulation(duration, pareto_front(measured), said, refused, tuple(notes))
+    return _simulation(duration, pareto_front(measured), text, refused, tuple(notes))
 
 
 def _simulation(

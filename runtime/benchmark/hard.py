@@ -183,8 +183,8 @@ def _truths(folder: Path) -> dict[str, Any]:
         raise ApcError(Mistake("E920", place, refused.words, hint=FOLDER)) from None
     except ValueError as error:
         raise ApcError(Mistake("E920", place, f"is not JSON: {error}")) from error
-    listed: list[tuple[str, Any]] = list(result.items()) if isinstance(result, dict) else [("", None)]
-    for name, truth in listed:
+    pairs: list[tuple[str, Any]] = list(result.items()) if isinstance(result, dict) else [("", None)]
+    for name, truth in pairs:
         try:
             Fraction(truth["spectral_radius"])
             whole = isinstance(truth["rigid_modes"], int) and isinstance(truth["verdict"], str)

@@ -100,8 +100,8 @@ def scale(path: Path, counts: Sequence[int]) -> Scale:
         count, reason = refused[0]
         what = f"leaves nothing to measure: {counted(count, 'peer')} of {name}: {reason}"
         raise ApcError(Mistake("E921", Place("--scale"), what))
-    said = f"{floor / 2**20:.0f} MiB are the program itself"
-    return Scale(path.stem, name, tuple(rows), tuple(refused), said)
+    text = f"{floor / 2**20:.0f} MiB are the program itself"
+    return Scale(path.stem, name, tuple(rows), tuple(refused), text)
 
 
 def with_count(path: Path, count: int) -> CompiledSystem:

@@ -110,16 +110,16 @@ def _gallery(out: Path) -> str:
     check_suffix(out, (".html",), "--out")
     check_target(out)
     need("matplotlib", "plot")
-    listed = list(scenes().values())
-    with at_work(f"analysing {len(listed)} scenes"):
-        write_text(out, gallery_page(listed))
+    paths = list(scenes().values())
+    with at_work(f"analysing {len(paths)} scenes"):
+        write_text(out, gallery_page(paths))
     return f"{out} is written"
 
 
 def _is_there(table: Path) -> bool:
     """Return whether the folder has a table already, as it is."""
-    here = Path(table.name)
-    return here.is_file() and here.read_bytes() == table.read_bytes()
+    path = Path(table.name)
+    return path.is_file() and path.read_bytes() == table.read_bytes()
 
 
 def _write(texts: dict[Path, str]) -> None:

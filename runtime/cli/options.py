@@ -37,12 +37,12 @@ BY_TYPE: dict[str, dict[str, Any]] = {
 }
 
 
-def option(told: str, metavar: str | None = None, *, name: str = "", **settings: Any) -> Any:
+def option(text: str, metavar: str | None = None, *, name: str = "", **settings: Any) -> Any:
     """Return what a parameter of a command has in the place of a default: its option.
 
     Parameters
     ----------
-    told
+    text
         The option's help.
     metavar
         What stands for its value in the help.
@@ -56,7 +56,7 @@ def option(told: str, metavar: str | None = None, *, name: str = "", **settings:
         said = {**BY_TYPE.get(parameter.annotation, {}), **({"metavar": metavar} if metavar else {})}
         said = {"show_default": bool(settings.get("default")), **said, **settings}
         return click.Option(
-            [name or f"--{parameter.name.replace('_', '-')}", parameter.name], help=told, **said
+            [name or f"--{parameter.name.replace('_', '-')}", parameter.name], help=text, **said
         )
 
     return make
@@ -67,7 +67,7 @@ def argument(**settings: Any) -> Any:
     return lambda parameter: click.Argument([parameter.name], **settings)
 
 
-def picture_option(told: str, more: Sequence[str] = ()) -> Any:
+def picture_option(text: str, more: Sequence[str] = ()) -> Any:
     """Return an option that names a picture to write, or a file with a suffix of `more`."""
 
     def check(_: click.Context, asked: click.Parameter, path: Path | None) -> Path | None:
@@ -77,19 +77,19 @@ def picture_option(told: str, more: Sequence[str] = ()) -> Any:
             check_picture(path, asked.opts[0], more)
         return path
 
-    return option(told, callback=check)
+    return option(text, callback=check)
 
 
 def result_option() -> Any:
     """Return the option `--out` of a result that can be drawn, tabulated, or written as JSON."""
-    told = "Write a picture (.png .svg .pdf), a table (.csv .parquet) or .json."
-    return picture_option(told, (".csv", ".parquet", ".json"))
+    text = "Write a picture (.png .svg .pdf), a table (.csv .parquet) or .json."
+    return picture_option(text, (".csv", ".parquet", ".json"))
 
 
 def seed_option(packets: str) -> Any:
     """Return the option `--seed` of what happens by chance to `packets`, such as "that get lost"."""
-    told = f"Of packets {packets}; the experiment's if not given."
-    return option(told, "NUMBER", type=WholeNumber(0, 2**63 - 1))
+    text = f"Of packets {packets}; the experiment's if not given."
+    return option(text, "NUMBER", type=WholeNumber(0, 2**63 - 1))
 
 
 # What parameters without a default are, by their names.

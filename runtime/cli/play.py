@@ -145,9 +145,9 @@ def _addresses(listen: str | None, to: tuple[str, ...], *, has_secret: bool):  #
             what = f"{name} is given twice"
             raise ApcError(Mistake("E971", Place("--to"), what, hint=f'--to "{name}={address}"'))
         others[name] = address_of(address, "--to", name)
-    own = address_of(listen, "--listen") if listen else (LOOPBACK, 0)
-    socket = listen_at(own)
-    if not is_loopback(own) and not has_secret:
+    pair = address_of(listen, "--listen") if listen else (LOOPBACK, 0)
+    socket = listen_at(pair)
+    if not is_loopback(pair) and not has_secret:
         note_aside(
             "packets carry no secret: whoever can send from a peer's address can play it; --secret-file"
         )

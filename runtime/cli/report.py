@@ -94,13 +94,13 @@ def _check(path: Path) -> None:
     tell(f"{path}: every number is the same, computed anew")
 
 
-def _differs(kept: KeptScene, again: Report) -> Iterator[str]:
+def _differs(kept_scene: KeptScene, again: Report) -> Iterator[str]:
     """Yield what differs between the sections of a scene that a report keeps and those made anew."""
     from apc.present.report import TITLES
     from apc.reports.contents import differences
 
     [now] = again.to_dict()["scenes"]
-    before = {item["key"]: item for item in kept["sections"]}
+    before = {item["key"]: item for item in kept_scene["sections"]}
     for section in now["sections"]:
         title, old = TITLES[section["key"]], before.get(section["key"])
         if old is None:

@@ -163,16 +163,16 @@ def closed_frame(
     matrix = np.zeros(start.shape, dtype=object)
     courses = {
         g: follow(
-            *(site, group.schedule, own, start[offset : offset + len(group.z_names)], hearing(g)),
+            *(site, group.schedule, step, start[offset : offset + len(group.z_names)], hearing(g)),
             numbers=BALLS,
             watch=watch and functools.partial(watch, g),
         )
-        for g, (group, site, own, offset) in enumerate(
+        for g, (group, site, step, offset) in enumerate(
             zip(system.sites, sites, steps, layout.offsets, strict=True)
         )
     }
     while courses:
-        known = len(courses), len(sent)
+        pair = len(courses), len(sent)
         for g, course in tuple(courses.items()):
             try:
                 # On until it has to wait, so that everybody is sooner or later heard.
@@ -182,7 +182,7 @@ def closed_frame(
                 moved = end_of_frame.value
                 matrix[layout.offsets[g] : layout.offsets[g] + len(moved)] = moved
                 del courses[g]
-        assert (len(courses), len(sent)) != known, "a packet is heard before it is sent"
+        assert (len(courses), len(sent)) != pair, "a packet is heard before it is sent"
     for packet, place in place_of.items():
         older = Packet(packet.site, packet.row, packet.lag - 1)
         matrix[place] = sent[packet.site, packet.row] if packet.lag == 1 else start[place_of[older]]

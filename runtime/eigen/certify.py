@@ -179,9 +179,9 @@ def root_discs(polynomial: Any) -> Discs:
                 abs(exact(point) / math.prod((point - other for other in rest), start=flint.acb(1))) * n
                 for point, rest in zip(points, others, strict=True)
             ]
-    known = [*zip(points, radii, strict=True), *[(flint.acb(0), flint.arb(0))] * gone]
-    centres = np.array([complex(point) for point, _ in known], dtype=np.complex128)
-    within = [(radius, radius - (abs(point) - 1), radius + (abs(point) - 1)) for point, radius in known]
+    pairs = [*zip(points, radii, strict=True), *[(flint.acb(0), flint.arb(0))] * gone]
+    centres = np.array([complex(point) for point, _ in pairs], dtype=np.complex128)
+    within = [(radius, radius - (abs(point) - 1), radius + (abs(point) - 1)) for point, radius in pairs]
     widths, less, most = np.array([*map(_above, itertools.chain(*within))]).reshape(-1, 3).T
     return Discs(centres, widths + 2 * UNIT * np.abs(centres), -less, most)
 

@@ -112,9 +112,9 @@ def lay_out(z_names: Sequence[Sequence[str]], schedules: Sequence[Schedule]) -> 
     offsets: list[int] = []
     names: list[str] = []
     places: dict[Packet, int] = {}
-    for site, (own, schedule) in enumerate(zip(z_names, schedules, strict=True)):
+    for site, (z_name, schedule) in enumerate(zip(z_names, schedules, strict=True)):
         offsets.append(len(names))
-        names += own
+        names += z_name
         for row, depth in enumerate(schedule.depths):
             for lag in range(1, depth + 1):
                 quanta = schedule.sent_times[row] - lag * schedule.frame
@@ -133,7 +133,7 @@ def lay_out_loop(loop: Loop | ClosedSystem) -> StateLayout:
     sizes = np.diff([*layout.offsets, len(layout.names)])
     owners = (group.name for group, size in zip(groups, sizes, strict=True) for _ in range(size))
     return replace(
-        layout, names=tuple(f"{own}.{name}" for own, name in zip(owners, layout.names, strict=True))
+        layout, names=tuple(f"{owner}.{name}" for owner, name in zip(owners, layout.names, strict=True))
     )
 
 
@@ -300,16 +300,16 @@ def close(
         for frame_map, offset in zip(maps, layout.offsets, strict=True)
     ]
     sent = np.zeros((*many, starts[-1], columns), dtype=number)
-    for frame_map, heard, own, place in zip(maps, feedback, rows, z, strict=True):
+    for frame_map, heard, row, place in zip(maps, feedback, rows, z, strict=True):
         if numbers.vanishes(frame_map.d):
-            sent[..., own, place] = frame_map.s
+            sent[..., row, place] = frame_map.s
         else:
-            _put(sent[..., own, :], place, frame_map.s, frame_map.d, heard.before, numbers)
+            _put(sent[..., row, :], place, frame_map.s, frame_map.d, heard.before, numbers)
     at_once = any(heard.now.any() for heard in feedback)
     if at_once:
         within = np.zeros((*many, starts[-1], starts[-1]), dtype=number)
-        for frame_map, heard, own in zip(maps, feedback, rows, strict=True):
-            within[..., own, :] = numbers.multiply(frame_map.d, heard.now)
+        for frame_map, heard, row in zip(maps, feedback, rows, strict=True):
+            within[..., row, :] = numbers.multiply(frame_map.d, heard.now)
         sent = _sent_in_turn(within, sent, numbers)
     matrix = np.zeros((*many, n, columns), dtype=number)
     received = []
@@ -365,10 +365,12 @@ def close_outside(
     return close(maps, feedback, layout, numbers=numbers)
 
 
-def _put(rows: Matrix, z: slice, own: Matrix, of_heard: Matrix, heard: Matrix, numbers: Arithmetic) -> None:
+def _put(
+    rows: Matrix, z: slice, matrix: Matrix, of_heard: Matrix, heard: Matrix, numbers: Arithmetic
+) -> None:
     """Write what a site makes of its own z, and of what it hears, into its rows over the state."""
     rows[...] = numbers.multiply(of_heard, heard)
-    rows[..., z] = own if numbers.vanishes(heard[..., z]) else numbers.add(rows[..., z], own)
+    rows[..., z] = matrix if numbers.vanishes(heard[..., z]) else numbers.add(rows[..., z], matrix)
 
 
 def _sent_in_turn(within: Matrix, alone: Matrix, numbers: Arithmetic) -> Matrix:

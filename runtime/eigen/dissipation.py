@@ -239,8 +239,8 @@ def _dissipates(a: Matrix, b: Matrix, supply: Matrix, spared: Sequence[float]) -
     # What nothing comes of needs some storage, too, for that of all to be positive.
     sizes = np.diag(first)
     sizes = np.maximum(sizes, UNSEEN * sizes.max(initial=0.0) or 1.0)
-    generator = (_storage(*plain, part * sizes) for part in spared)
-    return any(_serves(a, b, supply, (p + p.T) / 2) for p in generator if p is not None)
+    storages = (_storage(*plain, part * sizes) for part in spared)
+    return any(_serves(a, b, supply, (p + p.T) / 2) for p in storages if p is not None)
 
 
 def _storage(a: Floats, b: Floats, supply: Floats, more: Floats) -> Floats | None:

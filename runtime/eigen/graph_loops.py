@@ -29,10 +29,10 @@ def common_graph(ways: Sequence[Way], exchange: Exchange) -> str:
     """Return "" if the links' W are one graph, or else why they have not the same eigenvectors."""
     links = list(dict.fromkeys(way.link for way in ways))
     shapes = {exchange.links[link].graph.shape for link in links}
-    listed = [exchange.links[link].graph for link in links]
+    graphs = [exchange.links[link].graph for link in links]
     if len(shapes) > 1 or any(
-        not np.array_equal(graph.arcs, listed[0].arcs) or not np.array_equal(graph.weights, listed[0].weights)
-        for graph in listed
+        not np.array_equal(graph.arcs, graphs[0].arcs) or not np.array_equal(graph.weights, graphs[0].weights)
+        for graph in graphs
     ):
         return f"the graphs of {' and '.join(links)} are not the same"
     if len({way.operator == "mean" for way in ways}) > 1 and _degree(links[0], exchange) is None:

@@ -530,7 +530,7 @@ def _by_start(
 
     # Peers apart in the graph are one group if they turned out alike, and weigh all others alike.
     merged: dict[tuple[Any, ...], int] = {}
-    alike = all(len(listed) == 1 for _, gains in listened for listed in gains.values())
+    alike = all(len(gain) == 1 for _, gains in listened for gain in gains.values())
     joined: dict[int, list[tuple[int, Peers]]] = {}
     for g, (listening, gains) in enumerate(listened):
         own = parts[g][0][0]

@@ -247,10 +247,10 @@ def _standing(system: ClosedSystem | Loop, sites: Sequence[LinearSite]) -> tuple
             size += len(partition.outputs)
     places = []  # of x and u, site by site
     sent: list[dict[tuple[str, str], Matrix]] = []
-    for site, start, own in zip(sites, starts, outputs, strict=True):
+    for site, start, output in zip(sites, starts, outputs, strict=True):
         clock = {partition.clock: place for place, partition in enumerate(site.kind.clocks)}
         x = [*range(start, start + len(site.kind.states))]
-        u = [own[clock[hold.clock]][hold.output] for hold in site.kind.holds]
+        u = [output[clock[hold.clock]][hold.output] for hold in site.kind.holds]
         places.append((x, u))
         sent.append({})
         for send, sending in zip(site.sends, site.kind.sends, strict=True):
@@ -260,10 +260,10 @@ def _standing(system: ClosedSystem | Loop, sites: Sequence[LinearSite]) -> tuple
             }
     equations, states = [np.zeros((0, size), dtype=object)], [np.zeros((0, size), dtype=object)]
     unit = np.eye(size, dtype=np.int64).astype(object)
-    for g, (group, site, own, (x, u)) in enumerate(zip(system.sites, sites, outputs, places, strict=True)):
+    for g, (group, site, output, (x, u)) in enumerate(zip(system.sites, sites, outputs, places, strict=True)):
         equations.append(_placed(size, len(x), (x, site.a), (u, site.b)))
         for p, (tick, partition) in enumerate(zip(site.ticks, site.kind.clocks, strict=True)):
-            y = own[p]
+            y = output[p]
             blocks = ((x, tick.x), (u, tick.u), ([y[o] for o in partition.memories], tick.m))
             rows = _placed(size, len(tick.x), *blocks)
             for place in range(len(partition.receives)):
@@ -276,7 +276,7 @@ def _standing(system: ClosedSystem | Loop, sites: Sequence[LinearSite]) -> tuple
             for row in range(len(rows)):  # of all variants
                 rows[row, y[row % len(y)]] -= 1
             equations.append(rows)
-        carried = [own[value.partition][value.output] for value in group.schedule.carried]
+        carried = [output[value.partition][value.output] for value in group.schedule.carried]
         states.append(unit[[*x, *carried]])
         for packet in system.packets:
             if packet.site == g:

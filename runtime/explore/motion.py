@@ -78,7 +78,7 @@ def motion_of(system: CompiledSystem, *, struck: bool) -> Motion:
     if not names:
         raise ApcError(Mistake("E983", Place(system.name), "nothing here has a position that could be shown"))
     duration = system.experiment.duration or WATCHED
-    played = simulate(system, duration=duration, signals=[text for own in names for text in own])
+    played = simulate(system, duration=duration, signals=[text for name in names for text in name])
     values, time = played.values, played.time
     places = [number for number, signal in enumerate(played.signals) if signal.unit == "m"]
     apart = np.abs(values - values[0])[:, places].max(axis=1) > FAR
@@ -86,15 +86,15 @@ def motion_of(system: CompiledSystem, *, struck: bool) -> Motion:
         last = max(int(np.argmax(apart)), 2)
         values, time = values[:last], time[:last]
         told.append(f"Shown until something is {FAR:g} m from where it began.")
-    some = np.unique(np.linspace(0, len(time) - 1, min(ROWS, len(time))).astype(int))
+    texts = np.unique(np.linspace(0, len(time) - 1, min(ROWS, len(time))).astype(int))
     columns = {signal.name: place for place, signal in enumerate(played.signals)}
-    tracks = [values[some][:, [columns[text] for text in own]] for own in names]
+    tracks = [values[texts][:, [columns[text] for text in name]] for name in names]
     x, y = (np.stack([track[:, place] for track in tracks], axis=1) for place in (0, 1))
     angle = np.stack([heading(track[:, 2:]) for track in tracks], axis=1)
     fixed = [(row, surface) for row, view in enumerate(views) for surface in view.surfaces]
     told.append(f"It {played.summary.verdict}.")
     return Motion(
-        time=time[some],
+        time=time[texts],
         bodies=shown,
         x=MM * x,
         y=MM * y if planar else None,

@@ -151,11 +151,11 @@ def _roots(system: CompiledSystem, prepared: Prepared, asked: tuple[Free, tuple[
     """Return the eigenvalues at values of a slider."""
     free, values = asked
     slow = reaches_time(system, free) or reaches_count(system, free)
-    some = _thinned(values, FEW_ROOTS if slow else ROOTS)
+    numbers = _thinned(values, FEW_ROOTS if slow else ROOTS)
     with finite_equations(system.name):
-        places, rows = eigenvalues_at(system, free, some, prepared=prepared)
+        places, rows = eigenvalues_at(system, free, numbers, prepared=prepared)
     result = np.concatenate([EMPTY, *rows])
-    texts = [text_of(number, unit_of(system, free.name)) for number in some]
+    texts = [text_of(number, unit_of(system, free.name)) for number in numbers]
     return {
         "real": result.real,
         "imag": result.imag,

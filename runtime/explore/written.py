@@ -84,8 +84,8 @@ def _at(node: yaml.Node | None, path: Sequence[str]) -> yaml.Node | None:
 def _put(text: str, path: Sequence[str], value: str) -> str:
     """Return a text with a value at the end of a path; what is missing of the path is added."""
     root = yaml.compose(text, yaml.SafeLoader)
-    known = next(n for n in range(len(path), -1, -1) if _at(root, path[:n]) is not None)
-    node, missing = _at(root, path[:known]), path[known:]
+    index = next(n for n in range(len(path), -1, -1) if _at(root, path[:n]) is not None)
+    node, missing = _at(root, path[:index]), path[index:]
     assert node is not None
     for key in reversed(missing[1:]):
         value = f"{{{_key(key)}: {value}}}"

@@ -72,9 +72,9 @@ def header(peer: Peer) -> str:
         ],
         holds=kind.holds,
         computed=[
-            f"{own} [{unit}]"
+            f"{output} [{unit}]"
             for clock in kind.clocks
-            for own, unit in zip(clock.outputs, clock.units, strict=True)
+            for output, unit in zip(clock.outputs, clock.units, strict=True)
         ],
         settings=[f"{own} [{unit}]" for own, unit in named],
         kept=_kept(peer),
@@ -188,13 +188,13 @@ def _received(peer: Peer, p: int, place: int) -> dict[str, Any]:
     packet, lines = f"in->{line.name}[k]", list[str]()
     value = f"{packet}.{names[0]}"
     if edge:
-        function, own = pair_function(peer.kind, p, place)
+        function, numbers = pair_function(peer.kind, p, place)
         missing = f"{packet}.missing" if line.missing else "0.0"
         heard = [
             f"({missing} ? 0.0 : {packet}.{name})" if line.missing else f"{packet}.{name}" for name in names
         ]
         every = [*_moving(peer), *_memories(peer, p), *_parameters(peer)]
-        lines, (value,) = _computed(function, [*(every[i] for i in own), *heard, missing, "t"])
+        lines, (value,) = _computed(function, [*(every[i] for i in numbers), *heard, missing, "t"])
     elif line.missing:
         value = f"({packet}.missing ? own_{line.name}.{names[0]} : {value})"
     weights = np.array([sender.weight for sender in line.senders])

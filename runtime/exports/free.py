@@ -110,7 +110,7 @@ def _by_groups(group: PeerGroup, starts: Any) -> list[PeerGroup]:
     peers = np.array(list(group.peers), np.int64)
     of = np.searchsorted(starts, peers, side="right")
     return [
-        replace(group, peers=own, count=len(own)) for item in np.unique(of) for own in [peers[of == item]]
+        replace(group, peers=peer, count=len(peer)) for item in np.unique(of) for peer in [peers[of == item]]
     ]
 
 

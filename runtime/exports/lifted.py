@@ -292,16 +292,18 @@ def _remembering(group: PeerGroup) -> Schedule:
     """Return a peer's frame with all that its clocks computed last among what it remembers."""
     schedule, kind = group.schedule, group.jacobians.kind
     at = _instants(schedule)
-    kept = [Value(p, o, -1) for p in ticking_partitions(schedule) for o in range(len(kind.clocks[p].outputs))]
-    kept = [value for value in kept if value not in schedule.carried]
+    values = [
+        Value(p, o, -1) for p in ticking_partitions(schedule) for o in range(len(kind.clocks[p].outputs))
+    ]
+    values = [value for value in values if value not in schedule.carried]
     names = [
         f"{kind.clocks[value.partition].outputs[value.output]}"
         f"({float((at[value.partition][-1] - schedule.frame) * schedule.quantum * 1000):.6g} ms)"
-        for value in kept
+        for value in values
     ]
     return replace(
         schedule,
-        carried=(*schedule.carried, *kept),
+        carried=(*schedule.carried, *values),
         value_names=(*schedule.value_names, *names),
         repeats=None,
     )
@@ -350,8 +352,8 @@ def _with_inputs(
     `inverses` are what each force does to each of its velocities, `noises` the states with noisy samples.
     """
     columns = np.zeros((len(site.a), len(forces) + len(noises)), dtype=site.b.dtype)
-    for place, (push, listed) in enumerate(zip(forces, inverses, strict=True)):
-        columns[list(push.velocities), place] = listed
+    for place, (push, inverse) in enumerate(zip(forces, inverses, strict=True)):
+        columns[list(push.velocities), place] = inverse
     wide = with_holds(site, columns)
     sampled = [*((tick.u, tick.x) for tick in wide.ticks), *((send.u, send.x) for send in wide.sends)]
     for u, x in sampled if noises else ():

@@ -360,8 +360,7 @@ class _Peer:
         """Return states, holds and time as a clock samples them, those that are needed."""
         sampled = self.writer.sampled
         return [
-            [functools.partial(sampled, text, clock) for text in listed]
-            for listed in (self.x, self.u, [TIME])
+            [functools.partial(sampled, text, clock) for text in texts] for texts in (self.x, self.u, [TIME])
         ]
 
     def sends(self) -> None:

@@ -503,15 +503,15 @@ def lines_of(plan: Plan, number: int) -> tuple[tuple[Line, ...], dict[tuple[int,
         hears = {channel for channels in of.values() for channel in channels}
         if not hears and not sent:
             continue
-        place, known = next(
+        place, send_partition = next(
             (place, send)
             for each in (kind, *system.kinds)
             for place, send in enumerate(each.sends)
             if send.link == link
         )
-        used = [i for i, channel in enumerate(known.channels) if i in hears or channel in sent]
+        used = [i for i, channel in enumerate(send_partition.channels) if i in hears or channel in sent]
         places |= {key: tuple(map(used.index, channels)) for key, channels in of.items()}
-        channels = tuple(known.channels[i] for i in used)
+        channels = tuple(send_partition.channels[i] for i in used)
         members = unique(map(identifier, channels))
         senders = [*heard_of(plan.system, plan.exchange, link, number)] if hears else []
         if len(senders) > MOST_HEARD:
@@ -523,7 +523,7 @@ def lines_of(plan: Plan, number: int) -> tuple[tuple[Line, ...], dict[tuple[int,
             Line(
                 link=link,
                 name=name,
-                packet=tuple(map(Entry, channels, [known.units[i] for i in used], members)),
+                packet=tuple(map(Entry, channels, [send_partition.units[i] for i in used], members)),
                 sending=place if sent else -1,
                 senders=tuple(
                     Sender(

@@ -78,9 +78,9 @@ def quotable(text: str) -> str:
     return text.replace("\\", "/").replace('"', "'")
 
 
-def _members(listed: str) -> str:
+def _members(text: str) -> str:
     """Return the members of a structure of C, given as lines `declaration | what it is`."""
-    rows = [line.split(" | ", 1) for line in listed.strip("\n").split("\n") if line]
+    rows = [line.split(" | ", 1) for line in text.strip("\n").split("\n") if line]
     rows = rows or [["char none", "nothing"]]
     width = max(len(declared) for declared, _ in rows) + 1
     return "".join(f"  {declared + ';':<{width}} /* {comment(what)} */\n" for declared, what in rows)

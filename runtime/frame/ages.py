@@ -180,7 +180,7 @@ def _with_ages(partition: ClockPartition, ages: Sequence[_Ages]) -> ClockPartiti
                 receives.append(_at_age(receive, age))
             own.append((0, ((places[key], float(age) if receive.age == "factor" else 1),)))
     r = type(x).sym("r", len(receives))
-    values = [partition.tick(x, u, m, _column(own, r), p, t) for own in rows]
+    values = [partition.tick(x, u, m, _column(row, r), p, t) for row in rows]
     number = {pairs: place for place, pairs in enumerate(different)}
     return replace(
         partition,
@@ -286,16 +286,16 @@ def _by_stamps(partition: ClockPartition, channels: Mapping[str, tuple[str, ...]
         plain = replace(receive, age="")
         if receive.age == "factor":
             stamped_too = replace(plain, channel=places.index(_stamp(places[receive.channel])))
-            own: _Row = (0, ((len(receives), t), (len(receives) + 1, -1)))
+            pair: _Row = (0, ((len(receives), t), (len(receives) + 1, -1)))
             receives += [plain, replace(stamped_too, name=f"{STAMP} of {receive.name}")]
         elif receive.age == "alone":
-            own = (t, ((len(receives), -1),))
+            pair = (t, ((len(receives), -1),))
             receives.append(replace(plain, channel=places.index(STAMP)))
         else:
-            own = (0, ((len(receives), 1),))
+            pair = (0, ((len(receives), 1),))
             edge = _looking(receive.edge, places.index(STAMP)) if receive.age else receive.edge
             receives.append(replace(plain, edge=edge))
-        rows.append(own)
+        rows.append(pair)
     r = type(x).sym("r", len(receives))
     tick = _function(partition.tick, [x, u, m, r, p, t], partition.tick(x, u, m, _column(rows, r), p, t))
     return replace(partition, receives=tuple(receives), tick=tick)

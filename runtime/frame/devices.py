@@ -136,7 +136,7 @@ def find_devices(
     """
     kind = site.kind
     owners = {_part(state.name) for state in kind.states}
-    gripped = {own for own in owners if _grips(kind, own)}
+    gripped = {owner for owner in owners if _grips(kind, owner)}
     if not _is_plain(site):
         return {}
     told_of = _told_of(site)
@@ -194,7 +194,7 @@ def coupled_directly(kinds: tuple[Kind, ...]) -> bool:
     parts = [{_part(state.name) for state in kind.states} for kind in kinds]
     gripped = [{part for part in own if _grips(kind, part)} for kind, own in zip(kinds, parts, strict=True)]
     anywhere = set().union(*gripped)
-    return not all(gripped) and all(own & anywhere for own in parts if anywhere)
+    return not all(gripped) and all(part & anywhere for part in parts if anywhere)
 
 
 def _grips(kind: Kind, part: str) -> bool:
@@ -382,9 +382,9 @@ def directions_of(system: CompiledSystem) -> dict[str, CompiledSystem]:
         site = jacobians(system.kinds[group.kind])
         result = find_devices(site, numbers.parameters[place][0], unit_of, direct=direct)
         axes = {own: device for own, device in result.items() if isinstance(device, Device)}
-        wholes = {whole_and_index(own)[0] if own.endswith("]") else "" for own in axes}
+        wholes = {whole_and_index(axis)[0] if axis.endswith("]") else "" for axis in axes}
         if len(axes) == len(result) > 1 and len(wholes) == 1 and "" not in wholes:
-            wanted |= dict.fromkeys(own.rpartition(".")[2] for own in axes)
+            wanted |= dict.fromkeys(axis.rpartition(".")[2] for axis in axes)
     return {axis: _along(system, [text for text in wanted if text != axis]) for axis in wanted}
 
 
@@ -657,11 +657,11 @@ def published(name: str) -> dict[str, tuple[str, str, str]]:
     # The library reads YAML, which no analysis of a compiled model does otherwise.
     from apc.compiler.components.library import Library
 
-    known = Library()
+    library = Library()
     result = {
         component_name: ranges
-        for component_name in known.component_names
-        if (ranges := _ranges(known.component(component_name)))
+        for component_name in library.component_names
+        if (ranges := _ranges(library.component(component_name)))
     }
     if name not in result:
         listed = (*HANDS, *result)

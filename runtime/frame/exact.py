@@ -146,20 +146,20 @@ def evaluate_exact(
     OverflowError
         A rational number takes more than BITS bits.
     """
-    known = _operations(function)
+    plain_function = _operations(function)
     own = _rules_of(number, rounded)
     if rules:
         own = {**own, **rules}
-    if "const" not in own and any(map(math.isnan, known.constants)):
+    if "const" not in own and any(map(math.isnan, plain_function.constants)):
         raise ValueError("math domain error")  # of constants alone, which CasADi evaluates at once
     entries = [
         entry
-        for (_, size), argument in zip(known.inputs, arguments, strict=True)
+        for (_, size), argument in zip(plain_function.inputs, arguments, strict=True)
         for entry in _of_size(argument, size)
     ]
-    constants = map(own.get("const", number), known.constants)
-    result = walk(known, [*entries, *constants], own.__getitem__)
-    return [[result[place] for place in places] for places in known.results]
+    constants = map(own.get("const", number), plain_function.constants)
+    result = walk(plain_function, [*entries, *constants], own.__getitem__)
+    return [[result[place] for place in places] for places in plain_function.results]
 
 
 def _of_size(argument: Sequence[Any], size: int) -> Sequence[Any]:
@@ -171,10 +171,10 @@ def is_rational(function: Any) -> bool:
     """Say whether a function's value over `Fraction` is exact: no step of it is rounded to a double."""
     if not function.is_a("SXFunction"):
         return False
-    known = _operations(function)
-    first = sum(size for _, size in known.inputs)
-    constants = dict(enumerate(known.constants, first))
-    for word, *places in known.operations:
+    plain_function = _operations(function)
+    first = sum(size for _, size in plain_function.inputs)
+    constants = dict(enumerate(plain_function.constants, first))
+    for word, *places in plain_function.operations:
         if word in ("pow", "constpow"):
             exponent = constants.get(places[1], 0.5)
             if exponent != int(exponent):

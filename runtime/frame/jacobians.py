@@ -274,17 +274,17 @@ def _listening(
     """Return, for each receive of a partition, the pattern of its own part and the channels it depends on."""
     partition = kind.clocks[p]
     inside = len(kind.states) + len(kind.holds) + len(partition.memories)
-    own: list[Matrix | None] = []
+    matrices: list[Matrix | None] = []
     channels: list[tuple[int, ...]] = []
     for place, receive in enumerate(partition.receives):
         if (p, place) not in edges:
-            own.append(None)
+            matrices.append(None)
             channels.append((receive.channel,))
             continue
         function = edges[p, place].function
         symbols = function.sx_in()
         moving = casadi.vertcat(*symbols[:4])
         depends = structural_pattern(jacobian(function(*symbols)[0], moving))[0]
-        own.append(depends[:inside])
+        matrices.append(depends[:inside])
         channels.append(tuple(np.flatnonzero(depends[inside:]).tolist()))
-    return own, tuple(channels)
+    return matrices, tuple(channels)

@@ -403,11 +403,11 @@ class _Playing:
                     for channel, row in rows:
                         yield row, everything[..., channel, :]
                 case Tick(partition, index, rows_heard):
-                    own = self.kind.clocks[partition]
-                    memories = own.memories
+                    clock = self.kind.clocks[partition]
+                    memories = clock.memories
                     before = [value.get(Value(partition, o, index - 1), at.nothing) for o in memories]
                     received = yield from _received(rows_heard, hear, at.nothing)
-                    slopes = self.ticks[partition][..., event.rows(len(own.outputs)), :]
+                    slopes = self.ticks[partition][..., event.rows(len(clock.outputs)), :]
                     computed = self.multiply(slopes, _over(moving, [*before, *received]))
                     for output in range(computed.shape[-2]):
                         value[Value(partition, output, index)] = computed[..., output, :]

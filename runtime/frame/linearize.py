@@ -256,8 +256,8 @@ def check_start(
     values = [("der({})", [state.name for state in kind.states], kind.derivative(x, u, p, t))]
     memories, heard = iter(m), iter(r)
     for clock in kind.clocks:
-        own = [next(memories) for _ in clock.memories], [next(heard) for _ in clock.receives]
-        column = clock.tick(x, u, *own, p, t)
+        pair = [next(memories) for _ in clock.memories], [next(heard) for _ in clock.receives]
+        column = clock.tick(x, u, *pair, p, t)
         values.append(("{}", list(clock.outputs) * (column.numel() // len(clock.outputs)), column))
     values += [("{}", list(send.channels), send.send(x, u, p, t)) for send in kind.sends]
     for form, rows, column in values:
@@ -284,12 +284,12 @@ def _check_finite(rows: Sequence[str], values: NDArray[np.float64], what: str, w
     """Refuse what is not finite, by name."""
     for row, value in zip(rows, values, strict=True):
         if not np.isfinite(value):
-            told = (
+            text = (
                 f"{what}{row} is {value:g} at the start values: a division by zero, a root or logarithm of "
             )
             hint = "start values at which every equation has a finite value and slope"
             raise ApcError(
-                Mistake("E808", Place(where), f"{told}a number below zero, or the like", hint=hint)
+                Mistake("E808", Place(where), f"{text}a number below zero, or the like", hint=hint)
             )
 
 

@@ -93,8 +93,8 @@ def with_cuts(
     carried, heard = list(schedule.carried), list(schedule.heard)
     rows: dict[int, list[int]] = {}
     for partition, output in cuts:
-        tick, own, count = ticks[partition], clocks[partition], schedule.ticks[partition]
-        outputs = len(own.outputs)
+        tick, clock, count = ticks[partition], clocks[partition], schedule.ticks[partition]
+        outputs = len(clock.outputs)
         # A tick may have several variants of its rows, one below the other; cuts before this one added some.
         variants = len(tick.x) // outputs
         into = np.zeros((len(tick.r), 1), dtype=tick.r.dtype)
@@ -108,7 +108,7 @@ def with_cuts(
         r[output :: outputs + 1, -1] = 1
         ticks[partition] = replace(tick, x=x, u=u, m=m, r=r)
         clocks[partition] = replace(
-            own, outputs=(*own.outputs, f"followed {outputs}"), units=(*own.units, "1")
+            clock, outputs=(*clock.outputs, f"followed {outputs}"), units=(*clock.units, "1")
         )
         rows.setdefault(partition, []).append(len(heard))
         carried += [Value(partition, outputs, index - count) for index in range(count)]
@@ -185,8 +185,8 @@ def with_ports(
     start = len(kind.states) + len(schedule.carried)
     names = [
         f"{word} at {at}"
-        for word, listed in (("in", drawn), ("before", before), ("out", read))
-        for at in range(len(listed))
+        for word, values in (("in", drawn), ("before", before), ("out", read))
+        for at in range(len(values))
     ]
     full = replace(
         schedule,

@@ -136,9 +136,9 @@ def _time(system: CompiledSystem, timing: Timing) -> Settable:
             about = f"first tick of {clock.name}, below its period"
     if any(timing.name == link.delay for link in system.links):
         about = "from a packet's sending to where it can be heard"
-    told = next((parameter.about for parameter in system.parameters if parameter.name == timing.name), about)
+    text = next((parameter.about for parameter in system.parameters if parameter.name == timing.name), about)
     is_period = timing.name in {clock.period for clock in system.clocks}
-    return Settable(timing.name, value, value, "s", 0.0, is_period, None, _text(timing), "", told)
+    return Settable(timing.name, value, value, "s", 0.0, is_period, None, _text(timing), "", text)
 
 
 def _text(item: Parameter | Timing) -> str:

@@ -85,9 +85,9 @@ def responses(system: CompiledSystem, prepared: Prepared, port: Port, other: Por
             result = find_device(group.jacobians, group.parameters, unit_of, group.listening, direct=direct)
             device = result if isinstance(result, Device) else None
         _check_kicks(system, group)
-        own, site = open_site(group, device)
-        opened.append(own)
-        sites[id(own.schedule)] = site
+        peer_group, site = open_site(group, device)
+        opened.append(peer_group)
+        sites[id(peer_group.schedule)] = site
     plain, wide = _arranged(system, groups, exchange), _arranged(system, opened, exchange)
     common = wide[0]
     if (states := sum(len(site.z_names) for site in common.sites)) > MOST_TOGETHER:
@@ -295,18 +295,18 @@ class Responses:
     @property
     def error(self) -> Weights:
         """How far the pushed peer's copy is from the mean of all others' of its name; nothing if none."""
-        own = self.copies[self.own]
+        copy = self.copies[self.own]
         others = {
             (place, copy[1]): self.members[place] - (place == self.own)
             for place, copy in enumerate(self.copies)
-            if own and copy and copy[0] == own[0]
+            if copy and copy and copy[0] == copy[0]
         }
         total = sum(others.values())
-        if own is None or not total:
+        if copy is None or not total:
             return {}, {}
         common = {place: (place[0] == self.own) - many / total for place, many in others.items()}
         return {place: weight for place, weight in common.items() if abs(weight) > UNIT}, {
-            (0, own[1]): 1 + 1 / total
+            (0, copy[1]): 1 + 1 / total
         }
 
 

@@ -88,7 +88,7 @@ def find_port(system: CompiledSystem, text: str, option: str) -> Port:
 
 
 def read_frequencies(
-    system: CompiledSystem, listed: str | None, low: str, high: str | None, points: int
+    system: CompiledSystem, text: str | None, low: str, high: str | None, points: int
 ) -> Floats:
     """Return the frequencies that options name, in Hz: those listed, or points between two at equal ratios.
 
@@ -96,7 +96,7 @@ def read_frequencies(
     ----------
     system
         The compiled scene.
-    listed
+    text
         Frequencies with units and commas between, or None.
     low, high, points
         From where to where, `HIGHEST` or half the fastest clock if not given, and how many.
@@ -106,8 +106,8 @@ def read_frequencies(
     ApcError
         E935 none above 0, the lowest above the highest, or nothing that ticks; those of `option_value`.
     """
-    if listed is not None:
-        texts = [part.strip() for part in listed.split(",") if part.strip()]
+    if text is not None:
+        texts = [part.strip() for part in text.split(",") if part.strip()]
         values = [float(option_value("--frequencies", text, what="frequency", unit="Hz")) for text in texts]
         return np.array(values)
     first = float(option_value("--from", low, what="frequency", unit="Hz"))

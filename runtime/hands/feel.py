@@ -194,11 +194,11 @@ def feel(
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         answers = responses(system, prepared, port, other)
         s = np.asarray(2j * np.pi * result, dtype=np.complex128)
-        own, *aliases, across, error = answers.steady(s, ALIASES)
-        values = 1 / own[0]
-        alias = np.max([np.abs(value) for value, _ in aliases], axis=0) / np.abs(own[0])
+        pair, *aliases, across, error = answers.steady(s, ALIASES)
+        values = 1 / pair[0]
+        alias = np.max([np.abs(value) for value, _ in aliases], axis=0) / np.abs(pair[0])
         bounds = [
-            1.01 * off / np.where(value == 0, np.inf, np.abs(value)) for value, off in (own, across, error)
+            1.01 * off / np.where(value == 0, np.inf, np.abs(value)) for value, off in (pair, across, error)
         ]
         steady = verdict.stable is not False
         slow = _slow(answers) if "low_frequency" in beside else None
@@ -250,8 +250,8 @@ def _viscosity(system: CompiledSystem, slow: Slow, port: Port, other: Port) -> V
     """Return what of the damping felt of slow motions comes of the network."""
 
     def damping_of(changed: CompiledSystem) -> tuple[float, float] | None:
-        own = _slow(responses(changed, prepare(changed), port, other))
-        return None if own is None else (own.damping, own.errors[1])
+        slow = _slow(responses(changed, prepare(changed), port, other))
+        return None if slow is None else (slow.damping, slow.errors[1])
 
     return network_viscosity(system, (slow.damping, slow.errors[1]), damping_of)
 

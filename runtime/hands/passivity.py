@@ -112,13 +112,13 @@ class PassiveHands(Result):
     @property
     def worst(self) -> PassiveMode | None:
         """The mode that needs most damping."""
-        known = [mode for mode in self.modes if mode.more is not None]
+        passive_modes = [mode for mode in self.modes if mode.more is not None]
         lost = [mode for mode in self.modes if mode.more is None]
         return (
             lost[0]
             if lost
-            else max(known, key=lambda passive_mode: passive_mode.more or 0.0)
-            if known
+            else max(passive_modes, key=lambda passive_mode: passive_mode.more or 0.0)
+            if passive_modes
             else None
         )
 
@@ -239,10 +239,10 @@ def _as_at_start(system: CompiledSystem, prepared: Prepared, *, linear: bool) ->
         return ()
     if not parts:
         return ()
-    told = (
+    text = (
         f"left out: {', '.join(parts)} as at the start, whether they touch then or not; hands may change that"
     )
-    return (told,)
+    return (text,)
 
 
 def passive_growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool = True) -> Growth:

@@ -114,8 +114,8 @@ def open_site(group: PeerGroup, device: Device | None) -> tuple[PeerGroup, Site]
     if device is not None:
         push[0, device.velocity] = float(device.inverse)
         push[1, device.velocity] = UNIT * abs(float(device.inverse))
-    own = group.with_site(site, exact, full, lifted)
-    return own, Site(
+    peer_group = group.with_site(site, exact, full, lifted)
+    return peer_group, Site(
         group=group,
         device=device,
         a=with_radius(group.site.a, charge * np.abs(group.site.a)),

@@ -52,7 +52,7 @@ class Member:
 
 
 def _weights(
-    population: Population, listed: Sequence[Population], exchange: Exchange
+    population: Population, populations: Sequence[Population], exchange: Exchange
 ) -> tuple[Floats, Floats]:
     """Return what each line of r weighs another's packet by on a complete graph, and how many others send.
 
@@ -64,7 +64,7 @@ def _weights(
     weights, senders = np.ones((2, len(population.schedule.heard)))
     for line, heard in enumerate(population.schedule.heard):
         link = heard.way.link
-        senders[line] = sum(other.counts.sum() for other in listed if other.sends(link))
+        senders[line] = sum(other.counts.sum() for other in populations if other.sends(link))
         senders[line] -= population.sends(link)
         if heard.way.operator == "mean":
             first, others = int(exchange.starts[population.group]), float(senders[line])
@@ -74,22 +74,22 @@ def _weights(
 
 
 def of_populations(
-    listed: Sequence[Population], exchange: Exchange
+    populations: Sequence[Population], exchange: Exchange
 ) -> tuple[Characteristic, tuple[Member, ...]]:
     """Return the characteristic function of different peers on complete graphs.
 
     Parameters
     ----------
-    listed
+    populations
         All peers.
     exchange
         The links, all of them complete.
     """
-    roles = [exchange.role(population.group) for population in listed]
+    roles = [exchange.role(population.group) for population in populations]
     sent_place: dict[tuple[int, Sent], int] = {}
     heard_place: dict[tuple[int, Heard], int] = {}
     group_of: dict[int, int] = {}
-    for role, population in zip(roles, listed, strict=True):
+    for role, population in zip(roles, populations, strict=True):
         group_of.setdefault(role, population.group)
         for sent in population.schedule.sent:
             sent_place.setdefault((role, sent), len(sent_place))
@@ -100,9 +100,9 @@ def of_populations(
         return exchange.delay(way.link, group_of[sender], group_of[receiver]) == way.delay
 
     members, sites = [], []
-    for role, population in zip(roles, listed, strict=True):
+    for role, population in zip(roles, populations, strict=True):
         schedule = population.schedule
-        weight, senders = _weights(population, listed, exchange)
+        weight, senders = _weights(population, populations, exchange)
         rows = np.array([sent_place[role, sent] for sent in schedule.sent], np.int64)
         lines = np.array([heard_place[role, heard] for heard in schedule.heard], np.int64)
         own = -weight * np.array([float(on_the_way(heard.way, role, role)) for heard in schedule.heard])
@@ -186,6 +186,6 @@ def _wires_of(
             for h, sender in enumerate(sites):
                 if heard.sent in sender.schedule.sent:
                     row = sent_starts[h] + sender.schedule.sent.index(heard.sent)
-                    known = bounded_weight(coupling[heard.way][g][h], doubts.get(heard.way, 0.0))
-                    weights[:, lags.index(heard.lag), heard_starts[g] + line, row] = known
+                    pair = bounded_weight(coupling[heard.way][g][h], doubts.get(heard.way, 0.0))
+                    weights[:, lags.index(heard.lag), heard_starts[g] + line, row] = pair
     return tuple(lags), *weights

@@ -70,20 +70,20 @@ def solve_loops(loops: Sequence[Loop]) -> Spectrum:
     return _spectrum([_solve_loop(loop) for loop in loops], [loop.multiplicity for loop in loops])
 
 
-def solve_populations(listed: Sequence[Population], exchange: Exchange, *, rigid: int) -> Spectrum:
+def solve_populations(populations: Sequence[Population], exchange: Exchange, *, rigid: int) -> Spectrum:
     """Compute the spectrum of different peers on complete graphs.
 
     Parameters
     ----------
-    listed
+    populations
         All peers.
     exchange
         The links, all of them complete.
     rigid
         How many common translations there are, from the equations (see `translation`).
     """
-    function, members = of_populations(listed, exchange)
-    peers = int(sum(len(population.parameters) for population in listed))
+    function, members = of_populations(populations, exchange)
+    peers = int(sum(len(population.parameters) for population in populations))
     zeros = find_zeros(
         function,
         _common_starts(members),
@@ -165,8 +165,8 @@ def _common_starts(members: Sequence[Member]) -> Complexes:
     result = [np.zeros(0, np.complex128)]
     for member in members:
         few = np.unique(np.linspace(0, len(member.sites.counts) - 1, SAMPLES).astype(np.int64))
-        some = member.sites.maps.mapped(lambda block, few=few: block[few])
-        alike = hear_themselves(some, member.schedule, member.alike, 0 * member.alike)
+        frame_map = member.sites.maps.mapped(lambda block, few=few: block[few])
+        alike = hear_themselves(frame_map, member.schedule, member.alike, 0 * member.alike)
         values = np.linalg.eigvals(value_of(alike.p)).astype(np.complex128).ravel()
         kept = (values.imag >= 0) & (np.abs(values) > LEAST_START) & (np.abs(values - 1) > SAME_START)
         result.append(values[kept])

@@ -117,14 +117,14 @@ def joined(parts: Sequence[FrameMap]) -> FrameMap:
     return parts[0].mapped(lambda *blocks: np.concatenate(blocks), *parts[1:])
 
 
-def hear_themselves(maps: FrameMap, schedule: Schedule, own: Floats, others: Floats) -> FrameMap:
+def hear_themselves(maps: FrameMap, schedule: Schedule, values: Floats, others: Floats) -> FrameMap:
     """Let every site hear its own packets, weighed, the rest of what it hears left open: with radii.
 
     Parameters
     ----------
     maps, schedule
         Of k sites, with their radii.
-    own
+    values
         What each line of r weighs the site's own packets by (n_r,).
     others
         What each line weighs what still comes from outside by (n_r,).
@@ -142,13 +142,13 @@ def hear_themselves(maps: FrameMap, schedule: Schedule, own: Floats, others: Flo
     for packet, place in layout.places.items():
         if packet.lag in picked:
             before[:, place] = picked[packet.lag][:, packet.row]
-    before = own[:, None] * before
+    before = values[:, None] * before
     before[:, n:] = np.diag(others)
-    heard = Feedback(rounded(own[:, None] * now), rounded(before))
+    heard = Feedback(rounded(values[:, None] * now), rounded(before))
     parts = []
     for start in range(0, len(maps.p), CHUNK):
-        some = maps.mapped(lambda block, start=start: block[start : start + CHUNK])
-        closed = close([some], [heard], layout, numbers=RADII)
+        frame_map = maps.mapped(lambda block, start=start: block[start : start + CHUNK])
+        closed = close([frame_map], [heard], layout, numbers=RADII)
         matrix, sent = closed.matrix, closed.sent
         parts.append(FrameMap(matrix[..., :n], matrix[..., n:], sent[..., :n], sent[..., n:]))
     return joined(parts)

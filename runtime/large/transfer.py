@@ -347,8 +347,8 @@ def add_fractions(
         4 * (8 + len(transfer.fractions) + max(fraction.poles.size for fraction in transfer.fractions)) * UNIT
     )
     for fraction in transfer.fractions:
-        for some in _pieces(fraction, len(points)):
-            inverse, radius = 1.0 / (points[some, None, None] - fraction.poles), reach[some, None, None]
+        for piece in _pieces(fraction, len(points)):
+            inverse, radius = 1.0 / (points[piece, None, None] - fraction.poles), reach[piece, None, None]
             values = np.zeros((len(inverse), 3, len(fraction.rows), len(fraction.lines)), np.complex128)
             values[:, 0] = _by_poles(inverse, fraction.residues, values)
             if bounded:
@@ -357,7 +357,7 @@ def add_fractions(
                     near = far / (1 - moved)  # 1/(|ζ − p| − ρ), negative where a pole is in the disc
                     near[near.min(axis=(1, 2), initial=0.0) < 0] = np.nan
                 values[:, 1] = _by_poles(near, fraction.errors, values) + _reaction(
-                    fraction, near, nearest[some]
+                    fraction, near, nearest[piece]
                 )
                 moved *= moved
                 moved += rounded
@@ -365,7 +365,7 @@ def add_fractions(
                 values[:, 1] += _by_poles(moved, fraction.sizes, values)
             inverse *= inverse
             values[:, 2] = -radius * _by_poles(inverse, fraction.residues, values)
-            total[some, :, fraction.rows[:, None], fraction.lines] += values
+            total[piece, :, fraction.rows[:, None], fraction.lines] += values
     total[~(nearest >= transfer.innermost), 1] = np.nan
 
 

@@ -36,7 +36,7 @@ from apc.large.populations import Population
 LARGEST = 2**61 - 1  # of what random numbers are made of: a prime
 
 
-def representatives(listed: Sequence[Population], exchange: Exchange) -> list[PeerGroup]:
+def representatives(populations: Sequence[Population], exchange: Exchange) -> list[PeerGroup]:
     """Return the first peer of each population, as many as there are peers in it."""
     return [
         group_of_row(
@@ -47,22 +47,22 @@ def representatives(listed: Sequence[Population], exchange: Exchange) -> list[Pe
             population.group,
             len(population.rows),
         )
-        for population in listed
+        for population in populations
     ]
 
 
-def count_translations(listed: Sequence[Population], exchange: Exchange) -> int | None:
+def count_translations(populations: Sequence[Population], exchange: Exchange) -> int | None:
     """Return how many independent motions nothing holds back on complete graphs; None if it can't be told.
 
     Parameters
     ----------
-    listed
+    populations
         All peers.
     exchange
         The links, all of them complete.
     """
-    groups = representatives(listed, exchange)
-    population_of = {id(group): population for group, population in zip(groups, listed, strict=True)}
+    groups = representatives(populations, exchange)
+    population_of = {id(group): population for group, population in zip(groups, populations, strict=True)}
     total = 0
     for loop in complete_loops(groups, exchange):
         free = len(find_rigid_modes(loop, with_drifts=False).names)
@@ -72,21 +72,21 @@ def count_translations(listed: Sequence[Population], exchange: Exchange) -> int 
     return total
 
 
-def hold_for_all(loop: Loop, listed: Sequence[Population]) -> bool:
+def hold_for_all(loop: Loop, populations: Sequence[Population]) -> bool:
     """Say whether the rigid modes of a loop of representatives are those of every peer of their populations.
 
     Parameters
     ----------
     loop
         Its sites are the representatives; all peers hear what they do.
-    listed
+    populations
         The population of each site.
     """
-    for place, population in enumerate(listed):
+    for place, population in enumerate(populations):
         sites: list[LinearSite | None] = [group.exact for group in loop.sites]
         sites[place] = _any_peer(population)
-        known = [site for site in sites if site is not None]
-        if len(known) < len(sites) or not stays_rigid(loop, known):
+        linear_sites = [site for site in sites if site is not None]
+        if len(linear_sites) < len(sites) or not stays_rigid(loop, linear_sites):
             return False
     return True
 

@@ -304,17 +304,15 @@ def _largest(
     return (abs(largest.value), largest.error) if largest else (0.0, 0.0)
 
 
-def _rigid_radius(function: Characteristic, rigid: int, radii: Sequence[float], known: float) -> float:
+def _rigid_radius(function: Characteristic, rigid: int, radii: Sequence[float], value: float) -> float:
     """Return the first of some circles about 1 in which all eigenvalues are the rigid ones.
 
     Without one, that which is known; 0 where nothing is rigid, and `WIDEST` where none is shown.
     """
     if not rigid:
         return 0.0
-    generator = (
-        radius for radius in radii if radius < 2 * WIDEST and _held_in(function, 1.0, radius) == rigid
-    )
-    return next(generator, known or WIDEST)
+    widths = (radius for radius in radii if radius < 2 * WIDEST and _held_in(function, 1.0, radius) == rigid)
+    return next(widths, value or WIDEST)
 
 
 def _held_poles(function: Characteristic) -> list[Zero]:
@@ -365,12 +363,12 @@ def _distinct(zeros: Complexes, rigid_radius: float) -> Complexes:
     zeros = np.where(np.abs(zeros.imag) <= SAME * np.abs(zeros), zeros.real, zeros)
     zeros = zeros[np.abs(zeros - 1) > rigid_radius] if rigid_radius else zeros
     zeros = zeros[np.argsort(-np.abs(zeros), kind="stable")]
-    kept: list[complex] = []
+    values: list[complex] = []
     for zero in zeros.tolist():
-        near = (value for value in reversed(kept[-16:]) if abs(value - zero) <= SAME * abs(zero))
+        near = (value for value in reversed(values[-16:]) if abs(value - zero) <= SAME * abs(zero))
         if next(near, None) is None:
-            kept.append(zero)
-    return np.array(kept, dtype=np.complex128)
+            values.append(zero)
+    return np.array(values, dtype=np.complex128)
 
 
 def _search(

@@ -139,9 +139,9 @@ def compare_run(run: Run) -> RunComparison:
         apart={} if why_not else _apart(run, simulation),
         why_not=why_not,
         measured=tuple(
-            _measured(system, link, listed)
-            for link, listed in zip(system.links, heard, strict=True)
-            if listed
+            _measured(system, link, way_runs)
+            for link, way_runs in zip(system.links, heard, strict=True)
+            if way_runs
         ),
     )
 

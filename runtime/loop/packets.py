@@ -104,12 +104,12 @@ class Post:
     they are asked again; `dropped` counts what was let go, by why.
     """
 
-    def __init__(self, own: int, scene: bytes, secret: bytes, addresses: Mapping[Address, int]) -> None:
+    def __init__(self, number: int, scene: bytes, secret: bytes, addresses: Mapping[Address, int]) -> None:
         """Take who is who.
 
         Parameters
         ----------
-        own
+        number
             The peer's number in the scene.
         scene
             The digest of the compiled scene, with its numbers.
@@ -118,7 +118,7 @@ class Post:
         addresses
             The other peers' numbers by their addresses.
         """
-        self.own, self.scene, self.secret = own, scene[:SCENE], secret
+        self.own, self.scene, self.secret = number, scene[:SCENE], secret
         self.addresses = dict(addresses)
         self.nonce = 1 + secrets.randbelow((1 << 64) - 1)
         self.nonces: dict[int, int] = {}
@@ -186,8 +186,8 @@ class Post:
                 self.past.add(before)
             self.nonces[said.sender] = said.nonce
             (low, number), (high, two) = sorted([(self.own, self.nonce), (said.sender, said.nonce)])
-            told = b"session" + OF_KEY.pack(low, number, high, two)
-            self.keys[said.sender] = hmac.digest(self.secret, told, "sha256")
+            text = b"session" + OF_KEY.pack(low, number, high, two)
+            self.keys[said.sender] = hmac.digest(self.secret, text, "sha256")
         return ""
 
     def _said(self, datagram: bytes) -> Data | Hello | Answer | None:

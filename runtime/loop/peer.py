@@ -233,8 +233,8 @@ class Loop:
         missing = sorted(set(self.others) - set(self.post.nonces)) or sorted(self.others)[:1]
         names = ", ".join(self.exchange.peer_name(number) for number in missing)
         dropped = self.post.dropped.items()
-        told = "; ".join(f"{counted(count, 'datagram')} dropped: {DROPPED[why]}" for why, count in dropped)
-        what = f"{names} did not say within {patience:g} s when the scene begins" + (told and f" ({told})")
+        text = "; ".join(f"{counted(count, 'datagram')} dropped: {DROPPED[why]}" for why, count in dropped)
+        what = f"{names} did not say within {patience:g} s when the scene begins" + (text and f" ({text})")
         hint = "the same FILE, --set and --secret-file at every peer, started within --wait of each other"
         return ApcError(Mistake("E972", Place(self.name), what, hint=hint))
 

@@ -109,7 +109,7 @@ def _peer(data: bytes, scene: _Scene) -> PeerRun:
     except ValueError:
         raise DamageError("what it tells is not what apc play writes") from None
     arrays: dict[str, Any] = {name: result[name] for name in ARRAYS}
-    arrays |= {name: tuple(map(result.__getitem__, listed)) for name, listed in of_routes.items()}
+    arrays |= {name: tuple(map(result.__getitem__, of_route)) for name, of_route in of_routes.items()}
     return PeerRun(**asdict(words), **arrays)
 
 
@@ -170,6 +170,6 @@ def _check_packets(peer: PeerRun, scene: _Scene) -> None:
         {*zip(links.tolist(), senders.tolist(), strict=True)} <= heard, "a packet came from where none comes"
     )
     for link, sender in heard:
-        own = counts[(links == link) & (senders == sender)]
-        span = int(own.max(initial=0)) - int(own.min(initial=LATEST))
+        count = counts[(links == link) & (senders == sender)]
+        span = int(count.max(initial=0)) - int(count.min(initial=LATEST))
         _want(span < MOST_PACKETS, f"a way has more than {MOST_PACKETS:,} packets")

@@ -229,10 +229,10 @@ def _tagged(of: Affine, order: int) -> _Tagged:
             for factor, pairs in once:
                 if len(pairs) <= order:
                     stands, peers = _named(pairs, of.peers)
-                    (own,) = _renamed((arc,), {peer: label for label, peer in enumerate(peers)})
+                    (pair,) = _renamed((arc,), {peer: label for label, peer in enumerate(peers)})
                     first.append((factor, s * count + c, len(origin)))
                     origin.append(
-                        (place[stands], number[own], permutations.setdefault(peers, len(permutations)))
+                        (place[stands], number[pair], permutations.setdefault(peers, len(permutations)))
                     )
             for d, other in enumerate(of.arcs):
                 for factor, pairs in times(once, other):
@@ -292,9 +292,9 @@ def _states(of: Affine, peers: Sequence[int]) -> Integers:
     """Return which state comes from where when peer i becomes `peers[i]`: new[states] = old."""
     places = np.zeros(len(of.mean), np.intp)
     number = {arc: place for place, arc in enumerate(of.arcs)}
-    own = of.offsets[1]
+    offset = of.offsets[1]
     for peer, to in enumerate(peers):
-        places[of.offsets[peer] : of.offsets[peer] + own] = of.offsets[to] + np.arange(own)
+        places[of.offsets[peer] : of.offsets[peer] + offset] = of.offsets[to] + np.arange(offset)
     for place, (g, h) in enumerate(of.arcs):
         places[list(of.held[place])] = list(of.held[number[peers[g], peers[h]]])
     return places

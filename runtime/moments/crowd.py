@@ -153,10 +153,10 @@ class Classes:
         return names.index(self.loops[place].sites[0].name) if place else None
 
 
-def classes_of(told: Hearing) -> Classes:
+def classes_of(hearing: Hearing) -> Classes:
     """Return the loops of a scene with their rigid motions."""
-    loops, weights = peer_classes(told)
-    return Classes(told, loops, weights, tuple(map(standing_motions, loops)))
+    loops, weights = peer_classes(hearing)
+    return Classes(hearing, loops, weights, tuple(map(standing_motions, loops)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -175,17 +175,17 @@ class _Luck:
     units: Floats
 
 
-def crowd(system: CompiledSystem, told: Hearing) -> Moments:
+def crowd(system: CompiledSystem, hearing: Hearing) -> Moments:
     """Make the mean loops of a scene and the luck that drives them.
 
     Parameters
     ----------
     system
         The compiled scene, with the numbers to analyse.
-    told
+    hearing
         Its peers.
     """
-    of = classes_of(told)
+    of = classes_of(hearing)
     return moments_of(of, remembered_of(system, of.told, of.loops[0]))
 
 
@@ -233,7 +233,7 @@ def _answers(
     classes: Sequence[int],
     share: float = 1.0,
     driving: _Luck | None = None,
-    own: Sequence[Matrix] = (),
+    matrices: Sequence[Matrix] = (),
     by: float = 0.0,
 ) -> Iterator[Answer]:
     """Give the covariances of luck that follow from a loop's moments.
@@ -248,7 +248,7 @@ def _answers(
         The classes of the loop's sites.
     share
         How many channels drive the loop.
-    driving, own, by
+    driving, matrices, by
         Of a loop driven by a channel: which kind, how far its packets are from what it hears by itself, slot
         by slot, and how much of it the loop takes part in.
     """
@@ -261,8 +261,8 @@ def _answers(
                 # by (m oᵀ + o mᵀ), and o oᵀ itself once, in the loop of all.
                 numbers = arithmetic_of(miss)
                 more = entrywise(miss, number_of(2 * by, numbers))
-                more = numbers.add(more, own[slot]) if by > 0 else more
-                left, right = np.stack([miss, more]), np.stack([miss, own[slot]])
+                more = numbers.add(more, matrices[slot]) if by > 0 else more
+                left, right = np.stack([miss, more]), np.stack([miss, matrices[slot]])
                 weights = np.array([share, 1.0])
             yield Answer(kind.places[slot], left, right, weights, kind.entries[slot], kind.spreads[slot])
 
@@ -292,7 +292,7 @@ def _luck(common: Loop, weights: Coupling, memories: Sequence[Remembered]) -> li
                     way: rows[h][g] for way, rows in weights.items() if (way.link, way.delay) == memory.route
                 }
                 if any(weighed.values()) and (g != h or site.count > 1):
-                    ends = np.cumsum([first, *(listed.shape[1] for listed in entries)]).tolist()
+                    ends = np.cumsum([first, *(entry.shape[1] for entry in entries)]).tolist()
                     places = tuple(map(slice, ends, ends[1:]))
                     listened = Listened(h, memory.route, weighed)
                     kinds.append(_Luck(g, listened, spreads, places, entries, np.array(units)))
@@ -306,13 +306,13 @@ def standing_motions(loop: Loop) -> Floats:
     return find_rigid_modes(without_packets(loop), with_drifts=False).basis[:states]
 
 
-def peer_classes(told: Hearing) -> tuple[tuple[Loop, ...], Coupling]:
+def peer_classes(hearing: Hearing) -> tuple[tuple[Loop, ...], Coupling]:
     """Return the loops of a scene, that of all classes first, and what a peer of one weighs one of another
     by.
 
     Peers of a class can change places: each hears all others alike, of its own class too, or none of them.
     """
-    groups, exchange = told.groups, told.exchange
+    groups, exchange = hearing.groups, hearing.exchange
     if all(exchange.is_complete(way.link) for way in used_ways(group.schedule for group in groups)):
         degrees = complete_degrees(groups, exchange)
 
@@ -334,7 +334,7 @@ def peer_classes(told: Hearing) -> tuple[tuple[Loop, ...], Coupling]:
 
 def remembered_of(
     system: CompiledSystem,
-    told: Hearing,
+    hearing: Hearing,
     common: Loop,
     *,
     perfect: bool = False,
@@ -344,7 +344,7 @@ def remembered_of(
 
     Parameters
     ----------
-    system, told
+    system, hearing
         The compiled scene and its peers.
     common
         The loop of all classes.
@@ -355,27 +355,27 @@ def remembered_of(
         link's name, as for `memory.memory_of`.
     """
     heard: dict[Route, list[Selected]] = {}
-    for site, rows in zip(common.sites, told.of(common), strict=True):
+    for site, rows in zip(common.sites, hearing.of(common), strict=True):
         size = site.lifted.mapped(lambda block: np.abs(value_of(block)) + radius_of(block))
         felt: Flags = np.any(size.q, axis=0) | np.any(size.d, axis=0)
         for place, row in enumerate(rows):
             if felt[place] and not row.gap:
                 heard.setdefault((row.way.link, row.way.delay), []).append(row)
     links = {link.name: link for link in system.links}
-    remembereds = []
-    times = {clock.name: instants(told, clock) for clock in system.clocks}
-    for route, listed in sorted(heard.items()):
-        link, delay = links[route[0]], told.timings[route[1]]
+    memories = []
+    times = {clock.name: instants(hearing, clock) for clock in system.clocks}
+    for route, selected in sorted(heard.items()):
+        link, delay = links[route[0]], hearing.timings[route[1]]
         sent = times[link.clock]
-        ticks = {(row.clock, row.tick): times[row.clock][row.tick] for row in listed}
+        ticks = {(row.clock, row.tick): times[row.clock][row.tick] for row in selected}
         law = PERFECT if perfect or link.channel is None else channel_law(system, link, delay)
         off = lost.get(route[0], (0.0,))
-        memory = memory_of(law, delay, sent, ticks, told.frame, strictly=told.strictly, lost=off)
-        remembereds.append(remember(route, memory, sorted({row.channel for row in listed})))
-    return remembereds
+        memory = memory_of(law, delay, sent, ticks, hearing.frame, strictly=hearing.strictly, lost=off)
+        memories.append(remember(route, memory, sorted({row.channel for row in selected})))
+    return memories
 
 
-def instants(told: Hearing, clock: Clock) -> list[Fraction]:
+def instants(hearing: Hearing, clock: Clock) -> list[Fraction]:
     """Return when a clock ticks in a frame, in seconds."""
-    phase, period = told.timings[clock.phase], told.timings[clock.period]
-    return [phase % period + number * period for number in range(int(told.frame / period))]
+    phase, period = hearing.timings[clock.phase], hearing.timings[clock.period]
+    return [phase % period + number * period for number in range(int(hearing.frame / period))]

@@ -69,14 +69,14 @@ class Forced:
         return self.of(dense_loop(self.told.groups, self.told.exchange).sites)
 
 
-def forced(system: CompiledSystem, told: Hearing, first: Fraction = Fraction(0)) -> Forced:
+def forced(system: CompiledSystem, hearing: Hearing, first: Fraction = Fraction(0)) -> Forced:
     """Push what hands hold, each for itself, by a force of variance 1 N².
 
     Parameters
     ----------
     system
         The compiled scene.
-    told
+    hearing
         Its peers.
     first
         When frames begin there, in seconds.
@@ -92,18 +92,19 @@ def forced(system: CompiledSystem, told: Hearing, first: Fraction = Fraction(0))
         link.clock for link in system.links
     }
     fastest = min(
-        (clock for clock in system.clocks if clock.name in used), key=lambda clock: told.timings[clock.period]
+        (clock for clock in system.clocks if clock.name in used),
+        key=lambda clock: hearing.timings[clock.period],
     )
-    ticks = instants(told, fastest)
+    ticks = instants(hearing, fastest)
     groups, rows, peers = [], {}, {}
     built: dict[tuple[int, int], tuple[PeerGroup, Peer]] = {}
-    for group in told.groups:
+    for group in hearing.groups:
         key = id(group.schedule), id(group.lifting)
         if key not in built:
             held = find_device(group.jacobians, group.parameters, unit_of, group.listening, direct=direct)
             if isinstance(held, str):
                 raise UnservedError(held)
-            built[key] = _pushed(group, held, ticks, -first % told.frame)
+            built[key] = _pushed(group, held, ticks, -first % hearing.frame)
         pushed, peer = built[key]
         groups.append(
             replace(
@@ -115,11 +116,11 @@ def forced(system: CompiledSystem, told: Hearing, first: Fraction = Fraction(0))
                 lifting=pushed.lifting,
             )
         )
-        rows[id(pushed.schedule)] = told.rows.get(id(group.schedule), ())
+        rows[id(pushed.schedule)] = hearing.rows.get(id(group.schedule), ())
         peers[id(pushed.schedule)] = peer
     if not any(peer.drawn for peer in peers.values()):
         raise UnservedError("no peer holds anything but what it tells others about")
-    return Forced(replace(told, groups=tuple(groups), rows=rows), peers)
+    return Forced(replace(hearing, groups=tuple(groups), rows=rows), peers)
 
 
 def _pushed(
@@ -190,7 +191,7 @@ def moments_error(of: Moments, classes: Sequence[tuple[int, Peer]]) -> float:
 
     def read(drive: Drive) -> Drive:
         added = []
-        for number, row in enumerate(listed[drive.part] for listed in rows):
+        for number, row in enumerate(row[drive.part] for row in rows):
             form = np.zeros((1, 2, 1, drive.matrix.shape[-1]))
             form[0, 0, 0, : len(row)] = row
             place = slice(count + number, count + number + 1)

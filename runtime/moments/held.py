@@ -126,8 +126,8 @@ def held_scene(system: CompiledSystem, prepared: Prepared) -> HeldScene:
         raise UnservedError(f"{what}, and {MOST_STATES:,} are the most")
     groups, exchange = lifted_groups(system, prepared=at)
     schedule = at.schedules[0]
-    told = Hearing(groups, exchange, {}, at.timings, schedule.frame_s, schedule.quantum, strictly=False)
-    return HeldScene(told, frozenset(link.name for link in lossy))
+    hearing = Hearing(groups, exchange, {}, at.timings, schedule.frame_s, schedule.quantum, strictly=False)
+    return HeldScene(hearing, frozenset(link.name for link in lossy))
 
 
 def _unheld(link: Link, period: Fraction, schedules: Sequence[Schedule]) -> str:

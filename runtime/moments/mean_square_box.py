@@ -155,9 +155,9 @@ def _refuse(system: CompiledSystem, prepared: Prepared, interval: Range) -> None
         what = f"values of {interval.free.label}, on which other numbers of a link depend"
     why = "" if what else growth(system, prepared, bounded=False).why
     if what or why:
-        told = f"no box is proved in mean square over {what}" if what else f"no box is proved: {why}"
+        text = f"no box is proved in mean square over {what}" if what else f"no box is proved: {why}"
         hint = f"apc critical {interval.free.label} --in mean-square"
-        raise ApcError(Mistake("E898", PLACE, told, hint=hint))
+        raise ApcError(Mistake("E898", PLACE, text, hint=hint))
 
 
 def _changed(

@@ -202,8 +202,8 @@ def _by_gain(system: CompiledSystem, prepared: Prepared, bounded: bool, first: F
     """
     told = hearing(system, prepared, first=first or Fraction(0), stand_in=first is not None)
 
-    def moments(told: Hearing) -> Moments:
-        return crowd(system, told) if first is None else stand_in(system, told)
+    def moments(hearing: Hearing) -> Moments:
+        return crowd(system, hearing) if first is None else stand_in(system, hearing)
 
     def errors() -> tuple[float, str]:
         pushed = forced(system, told, first or Fraction(0))

@@ -86,18 +86,18 @@ class Memory:
         same all over the cell; the variance π (1 − π) has the slope 1 − 2 π.
         """
         place = self.uncertain(slot)
-        own, moves = self.chances[place, slot], self.moves[:, place, slot]
+        chance, moves = self.chances[place, slot], self.moves[:, place, slot]
         # Of a chance near 1 the variance is small, and what the chance rounds is not.
         doubt = self.doubts[place, slot] + CHANCE_ROUNDINGS * UNIT
         wander = np.abs(moves).sum(axis=0)
-        result = np.minimum.outer(own, own) - np.outer(own, own)
-        least = np.where(own[:, None] <= own, moves[:, :, None], moves[:, None, :])
-        slopes = least - own[:, None] * moves[:, None, :] - moves[:, :, None] * own
-        both = np.outer(own + wander, doubt) + np.outer(doubt, own + wander) + np.outer(doubt, doubt)
+        result = np.minimum.outer(chance, chance) - np.outer(chance, chance)
+        least = np.where(chance[:, None] <= chance, moves[:, :, None], moves[:, None, :])
+        slopes = least - chance[:, None] * moves[:, None, :] - moves[:, :, None] * chance
+        both = np.outer(chance + wander, doubt) + np.outer(doubt, chance + wander) + np.outer(doubt, doubt)
         off = np.maximum.outer(doubt, doubt) + both
-        np.fill_diagonal(off, (np.abs(1 - 2 * own) + 2 * wander) * doubt + doubt**2)
+        np.fill_diagonal(off, (np.abs(1 - 2 * chance) + 2 * wander) * doubt + doubt**2)
         off += np.outer(wander, wander)
-        off = off * (1 + 8 * UNIT) + (4 + len(moves)) * UNIT * (own + 4 * wander)
+        off = off * (1 + 8 * UNIT) + (4 + len(moves)) * UNIT * (chance + 4 * wander)
         return np.concatenate([np.stack([result, off]), slopes])
 
 
@@ -194,10 +194,10 @@ def memory_of(
                 later.append(place)
             else:
                 of_time[time] = place
-    kept = list(dict.fromkeys(later))
+    numbers = list(dict.fromkeys(later))
     # A value kept is called by what is known of it a frame later: of no packet of that frame yet.
     listed = list(keys)
-    known = {listed[place][: len(listed[place]) - slots]: number for number, place in enumerate(kept)}
+    known = {listed[place][: len(listed[place]) - slots]: number for number, place in enumerate(numbers)}
     old = [known[key[slots:]] for key in listed]
     chances = np.array([key[:slots][::-1] for key in listed])
     doubt, *moves = (value / (1 - law.mean_loss) if value else 0.0 for value in lost)
@@ -207,5 +207,5 @@ def memory_of(
         doubts=chances * (doubt * (1 + 8 * UNIT) + 4 * UNIT * sum(map(abs, moves))),
         moves=np.array([chances * -move for move in moves]).reshape(len(moves), *chances.shape),
         heard={tick: of_time[int(time * unit)] for tick, time in ticks.items()},
-        kept=np.array(kept, np.intp),
+        kept=np.array(numbers, np.intp),
     )

@@ -88,16 +88,16 @@ def held_patterns(held: HeldLoop, chances: Sequence[Chance]) -> Patterns:
     return _balanced(f + g @ (s + lost * (e - s)), laws, held.at, held.offsets)
 
 
-def stand_in_patterns(system: CompiledSystem, told: Hearing) -> Patterns:
+def stand_in_patterns(system: CompiledSystem, hearing: Hearing) -> Patterns:
     """Return the frames of every pattern where own values stand in for missing ones.
 
     Parameters
     ----------
-    system, told
+    system, hearing
         As for `stand_in.stand_in`.
     """
-    loop = dense_loop(told.groups, told.exchange)
-    receivers, offsets, law = receivers_of(system, told, [loop], loop.coupling)
+    loop = dense_loop(hearing.groups, hearing.exchange)
+    receivers, offsets, law = receivers_of(system, hearing, [loop], loop.coupling)
     channels = [
         (h, g) for h, receiver in enumerate(receivers) for g in np.flatnonzero(receiver.heard.any(axis=0))
     ]

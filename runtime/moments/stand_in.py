@@ -91,29 +91,29 @@ def quadrature(n: int, chance: float, most: int) -> tuple[Floats, Floats]:
     return nodes, vectors[0] ** 2
 
 
-def stand_in(system: CompiledSystem, told: Hearing) -> Moments:
+def stand_in(system: CompiledSystem, hearing: Hearing) -> Moments:
     """Return the loops and the luck of peers that put their own values in the place of missing ones.
 
     Parameters
     ----------
     system
         The compiled scene.
-    told
+    hearing
         Its peers, of `crowd.hearing` with what stands in; packets are due as frames begin.
     """
-    loops, weights = peer_classes(told)
-    receivers, offsets, _ = receivers_of(system, told, loops, weights)
+    loops, weights = peer_classes(hearing)
+    receivers, offsets, _ = receivers_of(system, hearing, loops, weights)
     return _closed(receivers, [site.count for site in loops[0].sites], offsets, loops)
 
 
 def receivers_of(
-    system: CompiledSystem, told: Hearing, loops: Sequence[Loop], weights: Coupling
+    system: CompiledSystem, hearing: Hearing, loops: Sequence[Loop], weights: Coupling
 ) -> tuple[list[Receiver], list[int], ChannelLaw]:
     """Return how peers of each class move, where their states start, and the law of what they miss.
 
     Parameters
     ----------
-    system, told
+    system, hearing
         The compiled scene and its peers.
     loops
         The loops of classes of peers, that of all first.
@@ -121,12 +121,12 @@ def receivers_of(
         What a peer of one class weighs one of another by.
     """
     common = loops[0]
-    remembered = remembered_of(system, told, common, perfect=True)
+    remembered = remembered_of(system, hearing, common, perfect=True)
     if len(remembered) != 1:
         raise UnservedError("values that stand in beside what is heard over other links")
     (item,) = remembered
     link = next(link for link in system.links if link.name == item.route[0])
-    law = channel_law(system, link, told.timings[item.route[1]])
+    law = channel_law(system, link, hearing.timings[item.route[1]])
     counts = [site.count for site in common.sites]
     sites = [with_memory(group, remembered) for group in common.sites]
     heard_now = sorted(set(item.memory.heard.values()))
@@ -138,9 +138,9 @@ def receivers_of(
         )
         values.append(site.map.s[:, places])
     receivers = []
-    for h, rows in enumerate(told.of(common)):
+    for h, rows in enumerate(hearing.of(common)):
         others = [count - (g == h) for g, count in enumerate(counts)]
-        own = {way: listed[h] for way, listed in weights.items()}
+        own = {way: weight[h] for way, weight in weights.items()}
         ticks = len({(row.clock, row.tick) for row in rows})
         nodes = [
             quadrature(n, 1 - law.mean_loss, ticks + 3)
@@ -321,10 +321,10 @@ def _forms(
     # Two peers of a class of n differ from its mean by amounts of covariance −1/(n − 1).
     n = counts[only]
     forms = others[..., states[only]]
-    listed = [(RADII.add(forms, itself) if h == only else forms, -receiver.weight / (n - 1))]
+    pairs = [(RADII.add(forms, itself) if h == only else forms, -receiver.weight / (n - 1))]
     if h == only:
-        listed.append((itself, receiver.weight * n / (n - 1)))
+        pairs.append((itself, receiver.weight * n / (n - 1)))
     missed = float(receiver.weight @ (n - (h == only) - receiver.heard[:, only]))
-    listed.append((receiver.per_peer[only], receiver.weight * receiver.heard[:, only] * n / (n - 1)))
-    listed.append((receiver.shares[only][None], np.array([missed * n / (n - 1)])))
-    return np.concatenate([forms for forms, _ in listed]), np.concatenate([weights for _, weights in listed])
+    pairs.append((receiver.per_peer[only], receiver.weight * receiver.heard[:, only] * n / (n - 1)))
+    pairs.append((receiver.shares[only][None], np.array([missed * n / (n - 1)])))
+    return np.concatenate([forms for forms, _ in pairs]), np.concatenate([weights for _, weights in pairs])

@@ -100,7 +100,7 @@ def trace_radius(system: CompiledSystem, prepared: Prepared) -> Found:
 
 
 def heard_packets(
-    link: Link, delay: Fraction, sent: Sequence[Fraction], tick: Fraction, told: Hearing
+    link: Link, delay: Fraction, sent: Sequence[Fraction], tick: Fraction, hearing: Hearing
 ) -> list[int]:
     """Return which packet a tick hears, frame by frame over a period, counted from the first of its frame.
 
@@ -110,7 +110,7 @@ def heard_packets(
         The link, and its nominal delay in seconds.
     sent, tick
         When in a frame packets are sent, and when the tick is, in seconds.
-    told
+    hearing
         The peers of the scene.
     """
     slots = len(sent)
@@ -118,7 +118,7 @@ def heard_packets(
     delays = (
         [delay]
         if trace is None
-        else [instant_of(late, told.quantum) if math.isfinite(late) else None for late in trace.tolist()]
+        else [instant_of(late, hearing.quantum) if math.isfinite(late) else None for late in trace.tolist()]
     )
     longest = max(late for late in delays if late is not None)
     newest = link.channel is None or link.channel.reorder == "newest"
@@ -127,11 +127,11 @@ def heard_packets(
         best: tuple[Fraction, int] | None = None
         for number in itertools.count(slots - 1, -1):
             ago, slot = divmod(number, slots)
-            at = sent[slot] + ago * told.frame
+            at = sent[slot] + ago * hearing.frame
             if best is not None and (newest or at + longest < best[0]):
                 break  # what was sent before this can't have arrived later
             late = delays[(frame * slots + number) % len(delays)]
-            if late is None or at + late > tick or (at + late == tick and told.strictly):
+            if late is None or at + late > tick or (at + late == tick and hearing.strictly):
                 continue
             best = max(best or (at + late, number), (at + late, number))
         assert best is not None
@@ -148,7 +148,7 @@ def _period_of(link: Link, slots: int) -> int:
 
 def _period(
     loop: Loop,
-    told: Hearing,
+    hearing: Hearing,
     heard: Mapping[Selected, Sequence[int]],
     depth: Mapping[str, int],
     slots: Mapping[str, int],
@@ -157,7 +157,7 @@ def _period(
     """Return bounds on what a loop grows by in a frame, an estimate, and how far another one is from it."""
     known: dict[tuple[int, ...], Balls] = {}
     at: Relative | None = None
-    rows = [told.rows[id(site.schedule)] for site in loop.sites]
+    rows = [hearing.rows[id(site.schedule)] for site in loop.sites]
     # The eigenvalues of a product are those of its halves in either order, with other roundings.
     halves: list[Balls] = []
     scale = 0
@@ -220,9 +220,9 @@ def hearing_packets(
         How many frames a packet is kept for, and how many are sent in a frame, by the link's name.
     """
     sites = []
-    for site, listed in zip(loop.sites, rows, strict=True):
+    for site, row in zip(loop.sites, rows, strict=True):
         depths = tuple(depth[sent.link] for sent in site.schedule.sent)
-        packets = tuple(_packet(row, next(numbers), slots) for row in listed)
+        packets = tuple(_packet(row, next(numbers), slots) for row in row)
         schedule: Schedule = replace(site.schedule, heard=packets, depths=depths)
         sites.append(replace(site, schedule=schedule))
     return replace(loop, sites=tuple(sites))

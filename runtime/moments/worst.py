@@ -265,7 +265,7 @@ def ratios_of(sites: Sequence[PeerGroup], lossy: frozenset[str]) -> Ratios:
                             if entry:
                                 key = (g, partition, row, way)
                                 own[key] = own.get(key, Fraction(0)) + entry
-        if not columns or any(way.edge for own in columns.values() for *_, way in own):
+        if not columns or any(way.edge for column in columns.values() for *_, way in column):
             continue
         base = next(iter(columns.values()))
         ratios = {}

@@ -71,11 +71,11 @@ def refuse_range(system: CompiledSystem) -> None:
         )
         what = f"{interval.free.label} is a range, {low} to {high}, of which this takes one"
         hint = f'--set "{interval.free.label}={middle}"'
-        told = (
+        matches = (
             re.search(rf":(\d+):(\d+): W275 {re.escape(interval.free.label)} ", text)
             for text in system.warnings
         )
-        line, column = next((map(int, result.groups()) for result in told if result), (0, 0))
+        line, column = next((map(int, result.groups()) for result in matches if result), (0, 0))
         raise ApcError(Mistake("E899", Place(system.origin.topology, line, column), what, hint=hint))
 
 

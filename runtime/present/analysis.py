@@ -256,16 +256,16 @@ def _mode_table(modes: Sequence[Mode]) -> Lines:
     if unsure:
         many = "all" if unsure == left > 1 else str(unsure)
         ends = "it dies" if unsure == 1 else "they die"
-        told = f"{counted(left, 'mode')} {'more' if shown else ''} (--json lists all),"
-        told += f" {many} of them known too roughly to say how fast {ends}"
+        text = f"{counted(left, 'mode')} {'more' if shown else ''} (--json lists all),"
+        text += f" {many} of them known too roughly to say how fast {ends}"
     elif shown:
-        told = f"{left} faster-dying {'one' if left == 1 else 'ones'} (--json lists all)"
+        text = f"{left} faster-dying {'one' if left == 1 else 'ones'} (--json lists all)"
     else:
-        told = (
+        text = (
             f"{counted(left, 'mode')} {'dies' if left == 1 else 'die'} out within a frame (--json lists all)"
         )
     if left:
-        yield from notes(f"and {told}" if shown else told)
+        yield from notes(f"and {text}" if shown else text)
     elif not shown:
         yield "  nothing moves but that"
 
@@ -432,17 +432,17 @@ def switching_text(switching: Switching) -> Lines:
     """Yield whether contacts may open and close at will, in words."""
     reach = switching.reach
     if switching.stable:
-        said = "proved stable by the circle criterion"
+        text = "proved stable by the circle criterion"
         if switching.jumps:
-            said += f" (as {switching.jumps} jumps where it opens, within bounds: it need not come to rest)"
+            text += f" (as {switching.jumps} jumps where it opens, within bounds: it need not come to rest)"
     else:
-        said = f"{'cannot be proved' if switching.stable is False else 'not decided'}: {switching.reason}"
+        text = f"{'cannot be proved' if switching.stable is False else 'not decided'}: {switching.reason}"
     if reach is not None and math.isfinite(reach):
         times = f"{math.floor(reach * 10**DECIMALS) / 10**DECIMALS:.6g}"
-        said += f"; the criterion holds for contacts up to {times} times as stiff"
+        text += f"; the criterion holds for contacts up to {times} times as stiff"
     elif reach is not None:
-        said += "; the criterion holds however stiff the contacts"
-    yield from wrapped(f"{switching.topology}, contacts that open and close at will: {said}", "", "  ")
+        text += "; the criterion holds however stiff the contacts"
+    yield from wrapped(f"{switching.topology}, contacts that open and close at will: {text}", "", "  ")
 
 
 def switching_document(switching: Switching) -> Plain:
@@ -565,8 +565,8 @@ def locus_picture(locus: Locus, ax: Any = None) -> Any:
             continue
         nearest = locus.eigenvalues[int(np.abs(locus.values - crossing.value).argmin())]
         at = nearest[np.abs(np.abs(nearest) - 1).argmin()]
-        told = "" if np.isnan(crossing.frequency_hz) else f", {in_hertz(crossing.frequency_hz)}"
-        label = f"changes at {quantity(crossing.value, of.unit)}{told}"
+        text = "" if np.isnan(crossing.frequency_hz) else f", {in_hertz(crossing.frequency_hz)}"
+        label = f"changes at {quantity(crossing.value, of.unit)}{text}"
         _mark(ax, at / abs(at), MARKS[place], "none", label)
     _entitle(ax, [f"{of.topology}: eigenvalues of a frame of {1e3 * locus.frame_s:g} ms, packets on time"])
     return ax

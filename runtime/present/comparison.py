@@ -141,20 +141,20 @@ def _why(scheme: Scheme, key: str) -> tuple[str, ...]:
 def _verdict(scheme: Scheme, feet: dict[str, int]) -> tuple[str, str]:
     if scheme.analysis is None:
         return scheme.verdict, _marked(NONE, [scheme.refused], feet)
-    told = list(_why(scheme, "verdict"))
+    texts = list(_why(scheme, "verdict"))
     if scheme.network is not None and scheme.network.mean_square_radius is not None:
         root, error = math.sqrt(scheme.network.mean_square_radius), scheme.network.error or 0.0
         grown = radius_text(root, error / (2 * root) if root else error)
-        told.append(
+        texts.append(
             "the radius is that with every packet on time; "
             f"mean squares are multiplied by {grown} squared a frame"
         )
     if scheme.passive is not None:
-        told.append("the radius is that with free hands")
+        texts.append("the radius is that with free hands")
     verdict = scheme.verdict + (", linearized" if scheme.analysis.linearized else "")
     analysis = scheme.analysis
     radius = radius_text(analysis.spectral_radius, analysis.spectral_radius_error, analysis.beyond)
-    return verdict, _marked(radius, told, feet)
+    return verdict, _marked(radius, texts, feet)
 
 
 def _in_time(scheme: Scheme, feet: dict[str, int]) -> tuple[str, str]:

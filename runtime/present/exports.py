@@ -130,11 +130,11 @@ def unit_text(unit: Unit) -> Lines:
     )
     if fixed:
         yield from _numbered("parameter", fixed)
-    told = f"steps of {unit.step * 1e3:.6g} ms show every tick of the fastest clock, values before the tick"
+    text = f"steps of {unit.step * 1e3:.6g} ms show every tick of the fastest clock, values before the tick"
     if unit.peer:
-        told += "; what it hears is set when it has arrived: delays and losses are the network's"
+        text += "; what it hears is set when it has arrived: delays and losses are the network's"
     yield ""
-    yield from notes(told)
+    yield from notes(text)
 
 
 def unit_document(unit: Unit) -> Plain:

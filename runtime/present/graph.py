@@ -161,10 +161,10 @@ def _draw_peers(ax: Any, scene: Scene, link: SceneLink, colours: dict[str, str])
     look = {"node_size": 40, "edge_color": FAINT, "width": 0.7, "with_labels": False}
     places = networkx.shell_layout(graph, shells)
     networkx.draw_networkx(graph, places, ax=ax, nodelist=range(number), node_color=fills, **look)
-    told = f"{link.name}: {counted(scene.peers, 'peer', ',')}, {shape_of(link)}"
+    text = f"{link.name}: {counted(scene.peers, 'peer', ',')}, {shape_of(link)}"
     if scene.peers > number:
-        told += f"\n{number} drawn, {scene.peers - number:,} left out"
-    ax.set_title(told, size=SIZE, color=INK)
+        text += f"\n{number} drawn, {scene.peers - number:,} left out"
+    ax.set_title(text, size=SIZE, color=INK)
     ax.set(xlim=(-1.2, 1.2), ylim=(-1.2, 1.2), aspect="equal")
     ax.set_axis_off()
 

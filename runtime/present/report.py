@@ -93,9 +93,9 @@ def report_page(report: Report) -> str:
     """Return a report as one HTML document."""
     from apc.compiler.view.listing import diagram_of  # of the topologies as written
 
-    kept = json_text(report_document(report), indent=None)
+    text = json_text(report_document(report), indent=None)
     drawing = {"diagram_of": diagram_of, "graph_picture": graph_picture}
-    return page("report.html", report=report, titles=TITLES, kept=inert(kept), **drawing)
+    return page("report.html", report=report, titles=TITLES, kept=inert(text), **drawing)
 
 
 # ---- files ----
@@ -198,7 +198,7 @@ def kept_report(path: Path) -> KeptReport:
         raise ApcError(Mistake("E990", Place(str(path)), what, hint=hint)) from None
 
 
-def scene_again(kept: KeptScene, folder: Path) -> Path:
+def scene_again(kept_scene: KeptScene, folder: Path) -> Path:
     """Write the texts of a scene that a report keeps into an empty folder; return the topology.
 
     Raises
@@ -206,12 +206,12 @@ def scene_again(kept: KeptScene, folder: Path) -> Path:
     ApcError
         E990 a name among them leads out of the folder.
     """
-    for name, text in kept["texts"]:
+    for name, text in kept_scene["texts"]:
         parts = PurePosixPath(name).parts
         if not parts or name.startswith("/") or "\\" in name or ":" in name or ".." in parts:
             what = f"names a file outside of the scene's folder: {name[:80]}"
-            raise ApcError(Mistake("E990", Place(kept["name"][:80]), what))
+            raise ApcError(Mistake("E990", Place(kept_scene["name"][:80]), what))
         path = folder.joinpath(*parts)
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
-    return folder / PurePosixPath(kept["file"]).name
+    return folder / PurePosixPath(kept_scene["file"]).name

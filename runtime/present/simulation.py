@@ -81,14 +81,14 @@ _WORDS = {
 
 def buzz_text(buzz: Buzz) -> Lines:
     """Yield a buzz as it is predicted beside what was played."""
-    known = buzz.predicted
+    predicted = buzz.predicted
     settles = "settles" if buzz.settles else ""
     played = in_hertz(buzz.lines[0].frequency_hz) if buzz.lines else settles or "–"
     rows = [
         ("", "predicted", "played"),
-        ("frequency", in_hertz(known.frequency_hz) if known else "–", played),
+        ("frequency", in_hertz(predicted.frequency_hz) if predicted else "–", played),
     ]
-    share = f"{known.in_contact:.1%}" if known else "–"
+    share = f"{predicted.in_contact:.1%}" if predicted else "–"
     for contact in buzz.contacts:
         depth = "–" if contact.predicted_depth_m is None else f"{contact.predicted_depth_m * 1e3:.4g} mm"
         rows += [
@@ -380,8 +380,8 @@ def ensemble_text(ensemble: Ensemble) -> Lines:
     shares = []
     for verdict, count in ensemble.verdicts:
         low, high = share_interval(count, n)
-        told = f"{100 * count / n:.3g} % (95 % sure: {100 * low:.3g} % to {100 * high:.3g} %)"
-        shares.append((verdict, str(count), told))
+        text = f"{100 * count / n:.3g} % (95 % sure: {100 * low:.3g} % to {100 * high:.3g} %)"
+        shares.append((verdict, str(count), text))
     yield from table(shares, "<><")
     yield ""
     rows: list[tuple[str, ...]] = [("", "mean", "± error", "5 %", "median", "95 %", "most")]
@@ -412,27 +412,27 @@ def _beside(ensemble: Ensemble, mean_square: MeanSquare) -> str:
     n, calm = len(ensemble.runs), ensemble.calm
     if mean_square.why:
         return f"in mean square: not judged: {mean_square.why}"
-    told = f"{mean_square.verdict}, and {calm} of {counted(n, 'run')} settle or die away: "
+    text = f"{mean_square.verdict}, and {calm} of {counted(n, 'run')} settle or die away: "
     if mean_square.linearized:
         return (
-            f"{told}that verdict is of small motions about the start, the runs are of contacts as they come"
+            f"{text}that verdict is of small motions about the start, the runs are of contacts as they come"
         )
     if mean_square.stable is None:
-        return f"{told}bounds leave that verdict open"
+        return f"{text}bounds leave that verdict open"
     if ensemble.agrees:
-        return f"{told}they agree"
+        return f"{text}they agree"
     if not mean_square.stable:
-        return f"{told}what makes mean squares grow is rarer, or slower, than these runs show"
+        return f"{text}what makes mean squares grow is rarer, or slower, than these runs show"
     if mean_square.settles_in is not None and mean_square.settles_in > ensemble.duration:
-        return f"{told}that takes some {mean_square.settles_in:.2g} s, and the runs show how it begins"
-    return f"{told}what moves the others is a force that goes on, which that verdict is not about"
+        return f"{text}that takes some {mean_square.settles_in:.2g} s, and the runs show how it begins"
+    return f"{text}what moves the others is a force that goes on, which that verdict is not about"
 
 
 def ensemble_document(ensemble: Ensemble) -> Plain:
     """Return what many runs amount to as plain data."""
     from apc.simulation.ensemble import QUANTILES, share_interval
 
-    n, told = len(ensemble.runs), ensemble.mean_square
+    n, mean_square = len(ensemble.runs), ensemble.mean_square
     shares = {
         verdict: {"runs": count, "share": count / n, "share_95": list(share_interval(count, n))}
         for verdict, count in ensemble.verdicts
@@ -441,7 +441,7 @@ def ensemble_document(ensemble: Ensemble) -> Plain:
         "duration": ...,
         "duration_s": ensemble.duration,
         "runs": n,
-        "mean_square": None if told is None else {**document(told), "agrees": ensemble.agrees},
+        "mean_square": None if mean_square is None else {**document(mean_square), "agrees": ensemble.agrees},
         "verdicts": shares,
     }
     for name in LABELS:

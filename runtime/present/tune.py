@@ -124,9 +124,9 @@ def _proof_lines(tuning: Tuning) -> Lines:
     proved = [proof for proof in tuning.proofs if proof.proof.stable]
     cells = sum(item.proof.cells for item in proved)
     if proved:
-        told = counted(cells, "cell" if tuning.over else "analysis", ",d").replace("analysiss", "analyses")
+        text = counted(cells, "cell" if tuning.over else "analysis", ",d").replace("analysiss", "analyses")
         many = f"for each of {len(proved)} numbers of peers, " if proved[0].counts else ""
-        yield from labelled(("proved", f"{many}{proved[0].proof.verdict} ({told})"))
+        yield from labelled(("proved", f"{many}{proved[0].proof.verdict} ({text})"))
     left: dict[str, list[str]] = {}
     for proof in tuning.proofs:
         if not proof.proof.stable:
@@ -189,7 +189,7 @@ def _draw_gains(tuning: Tuning, ax: Any) -> None:
         map(_where, tuning.binding) if tuning.binding else [""], tuning.scenes, strict=True
     ):
         name = where or tuning.topology
-        if name not in [known.topology for known in regions]:
+        if name not in [region.topology for region in regions]:
             regions.append(replace(region(scene, ranges, criterion=tuning.criterion), topology=name))
     more = "; what is asked beside stability is not drawn" if tuning.felt or tuning.decay < 1 else ""
     draw_panel(ax, f"{tuning.topology}{more}", Panel("", tuple(regions), (1,) * len(regions), ()))
@@ -208,7 +208,9 @@ def _draw_struck(tuning: Tuning, ax: Any) -> None:
         ("found", [gain.value for gain in tuning.gains]),
         ("now", [Fraction(gain.now) for gain in tuning.gains]),
     ):
-        changes = [Override(own.free, value) for own, value in zip(tuning.ranges, values, strict=True)]
+        changes = [
+            Override(interval.free, value) for interval, value in zip(tuning.ranges, values, strict=True)
+        ]
         struck, name = strike(apply(scene, changes))
         played = simulate(struck, duration=WATCHED, signals=[f"{name}.*"], jit=False)
         place = next(place for place, signal in enumerate(played.signals) if signal.unit == LENGTH)

@@ -68,11 +68,11 @@ def critical_text(critical: Critical) -> Lines:
             f"{value} at {group}" for value, (group, _) in zip(values, critical.groups, strict=True)
         )
         now += f", to be one value for all {'groups' if len(critical.groups) > 1 else 'its peers'}"
-    said = _stable_ranges(critical)
-    if not said:
+    text = _stable_ranges(critical)
+    if not text:
         wording = ("value scanned", "number looked at") if critical.counted else ("", "")
-        said = critical.verdict.replace(*wording)
-    yield from wrapped(f"{critical.topology}: {said}")
+        text = critical.verdict.replace(*wording)
+    yield from wrapped(f"{critical.topology}: {text}")
     meant = MEANT.get(critical.criterion, "")
     yield from notes(meant, *critical.left_out, f"{critical.parameter} is now {now}")
     yield ""
@@ -191,12 +191,12 @@ def margins_text(margins: Margins) -> Lines:
     for row, end in zip(margins.rows, ends, strict=True):
         times = "–" if row.factor is None else f"{row.factor:.4g}"
         at = in_hertz(math.nan if row.frequency_hz is None else row.frequency_hz)
-        told = f"{end:<{wide}} {times:>5}  {at}{', jump' if row.kind == 'jump' else ''}"
+        text = f"{end:<{wide}} {times:>5}  {at}{', jump' if row.kind == 'jump' else ''}"
         if row.note:
-            told = f"not looked for: {row.note}"
+            text = f"not looked for: {row.note}"
         elif row.value is None:
-            told = f"none found up to {quantity(row.scanned, row.unit, 5)}"
-        yield f"  {row.parameter:<{width}}  {quantity(row.present, row.unit, 5):<14} {told}"
+            text = f"none found up to {quantity(row.scanned, row.unit, 5)}"
+        yield f"  {row.parameter:<{width}}  {quantity(row.present, row.unit, 5):<14} {text}"
     yield from notes(margins.note)
 
 
@@ -214,8 +214,8 @@ def sensitivities_text(sensitivities: Sensitivities) -> Lines:
             key = (row.parameter, f"{quantity(row.value, row.unit):<15}", f"{row.relative / 100:+.2e}")
             same.setdefault(key, []).append(str(row.mode + 1))
     if not same:
-        told = sensitivities.note if len(sensitivities.active) < 2 else ""
-        yield from notes(told or NONE_TOLD)
+        text = sensitivities.note if len(sensitivities.active) < 2 else ""
+        yield from notes(text or NONE_TOLD)
         return
     rows: list[tuple[str, ...]] = [("what moves it most", f"{'value':<15}", "per percent")]
     for (*cells, change), modes in list(same.items())[:SHOWN]:
@@ -275,8 +275,8 @@ def _verdict_lines(verdicts: Counter[str], messages: Counter[str]) -> Lines:
     """Yield how many points have each verdict, and what most of those at fault say."""
     for verdict, count in sorted(verdicts.items(), key=lambda item: (-item[1], item[0])):
         yield f"  {count:>10,} × {verdict}"
-    said = Counter({text: count for text, count in messages.items() if text})
-    for text, count in said.most_common(1):
+    counter = Counter({text: count for text, count in messages.items() if text})
+    for text, count in counter.most_common(1):
         yield from notes(f"at {count:,} of them: {text}")
 
 

@@ -244,8 +244,8 @@ def _halve(
         middle = knots.add(place, pairs, a, (knots.key[a] + knots.key[b]) / 2)
         knots.error[a] = knots.error[middle] = off
         # No nearer than where rounding has the boundary, which the curve's error counts as well.
-        known = _rounding(deciding, pairs)
-        fine = off <= np.maximum(FILLED * tolerance * relative_to(place, pairs.gradient, offset), known)
+        values = _rounding(deciding, pairs)
+        fine = off <= np.maximum(FILLED * tolerance * relative_to(place, pairs.gradient, offset), values)
         left += [np.stack([a, middle], axis=1)[~fine], np.stack([middle, b], axis=1)[~fine]]
     if len(lost):
         left.append(_search(deciding, knots, lost, tolerance, offset))
@@ -376,9 +376,9 @@ def _arcs(deciding: Eigenvalues, knots: _Knots, closed: tuple[bool, ...]) -> tup
         if comes_back and len(pieces) > 1:  # the first crossing is no corner
             pieces = [np.concatenate([pieces[-1], pieces[0][1:]]), *pieces[1:-1]]
         for piece in itertools.chain.from_iterable(_between_jumps(knots, piece) for piece in pieces):
-            kept = _without_copies(knots.points[piece])
-            if len(kept) > 1:
-                arcs.append(_arc(deciding, knots, piece[kept], chain))
+            numbers = _without_copies(knots.points[piece])
+            if len(numbers) > 1:
+                arcs.append(_arc(deciding, knots, piece[numbers], chain))
     return tuple(arcs)
 
 

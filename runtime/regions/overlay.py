@@ -93,10 +93,10 @@ def _role(system: CompiledSystem, symbol: str, player: str) -> Free | float:
         what = f"{symbol}, the {MEANINGS[symbol]},"
         raise ApcError(Mistake("E204", _PLACE, what, UNITS[symbol], f"{name} in {unit}"))
     if free.group is None:
-        own = [group for group in system.groups if name in _own_names(group)]
-        if own:
+        groups = [group for group in system.groups if name in _own_names(group)]
+        if groups:
             what = f"{name} differs between peers, and {symbol} is one number"
-            raise ApcError(Mistake("E886", _PLACE, what, hint=f"{symbol}={own[0].name}.{name}"))
+            raise ApcError(Mistake("E886", _PLACE, what, hint=f"{symbol}={groups[0].name}.{name}"))
     return free
 
 

@@ -88,11 +88,11 @@ def parse_vary(text: str) -> tuple[tuple[str, ...], ...]:
         E907 it isn't of that form.
     """
     name, equals, values = (part.strip() for part in text.partition("="))
-    listed = with_last_unit(values.split(","))
-    if not (equals and name and all(listed)):
+    texts = with_last_unit(values.split(","))
+    if not (equals and name and all(texts)):
         form = "--vary lan.delay=0,8 ms"
         raise ApcError(Mistake("E907", Place("--vary"), "--vary", "NAME=VALUE,VALUE,…", text[:80], form))
-    return tuple((f"{name}={value}",) for value in listed)
+    return tuple((f"{name}={value}",) for value in texts)
 
 
 # A scene with a panel's settings, its axes, and what its y is multiplied by.

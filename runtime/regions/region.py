@@ -141,7 +141,7 @@ class Curve:
                 2 * np.pi * round((turn - sign * float(angles[place])) / (2 * np.pi)) + sign * angles
                 for sign in (1, -1)
             ]
-            own = min(candidates, key=lambda listed: abs(float(listed[place]) - turn))
+            own = min(candidates, key=lambda candidate: abs(float(candidate[place]) - turn))
             listed = own if len(places) == 1 else own[[place]]
             values += (np.abs(listed) / (2 * np.pi * frame)).tolist()
         return min(values), max(values)

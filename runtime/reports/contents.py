@@ -247,8 +247,8 @@ def _region(system: CompiledSystem, call: str) -> Section:
     words += [f" --in {NOMINAL}"] if criterion else []
     command = f"apc region {call}{''.join(words)} --out region.svg"
     lossy = command.replace(f"--in {NOMINAL}", f"--in {MEAN_SQUARE}")
-    told = f"Stable here means with every packet on time. As they are lost and late: {lossy}"
-    return Section("region", command, (told,) if unreliable else (), (result,), (result,))
+    text = f"Stable here means with every packet on time. As they are lost and late: {lossy}"
+    return Section("region", command, (text,) if unreliable else (), (result,), (result,))
 
 
 def _response(system: CompiledSystem, call: str) -> Section:
@@ -298,22 +298,22 @@ def differences(before: Any, now: Any) -> Iterator[str]:
             yield f"{name} is {_shown(cell)}, not {_shown(old)}"
 
 
-def _leaves(data: Any, name: str = "", known: float = 0.0) -> Iterator[tuple[str, tuple[Any, float]]]:
+def _leaves(data: Any, name: str = "", value: float = 0.0) -> Iterator[tuple[str, tuple[Any, float]]]:
     """Yield what is no list or mapping by its place, and how far off it may be, which no error is itself."""
     if isinstance(data, Mapping):
         errors = (
             item for key, item in data.items() if key.endswith("error") and isinstance(item, int | float)
         )
-        known = sum(errors) or known
+        value = sum(errors) or value
         for key, item in data.items():
             if "error" not in key:
-                yield from _leaves(item, f"{name}.{key}" if name else key, known)
+                yield from _leaves(item, f"{name}.{key}" if name else key, value)
     elif isinstance(data, list):
         sizes = [abs(item) for item in data if isinstance(item, int | float)]
         for place, item in enumerate(data):
-            yield from _leaves(item, f"{name}[{place + 1}]", max(known, NOTHING * max(sizes, default=0.0)))
+            yield from _leaves(item, f"{name}[{place + 1}]", max(value, NOTHING * max(sizes, default=0.0)))
     else:
-        yield name, (data, known)
+        yield name, (data, value)
 
 
 def _shown(cell: Any) -> str:

@@ -90,11 +90,11 @@ class Comparison:
         """Return what has been seen."""
         span = np.where(self.high >= self.low, self.high - self.low, 0.0)
         columns: Sequence[Any] = (self.error.tolist(), self.at.tolist(), span.tolist())
-        generator = (
+        estimates = (
             SignalError(signal.name, signal.unit, *numbers)
             for signal, *numbers in zip(self.signals, *columns, strict=True)
         )
-        return ErrorEstimate(self.kind, self.compared, tuple(generator))
+        return ErrorEstimate(self.kind, self.compared, tuple(estimates))
 
 
 def compare_with(simulation: Simulation, *, signals: Sequence[str] = ()) -> Comparison:

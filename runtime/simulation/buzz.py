@@ -254,7 +254,7 @@ def _compare(
     return Buzz(topology, known, reason, end, bounded, steady, lines, contacts, notes)
 
 
-def _notes(known: Predicted | None, *, bounded: bool, steady: bool, lines: Sequence[Line]) -> list[str]:
+def _notes(predicted: Predicted | None, *, bounded: bool, steady: bool, lines: Sequence[Line]) -> list[str]:
     """Say what a prediction is worth beside what was played."""
     texts = []
     if not bounded:
@@ -267,16 +267,16 @@ def _notes(known: Predicted | None, *, bounded: bool, steady: bool, lines: Seque
             f"lines stand in the spectrum at {several}, none of which repeats another: one sinusoid says "
             "nothing of such a motion, and what was played counts"
         )
-    if known and lines and abs(lines[0].frequency_hz / known.frequency_hz - 1) > APART:
+    if predicted and lines and abs(lines[0].frequency_hz / predicted.frequency_hz - 1) > APART:
         texts.append(
             "what was played is far from what is predicted: the motion is no sinusoid, and what was played "
             "counts"
         )
-    if known and not known.attracts:
+    if predicted and not predicted.attracts:
         texts.append("the cycle predicted is one that motions leave: what swings less dies out, more grows")
-    if known and known.attracts and steady and not lines:
+    if predicted and predicted.attracts and steady and not lines:
         texts.append("the motion played came to rest and does not show the cycle predicted")
-    if not known and lines:
+    if not predicted and lines:
         texts.append("it buzzes all the same, in a way that one sinusoid does not describe")
     return texts
 
@@ -298,8 +298,8 @@ def _lines(time: Floats, values: Floats) -> tuple[Line, ...]:
     return tuple(lines)
 
 
-def _is_mixed(frequency: float, known: Sequence[float], apart: float) -> bool:
+def _is_mixed(frequency: float, values: Sequence[float], apart: float) -> bool:
     """Say whether a frequency is one that is known, or a sum or difference of a few times two of these."""
     times = range(-MIXED, MIXED + 1)
-    sums = {i * value + j * other for value in known for other in known for i in times for j in times}
+    sums = {i * value + j * other for value in values for other in values for i in times for j in times}
     return any(abs(frequency - value) < apart for value in sums)

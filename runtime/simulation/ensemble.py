@@ -207,8 +207,8 @@ def play_many(
             raise
         interrupted = True
     done.sort(key=lambda run: run.number)
-    told = None if interrupted else _mean_square(system)
-    return Ensemble(system.name, settings.duration, seed, tuple(done), interrupted, told)
+    mean_square = None if interrupted else _mean_square(system)
+    return Ensemble(system.name, settings.duration, seed, tuple(done), interrupted, mean_square)
 
 
 def _mean_square(system: CompiledSystem) -> MeanSquare | None:
@@ -256,8 +256,8 @@ def _runs(simulation: Simulation, numbers: range) -> list[Run]:
         watch = Watch(simulation)
         for block in blocks(simulation, run=number, player=player):
             watch.take(block.time, block.values)
-        told = watch.summary(block)
-        force = None if told.largest_force is None else told.largest_force[1]
-        copies = max((distance for name, distance in told.copies if name in lengths), default=None)
-        runs.append(Run(number, told.verdict, told.settled, force, copies))
+        summary = watch.summary(block)
+        force = None if summary.largest_force is None else summary.largest_force[1]
+        copies = max((distance for name, distance in summary.copies if name in lengths), default=None)
+        runs.append(Run(number, summary.verdict, summary.settled, force, copies))
     return runs

@@ -199,9 +199,9 @@ class _Listing:
                 start[key, self.first[g] : self.first[g + 1]] = _first_packet(member, sent.link, sent.channel)
         channels = tuple(
             np.array([
-                [self.key_of[Sent(route.link, c, slot)] for slot in range(route.slots)] for c in listed
+                [self.key_of[Sent(route.link, c, slot)] for slot in range(route.slots)] for c in channel
             ])
-            for route, listed in zip(self.routes, self.channels, strict=True)
+            for route, channel in zip(self.routes, self.channels, strict=True)
         )  # fmt: skip
         depths = [depth for member in self.members for depth in member.program.schedule.depths]
         segments = tuple(self._segment(i) for i in range(len(self.members[0].program.segments)))
@@ -233,14 +233,14 @@ class _Listing:
         before: dict[tuple[int, int], list[Operation]] = {}  # what the tick before heard is still there
         for g, member in enumerate(self.members):
             segment, received = member.program.segments[index], member.program.schedule.received
-            listed = [
+            pairs = [
                 (received[row], self._heard(g, place, received[row]))
                 for place, row in enumerate(segment.heard)
             ]
             for place, pairwise in enumerate(segment.pairs, len(segment.heard)):
                 rows = [received[row] for row in pairwise.heard]
-                listed += [(rows[0], look) for look in self._looks(g, place, pairwise, rows)]
-            for heard, operation in listed:
+                pairs += [(rows[0], look) for look in self._looks(g, place, pairwise, rows)]
+            for heard, operation in pairs:
                 if isinstance(heard, Selected):
                     group = before if heard.way.before else late
                     group.setdefault((self.route_of[heard.way.link, heard.clock], heard.tick), []).append(
@@ -257,8 +257,8 @@ class _Listing:
         if isinstance(row, Heard):
             return Packet(self.key_of[row.sent], row.lag)
         route = self.route_of[row.way.link, row.clock]
-        listed = self.channels[route]
-        return Arrived(route, len(listed) if row.gap else listed.index(row.channel))
+        channel = self.channels[route]
+        return Arrived(route, len(channel) if row.gap else channel.index(row.channel))
 
     def _heard(self, listener: int, place: int, row: Heard | Selected) -> Operation:
         """Return what makes a row of a plain sum or mean."""

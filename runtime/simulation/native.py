@@ -56,10 +56,12 @@ def compiler() -> tuple[str, str] | None:
         if path is None:
             continue
         try:
-            said = subprocess.run([path, "--version"], capture_output=True, text=True, timeout=10, check=True)
+            completed_process = subprocess.run(
+                [path, "--version"], capture_output=True, text=True, timeout=10, check=True
+            )
         except (OSError, subprocess.SubprocessError):
             continue
-        return str(Path(path).absolute()), said.stdout
+        return str(Path(path).absolute()), completed_process.stdout
     return None
 
 

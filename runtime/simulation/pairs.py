@@ -63,9 +63,9 @@ def pair_function(kind: Kind, partition: int, receive: int) -> tuple[Any, tuple[
         heard = casadi.vertcat(*(sent[row] + missing * stand_in[row] for row in range(sent.numel())))
     value = casadi.densify(evaluated(heard))
     every = casadi.vertcat(x, u, m, p)
-    own = _rows_used(value, every)
-    arguments = [_rows(every, own), _rows(sent, channels), missing, t]
-    return casadi.Function("pair", arguments, [value]), tuple(own)
+    numbers = _rows_used(value, every)
+    arguments = [_rows(every, numbers), _rows(sent, channels), missing, t]
+    return casadi.Function("pair", arguments, [value]), tuple(numbers)
 
 
 def _rows_used(value: Any, symbols: Any) -> list[int]:

@@ -147,7 +147,7 @@ def build_population(
     """
     schedule = members[0].program.schedule
     columns = np.cumsum([0, *(len(member.program.recorded) * member.count for member in members)]).tolist()
-    listed = (part for member in members for part in member.program.layout.parts)
+    parts = (part for member in members for part in member.program.layout.parts)
     return Population(
         members=tuple(members),
         hearing=hearing_of(exchange, members, routes),
@@ -156,5 +156,5 @@ def build_population(
         marks=len(schedule.marks) - 1,
         width=columns[-1],
         columns=tuple(columns[:-1]),
-        parts=tuple(dict.fromkeys(listed)),
+        parts=tuple(dict.fromkeys(parts)),
     )

@@ -186,25 +186,25 @@ def build_member(
         What each peer does in a frame.
     """
     used, own = np.unique(rows, return_inverse=True)
-    some, kind, layout = vectors[used], site.kind, program.layout
-    x, _, remembered = start_values(site, list(some.T))
-    carry = np.zeros((len(some), layout.ends[-1]))
+    vector, kind, layout = vectors[used], site.kind, program.layout
+    x, _, remembered = start_values(site, list(vector.T))
+    carry = np.zeros((len(vector), layout.ends[-1]))
     for row, value in enumerate(x):
         carry[:, row] = value
     for p, (partition, values) in enumerate(zip(kind.clocks, remembered, strict=True)):
         for output, value in zip(partition.memories, values, strict=True):
             if (p, output) in layout.outputs:  # else its clock never ticks
                 carry[:, layout.states + layout.outputs.index((p, output))] = value
-    states, still = carry[:, : layout.states].T, np.zeros((layout.holds, len(some)))
+    states, still = carry[:, : layout.states].T, np.zeros((layout.holds, len(vector)))
     return Member(
         group=group,
         peers=peers,
         program=program,
         rows=own,
-        parameters=some,
-        constants=program.constants(some, [transition[used] for transition in transitions]),
+        parameters=vector,
+        constants=program.constants(vector, [transition[used] for transition in transitions]),
         sends={
-            send.link: np.asarray(send.send.map(len(some))(states, still, some.T, 0.0), np.float64).T
+            send.link: np.asarray(send.send.map(len(vector))(states, still, vector.T, 0.0), np.float64).T
             for send in kind.sends
         },
         carry=carry,

@@ -92,9 +92,9 @@ def rates(kind: Kind, moved: Sequence[int] = ()) -> Rates:
     curved = [row for row in _curved(speed, moving, t) if own[row]]
     if curved:
         raise _nonlinear(kind, curved, speed, moving, p)
-    kept = casadi.sparsify(casadi.diag(casadi.DM(own.astype(float))))
-    slopes = kept @ jacobian(speed, moving)
-    still = kept @ kind.derivative(type_.zeros(n_x), type_.zeros(len(kind.holds)), p, t)
+    dm = casadi.sparsify(casadi.diag(casadi.DM(own.astype(float))))
+    slopes = dm @ jacobian(speed, moving)
+    still = dm @ kind.derivative(type_.zeros(n_x), type_.zeros(len(kind.holds)), p, t)
     if type_ is casadi.MX:  # the same wherever they are taken, but a loop's solution is of somewhere
         at = casadi.Function("slopes", [moving, p, t], [slopes])
         slopes = at(type_.zeros(moving.numel()), p, 0)

@@ -375,9 +375,9 @@ def _flow(
         return None
     vectors = [
         vector
-        for group, own in zip(system.groups, numbers.parameters, strict=True)
+        for group, parameter in zip(system.groups, numbers.parameters, strict=True)
         if group.kind == place
-        for vector in own
+        for vector in parameter
     ]
     return flow_of(kind, method, rows, state_scales(system, kind, site, vectors))
 

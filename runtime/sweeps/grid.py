@@ -209,11 +209,11 @@ def _check_bounds(system: CompiledSystem, axis: GridAxis, value: Fraction) -> No
     try:
         apply(system, [Override(axis.free, value)])
     except ApcError as error:
-        own = [
+        mistakes = [
             mistake
             for mistake in error.mistakes
             if mistake.what in (axis.free.label, axis.free.name)
             and (mistake.code == "E624" or (mistake.code == "E625" and mistake.expected.startswith("a time")))
         ]
-        if own:
-            raise ApcError(replace(own[0], place=PLACE)) from None
+        if mistakes:
+            raise ApcError(replace(mistakes[0], place=PLACE)) from None

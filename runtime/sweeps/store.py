@@ -113,14 +113,14 @@ def _packed(cells: Cells) -> bytes:
         if column.dtype == object
     ]
     points = len(cells[0]) if cells else 0
-    listed = json.dumps([text for text in texts if text is not None]).encode()
+    text = json.dumps([text for text in texts if text is not None]).encode()
     file = io.BytesIO()
     np.savez(
         file,
         is_text=np.array([column.dtype == object for column in cells], np.bool_),
         numbers=np.array([cell for cell in cells if cell.dtype != object], np.float64).reshape(-1, points),
         codes=np.array(codes, np.int32).reshape(-1, points),
-        texts=np.frombuffer(listed, np.uint8),
+        texts=np.frombuffer(text, np.uint8),
     )
     return file.getvalue()
 

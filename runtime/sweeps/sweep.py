@@ -196,20 +196,20 @@ def sweep(
     )
     work = Work(model_bytes(system), work_of, grid, part_points(grid.points, quick=quantity.quick))
     made_of = _description(system, work)
-    kept = _kept(out, made_of)
+    parts = _kept(out, made_of)
     whose = Whose(jobs or cores(), cluster, patience or Patience())
-    notes = _compute_missing(work, kept, whose, progress)
-    listed = (*(Column(axis.heading) for axis in grid.axes), *quantity.columns)
+    notes = _compute_missing(work, parts, whose, progress)
+    columns = (*(Column(axis.heading) for axis in grid.axes), *quantity.columns)
     counts = Counter[str](), Counter[str]()
-    blocks, held = _blocks(work, kept, [column.kind for column in listed], counts), None
-    if isinstance(kept, _Memory):
+    blocks, held = _blocks(work, parts, [column.kind for column in columns], counts), None
+    if isinstance(parts, _Memory):
         held = tuple(np.concatenate(own) for own in zip(*blocks, strict=True))
         blocks = ([column[at : at + BLOCK] for column in held] for at in range(0, grid.points, BLOCK))
     if out is not None:
-        write_table(out, listed, blocks, made_of)
-    if isinstance(kept, Parts):
-        kept.remove()
-    return Sweep(system.name, of, grid, listed, held, *counts, out, made_of, notes)
+        write_table(out, columns, blocks, made_of)
+    if isinstance(parts, Parts):
+        parts.remove()
+    return Sweep(system.name, of, grid, columns, held, *counts, out, made_of, notes)
 
 
 def part_points(points: int, *, quick: bool) -> int:
@@ -352,7 +352,7 @@ def _blocks(
         if cells is None:  # another process with the same sweep was done, and removed it
             cells = compute_part(work, number).cells
         places = work.grid.places(work.points_of(number))
-        columns = [own[places[:, axis]] for axis, own in enumerate(values)] + list(cells)
+        columns = [value[places[:, axis]] for axis, value in enumerate(values)] + list(cells)
         counts[0].update(cells[0].tolist())
         counts[1].update(cells[-1].tolist())
         waiting.append(

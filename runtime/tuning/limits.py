@@ -110,9 +110,9 @@ class Limits:
     @cached_property
     def settings(self) -> list[tuple[tuple[Override, ...], CompiledSystem]]:
         """Every number of peers with every delay that stands for others, and the scene with these."""
-        listed = [range(int(count.low), int(count.high) + 1) for count in self.demands.counts]
+        runs = [range(int(count.low), int(count.high) + 1) for count in self.demands.counts]
         pairs = []
-        for counts in itertools.product(*listed):
+        for counts in itertools.product(*runs):
             numbers = tuple(
                 Override(item.free, Fraction(count))
                 for item, count in zip(self.demands.counts, counts, strict=True)
@@ -228,9 +228,9 @@ class Limits:
         before = len(self.frequencies)
         for scenario in scenarios:
             point = np.append(chosen, scenario.point)[None]
-            known = np.max([self.asked(scenario.setting, point, view=view) for view in self.views], axis=0)
+            values = np.max([self.asked(scenario.setting, point, view=view) for view in self.views], axis=0)
             peaks = self.measured(scenario.setting, self._numbers(point), self.demands)[0, :, 2]
-            if (self.asked(scenario.setting, point) > known + LARGER).any():
+            if (self.asked(scenario.setting, point) > values + LARGER).any():
                 named = zip(self.demands.measured, np.maximum(peaks, SLOWEST).tolist(), strict=True)
                 new = [peak for felt, peak in named if felt.name == HINF]
                 self.frequencies.extend(peak for peak in new if peak not in self.frequencies)
@@ -323,7 +323,9 @@ class Limits:
         for place, scenario in enumerate(scenarios):
             point = np.append(chosen, scenario.point)
             family = self.family(scenario.setting)
-            inwards = along * np.where(point > [float(own.low + own.high) / 2 for own in ranges], -1, 1)
+            inwards = along * np.where(
+                point > [float(interval.low + interval.high) / 2 for interval in ranges], -1, 1
+            )
             moved = np.vstack([point, point + STEP * inwards])
             if isinstance(family, GrowthEvaluator):
                 distinct, which = np.unique(self._numbers(moved), axis=0, return_inverse=True)

@@ -161,15 +161,15 @@ class Search:
         order = np.argsort(self._order(points, worst), kind="stable")
         if than is not None:
             met = self.column is not None and than.worst <= BINDS
-            known = self._order(self.shares(than)[None], np.array([0.0 if met else than.worst]))[0]
-            order = order[self._order(points, worst)[order] < known - OPEN]
+            number = self._order(self.shares(than)[None], np.array([0.0 if met else than.worst]))[0]
+            order = order[self._order(points, worst)[order] < number - OPEN]
         size, left = (SLOW_LOOK if self.limits.slow else LOOK), LOOKS
         for begin in range(0, min(len(order), size * LOOKS), size):
             some = order[begin : begin + size]
             points[some] = self._at_level(points[some], every)
             ranks = self._order(points[some], self.limits.worst(every, self.gains(points[some])).max(axis=1))
             place, left = int(np.argmin(ranks)), left - 1
-            if ranks[place] < (known - OPEN if than is not None else 0.0 if left else np.inf):
+            if ranks[place] < (number - OPEN if than is not None else 0.0 if left else np.inf):
                 return [points[some[place]]]
         return []
 

@@ -355,8 +355,8 @@ class _Work:
             if column is not None:
                 gains[column] = self._back(float(optimum.gains[column]), shares[place])
                 if column < len(self.demands.free):
-                    own = self.demands.free[column]
-                    gains[column] = min(max(gains[column], own.low), own.high)
+                    interval = self.demands.free[column]
+                    gains[column] = min(max(gains[column], interval.low), interval.high)
             if column is None or len(gains) > 1:
                 middle = self._middle(gains, column, optimum) if middle is None else middle
                 gains = self._typed(gains, column, middle)
@@ -491,7 +491,7 @@ class _Work:
 
     def _felt(self, numbers: tuple[Override, ...], point: Floats) -> bool:
         """Say whether it is proved that what is felt is as asked, where only numbers of peers vary."""
-        places = [place for place, (own, _) in enumerate(self.limits.settings) if own == numbers]
+        places = [place for place, (overrides, _) in enumerate(self.limits.settings) if overrides == numbers]
         result = [self.limits.asked(place, point, bounded=True).max(initial=-1.0) for place in places]
         return max(result, default=-1.0) < 0
 
@@ -509,9 +509,9 @@ class _Work:
         """Return the scenario in which gains are proved not to hold; None where it is one already."""
         values = dict(zip([interval.free for interval in ranges], proof.point, strict=False))
         late = self.demands.delay and values.get(self.demands.delay.free)
-        for place, (own, _) in enumerate(self.limits.settings):
-            here = len(own) == len(numbers) or float(own[-1].value) == late
-            if own[: len(numbers)] == numbers and here:
+        for place, (overrides, _) in enumerate(self.limits.settings):
+            here = len(overrides) == len(numbers) or float(overrides[-1].value) == late
+            if overrides[: len(numbers)] == numbers and here:
                 box = tuple(values[interval.free] for interval in self.demands.box)
                 scenario = Scenario(place, box)
                 return None if scenario in self.scenarios else scenario
@@ -632,7 +632,7 @@ class _Work:
 
     def _binding(self, optimum: Optimum, *, met: bool) -> list[Binding]:
         """Return what binds: each mode with a multiplier, and what less of the ends that meet there buys."""
-        listed = []
+        bindings = []
         aim = self.demands.aim.column
         rows = self.limits.rows(optimum.scenarios, optimum.gains, wide=True)
         scale = 1.0
@@ -659,14 +659,14 @@ class _Work:
                 for number in numbers[len(self.demands.counts) :]
             ]
             where += [
-                (own.free.label, value, own.unit)
-                for own, value in zip(self.demands.box, scenario.point, strict=True)
+                (interval.free.label, value, interval.unit)
+                for interval, value in zip(self.demands.box, scenario.point, strict=True)
             ]
             shape, frequency = self._mode(optimum, scenario, complex(rows.eigenvalue[place]))
             if not math.isnan(rows.frequency_hz[place]):
                 frequency = float(rows.frequency_hz[place])
-            listed.append(Binding(tuple(where), shape, frequency, tuple(buys)))
-        return listed
+            bindings.append(Binding(tuple(where), shape, frequency, tuple(buys)))
+        return bindings
 
     def _mode(self, optimum: Optimum, scenario: Scenario, eigenvalue: complex) -> tuple[str, float]:
         """Return the shape and the frequency of a mode, "" and NaN where there is none."""

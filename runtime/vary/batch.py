@@ -202,11 +202,11 @@ class BatchEvaluator:
     def slopes(self, values: Floats, along: Floats) -> tuple[tuple[Floats, Floats], ...]:
         """Return each system's matrices (k, n, n) and their derivatives along directions (k, m)."""
         lifted = self.lifted(values + (STEP * 1j) * along)
-        generator = (reduced(wiring, closed_loop(wiring, lifted), len(values)) for wiring in self.wirings)
+        matrices = (reduced(wiring, closed_loop(wiring, lifted), len(values)) for wiring in self.wirings)
         # Squares of the step stand where nothing should: balancing would take them for entries.
         return tuple(
             (np.where(np.abs(values.real) <= STEP, 0.0, values.real), values.imag / STEP)
-            for values in generator
+            for values in matrices
         )
 
     def vectors(self, group: PeerGroup, values: Matrices) -> Matrices:
@@ -295,10 +295,10 @@ class BatchEvaluator:
     def _lift(self, group: PeerGroup, values: Matrices) -> FrameMap:
         if self.tangents:
             rows = self.rows(group.jacobians, self.vectors(group, values))
-            own = site_of(group.jacobians, rows)
+            linear_site = site_of(group.jacobians, rows)
         else:
-            own = every_matrix(group.site, lambda block: np.array(block[None]))
-        site, fixed, lost = self._placed(group, own)
+            linear_site = every_matrix(group.site, lambda block: np.array(block[None]))
+        site, fixed, lost = self._placed(group, linear_site)
         steps = {quanta: step.matrix for quanta, step in fixed.items()}
         steps = steps or self.steps(site, values, exponential_values)
         with np.errstate(all="ignore"):

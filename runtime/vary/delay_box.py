@@ -82,9 +82,11 @@ def prove_over_delay(
         else:
             verdict = proof.verdict
     stable = None if left else True
-    told = changing(system, delay) if nominal and stable and not rest else None
-    notes = (*proof.notes, *[CONSTANT] * (told is None))
-    whole = replace(proof, ranges=tuple(ranges), cells=cells, notes=notes, stable=stable, changing=told)
+    changing_delay = changing(system, delay) if nominal and stable and not rest else None
+    notes = (*proof.notes, *[CONSTANT] * (changing_delay is None))
+    whole = replace(
+        proof, ranges=tuple(ranges), cells=cells, notes=notes, stable=stable, changing=changing_delay
+    )
     return replace(whole, verdict=UNDECIDED if left else verdict, open_share=float(left), point=open_point)
 
 

@@ -135,9 +135,9 @@ class PointEvaluator:
         moved = step[:, None] * along
         points = np.concatenate([values, values - moved, values + moved])
         blocks = [self._blocks(value) for value in points]
-        here, before, after = np.split(_filled_up(blocks), 3)
+        closed_system, before, after = np.split(_filled_up(blocks), 3)
         slope = (after - before) / (2 * step[:, None, None])
-        shapes = [[len(values) for values in listed] for listed in blocks]
+        shapes = [[len(values) for values in block] for block in blocks]
         count = len(values)
         for row in range(count):
             if shapes[row] == shapes[count + row] == shapes[2 * count + row]:
@@ -150,9 +150,9 @@ class PointEvaluator:
                 size = len(second)
                 slope[row] = 0.0
                 slope[row, :size, :size] = (
-                    way * (4 * second - 3 * here[row, :size, :size] - third) / (2 * step[row])
+                    way * (4 * second - 3 * closed_system[row, :size, :size] - third) / (2 * step[row])
                 )
-        return ((here, slope),)
+        return ((closed_system, slope),)
 
     def closed_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
         """Return the closed systems at one point (m,), as an analysis has them."""
@@ -236,7 +236,7 @@ def _is_apart(matrices: Floats) -> Truths:
 
 def _filled_up(blocks: Sequence[Sequence[Floats]]) -> Floats:
     """Return the blocks of each point as one matrix (k, n, n), all of it NaN where a block is."""
-    size = max((sum(len(values) for values in listed) for listed in blocks), default=0)
+    size = max((sum(len(values) for values in block) for block in blocks), default=0)
     result = np.zeros((len(blocks), size, size))
     for matrix, listed in zip(result, blocks, strict=True):
         if not all(np.isfinite(values).all() for values in listed):
@@ -390,7 +390,7 @@ def free_parameters(system: CompiledSystem) -> list[Free]:
     reaches, as everybody's would set the groups' own as well. What is given to a group peer by peer, or as
     an expression, has no one value there and is left out.
     """
-    listed = []
+    frees = []
     shaping = scope_of(system).needed(
         [*(timing.name for timing in system.timings), *(group_count(group.name) for group in system.groups)]
     )
@@ -399,19 +399,19 @@ def free_parameters(system: CompiledSystem) -> list[Free]:
             continue
         several = {
             group.name: any(column.name == parameter.name for column in group.columns)
-            or any(own.name == parameter.name and own.formula for own in group.values)
+            or any(value.name == parameter.name and value.formula for value in group.values)
             for group in system.groups
         }
-        own = any(own.name == parameter.name for group in system.groups for own in group.values)
+        own = any(value.name == parameter.name for group in system.groups for value in group.values)
         if not own and not any(several.values()):
-            listed.append(Free(parameter.name))
+            frees.append(Free(parameter.name))
             continue
-        listed += [
+        frees += [
             Free(parameter.name, group.name)
             for group in system.groups
             if not several[group.name] and _reaches(system, group, parameter.name)
         ]
-    return listed
+    return frees
 
 
 def _reaches(system: CompiledSystem, group: Group, name: str) -> bool:

@@ -72,10 +72,10 @@ def root_locus(system: CompiledSystem, critical: Critical) -> Locus:
     if critical.counted:
         values = np.unique(np.round(values))
     prepared = prepare(system)
-    here = analyze(system, prepared=prepared)
-    now = np.array([mode.eigenvalue for mode in here.modes])
+    analysis = analyze(system, prepared=prepared)
+    now = np.array([mode.eigenvalue for mode in analysis.modes])
     places, eigenvalues = eigenvalues_at(system, free, values.tolist(), prepared=prepared)
-    return Locus(critical, here.frame_s, values[places], eigenvalues, now)
+    return Locus(critical, analysis.frame_s, values[places], eigenvalues, now)
 
 
 def eigenvalues_at(

@@ -403,16 +403,16 @@ def _reaching(system: CompiledSystem, columns: Sequence[int], free: Sequence[Fre
 
 
 def _filled(
-    family: _Family, varied: Sequence[Varied], places: Integers, some: Integers, rows: Rows
+    family: _Family, varied: Sequence[Varied], places: Integers, numbers: Integers, rows: Rows
 ) -> Truths:
     """Fill in what the matrices of some points decide, and say of each whether they do."""
-    done = np.zeros(len(some), dtype=np.bool_)
+    done = np.zeros(len(numbers), dtype=np.bool_)
     states = max(len(closed_system.layout.names) for closed_system in family.evaluator.closed)
     together = max(1, min(TOGETHER, ENTRIES // states**2))
     with single_threaded(), np.errstate(all="ignore"):
-        for start in range(0, len(some), together):
+        for start in range(0, len(numbers), together):
             mine = slice(start, start + together)
-            done[mine] = _decided(family, varied, places[some[mine]], some[mine], rows)
+            done[mine] = _decided(family, varied, places[numbers[mine]], numbers[mine], rows)
     return done
 
 
@@ -512,10 +512,12 @@ def _vectors(
 
 
 def _resolved(
-    family: _Family, varied: Sequence[Varied], some: _Reaching, places: Sequence[int]
+    family: _Family, varied: Sequence[Varied], reaching: _Reaching, places: Sequence[int]
 ) -> Numbers | None:
     """Return the scene's numbers with what others follow from at these places; None if these may not be."""
-    given = tuple(varied[column].override(place) for column, place in zip(some.columns, places, strict=True))
+    given = tuple(
+        varied[column].override(place) for column, place in zip(reaching.columns, places, strict=True)
+    )
     if given not in family.resolved:
         if len(family.resolved) >= MOST_RESOLVED:
             family.resolved.clear()

@@ -181,8 +181,8 @@ def _lines(
     which it varies: a parameter of 0 varies by itself.
     """
     base = np.array([parameter_of(system, item).value for item in free])
-    some = [item for item, value in zip(free, base, strict=True) if value]
-    together = evaluator(system, some, prepared=prepared) if some and not slow else None
+    frees = [item for item, value in zip(free, base, strict=True) if value]
+    together = evaluator(system, frees, prepared=prepared) if frees and not slow else None
     for item, present in zip(free, base.tolist(), strict=True):
         limit = parameter_of(system, item).maximum
         most = math.inf if limit is None else limit
@@ -194,7 +194,7 @@ def _lines(
             continue
         if present:
             assert together is not None, "it is among those that are not 0"
-            whole = MatrixLine(together, base[base != 0], some.index(item), present)
+            whole = MatrixLine(together, base[base != 0], frees.index(item), present)
         else:
             whole = MatrixLine(evaluator(system, [item], prepared=prepared), np.zeros(1), 0, present)
         top = min(GROWTH * whole.scale, most)

@@ -128,11 +128,11 @@ def _too_many(count: int) -> str:
     return f"over this network, {count} numbers take too long to vary (apc critical varies one)"
 
 
-def _not_varied(here: Growth) -> str:
+def _not_varied(growth: Growth) -> str:
     """Return why a scene is not looked at for many values, "" where it is."""
-    if here.why:
-        return f"over the network, the scene is not judged: {here.why}"
-    if not here.quick:
+    if growth.why:
+        return f"over the network, the scene is not judged: {growth.why}"
+    if not growth.quick:
         return (
             "over this network, to judge one value takes long (apc critical looks at those of one parameter)"
         )

@@ -250,15 +250,15 @@ def _clusters(system: CompiledSystem, free: Sequence[Free], prepared: Prepared) 
     for name, (matrix, slopes) in zip(family.names, pairs, strict=True):
         if not matrix.shape[1]:
             continue
-        own = _of_system(name, matrix[0], slopes[: len(free)], still)
+        clusters = _of_system(name, matrix[0], slopes[: len(free)], still)
         if not all(
-            cluster.condition < WORST for cluster in own
+            cluster.condition < WORST for cluster in clusters
         ):  # peers in a chain share eigenvalues, no motion
-            own = []
+            clusters = []
             for states in _alone(matrix[0], slopes):
                 block = np.index_exp[..., states[:, None], states]
-                own += _of_system(name, matrix[0][block], slopes[block][: len(free)], still)
-        result += own
+                clusters += _of_system(name, matrix[0][block], slopes[block][: len(free)], still)
+        result += clusters
     sizes = [float(np.abs(item.values).max()) for item in result]
     least = max(sizes, default=0.0) - SHARED * max(1.0, *sizes, 0.0)
     kept = [item for item, size in zip(result, sizes, strict=True) if size >= least]
