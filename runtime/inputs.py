@@ -130,7 +130,7 @@ def open_scene(
     outputs: Mapping[str, Path | None] | None = None,
     *,
     hands: str = "free",
-    told: Callable[[str], None] | None = None,
+    notify: Callable[[str], None] | None = None,
 ) -> CompiledSystem:
     """Return the compiled model that a command means.
 
@@ -144,7 +144,7 @@ def open_scene(
         What the command will write, by the option that says so: see `check_outputs`.
     hands
         How hands are to be taken, see `devices.with_hands`.
-    told
+    notify
         Is told what a setting for all groups takes the place of.
 
     Raises
@@ -169,9 +169,9 @@ def open_scene(
         if any(override.free == other.free for other in overrides[:place]):
             what = f"{override.free.label} is set twice"
             raise ApcError(Mistake("E621", OVERRIDE, what, "one value", hint=f'--set "{settings[place]}"'))
-    if told is not None:
+    if notify is not None:
         for note in notes_for_all_groups(system, [override.free for override in overrides]):
-            told(note)
+            notify(note)
     return apply(system, overrides)
 
 

@@ -58,7 +58,7 @@ class Patience:
     """What to do while no result comes: `told` hears of it; after `limit` seconds the work ends."""
 
     limit: float | None = None
-    told: Callable[[str], None] = lambda _: None
+    notify: Callable[[str], None] = lambda _: None
 
 
 def cores() -> int:
@@ -162,10 +162,10 @@ def results(
     except ApcError:
         raise
     except Exception as error:
-        told = workers.trouble(error)
-        if told is None:
+        trouble = workers.trouble(error)
+        if trouble is None:
             raise
-        raise told from error
+        raise trouble from error
 
 
 def _tell_silence(seconds: float, patience: Patience, place: Place) -> None:
@@ -174,7 +174,7 @@ def _tell_silence(seconds: float, patience: Patience, place: Place) -> None:
     if patience.limit is not None and seconds >= patience.limit:
         what += ": they are stuck, or a part takes longer"
         raise ApcError(Mistake("E889", place, what, hint=f'--patience "{2 * seconds:g} s"'))
-    patience.told(f"{what}; still waiting")
+    patience.notify(f"{what}; still waiting")
 
 
 @contextmanager

@@ -71,7 +71,7 @@ def bench_command(
         return
     from apc.benchmark.bench import bench
 
-    system = open_scene(file, settings, {"--plot": plot}, told=note_aside)
+    system = open_scene(file, settings, {"--plot": plot}, notify=note_aside)
     with at_work("measuring"):
         result = bench(system)
     print_result(result, as_json=as_json)

@@ -75,15 +75,15 @@ def compare_command(
     systems, refused = [], {}
     for place, file in enumerate(files):
         try:
-            system = open_scene(file, settings, {"--out": out}, hands=hands, told=note_aside)
+            system = open_scene(file, settings, {"--out": out}, hands=hands, notify=note_aside)
         except ApcError as error:
             if error.mistakes[0].code not in UNHELD:
                 raise
             system = open_scene(file, settings, {"--out": out})
             refused[place] = error.mistakes[0].reason
         systems.append(system)
-    with status_line() as told:
-        comparison = compare(systems, over=over, criterion=asked, at=at, refused=refused, told=told)
+    with status_line() as progress:
+        comparison = compare(systems, over=over, criterion=asked, at=at, refused=refused, progress=progress)
     if out is not None:
         write_result(out, comparison, comparison.plot)
     print_result(comparison, as_json=as_json, written=[out])

@@ -71,14 +71,14 @@ def critical_command(
     if plot is not None and asked == "passive":
         what = "--plot and --hands passive don't go together: what hands can draw has no eigenvalues"
         raise ApcError(Mistake("E930", Place("--hands"), what, hint="--hands clamped"))
-    system = open_scene(file, settings, {"--plot": plot}, hands=hands, told=note_aside)
+    system = open_scene(file, settings, {"--plot": plot}, hands=hands, notify=note_aside)
     if over:
         if plot is not None:
             raise click.UsageError("--plot and --over don't go together: there are as many loci as scenes")
         print_result(_over(system, path, (lower, upper), over, asked), as_json=as_json)
         return
-    with status_line() as told:
-        result = critical(system, path, lower=lower, upper=upper, criterion=asked, told=told)
+    with status_line() as progress:
+        result = critical(system, path, lower=lower, upper=upper, criterion=asked, progress=progress)
     if plot is not None:
         from apc.present.pictures import write_picture
 
@@ -105,8 +105,8 @@ def _over(
         raise click.UsageError(f"{path} is 0 now, which says nothing of how large it may be: give --upper")
     low, high = ends[0] or f"0 {unit}", ends[1] or f"{GROWTH * abs(present):.12g} {unit}"
     demands = read_demands(system, [f"{path}={low}:{high}"], maximize=path, over=over, criterion=criterion)
-    with status_line() as told:
-        return tune(system, demands, told=told)
+    with status_line() as progress:
+        return tune(system, demands, progress=progress)
 
 
 def _check_order(path: str, file: str | None) -> None:

@@ -68,6 +68,6 @@ def export_command(
     from apc.inputs import open_scene
 
     chosen = format_of(to, out)
-    system = open_scene(file, settings, {"--out": out}, told=note_aside)
+    system = open_scene(file, settings, {"--out": out}, notify=note_aside)
     result = export(system, chosen, Asked(cut, free, peer, device, method), out)
     print_result(result, as_json=as_json, written=[out])

@@ -67,7 +67,7 @@ def feel_command(
         raise click.UsageError("--between A:B names the hand's device, A: no --at with it")
     if nyquist and (out is None or out.suffix.lower() not in FORMATS):
         raise click.UsageError(f"--nyquist is for a picture: --out with {', '.join(FORMATS)}")
-    system = open_scene(file, settings, {"--out": out}, told=note_aside)
+    system = open_scene(file, settings, {"--out": out}, notify=note_aside)
     result = feel(
         system,
         read_frequencies(system, frequencies, low, high, points),

@@ -66,7 +66,7 @@ def play_command(
 
     path = find_input(file, compiled_too=True)
     folder = out or Path(f"{path.stem}.run")
-    system = open_scene(str(path), settings, told=note_aside)
+    system = open_scene(str(path), settings, notify=note_aside)
     asked = parse_duration(duration) if duration is not None else None
     how = Play(
         duration=duration_of(system, asked),

@@ -76,9 +76,10 @@ def region_command(
     asked = criterion_with(hands, criterion)
     note_usual(hands)
     systems = [
-        open_scene(text, settings, {"--out": out}, hands=hands, told=note_aside) for text in (file, *compare)
+        open_scene(text, settings, {"--out": out}, hands=hands, notify=note_aside)
+        for text in (file, *compare)
     ]
-    with status_line() as told:
+    with status_line() as progress:
         result = compare_regions(
             systems,
             x=x,
@@ -88,7 +89,7 @@ def region_command(
             normalize=normalize,
             cells=cells,
             criterion=asked,
-            told=told,
+            progress=progress,
         )
     if out is not None:
         write_result(out, result, result.plot)

@@ -103,7 +103,7 @@ def simulate_command(
     asked = parse_duration(duration) if duration is not None else None
     if out is not None:
         _check_rows(out)
-    system = open_scene(file, settings, {"--out": out, "--plot": plot, "--still": still}, told=note_aside)
+    system = open_scene(file, settings, {"--out": out, "--plot": plot, "--still": still}, notify=note_aside)
     if trace_of is not None:
         from apc.moments.worst import trace_of_worst
 

@@ -104,7 +104,7 @@ def tune_command(
         )
     if write is not None and against:
         raise click.UsageError("--write is of one design, and --against finds several")
-    system = open_scene(file, settings, {"--write": write, "--plot": plot}, hands=hands, told=note_aside)
+    system = open_scene(file, settings, {"--write": write, "--plot": plot}, hands=hands, notify=note_aside)
     criterion = criterion_with(hands, None)
     if hands == FREE:
         system, criterion = held_as_studied(system)
@@ -120,14 +120,16 @@ def tune_command(
     if plot is not None and not against:  # what can't be drawn is refused before the search
         panels_of(system, len(demands.free))
     if against:
-        with status_line() as told:
-            weighed = front(system, demands, read_against(against), seconds=read_seconds(time), told=told)
+        with status_line() as progress:
+            weighed = front(
+                system, demands, read_against(against), seconds=read_seconds(time), progress=progress
+            )
         if plot is not None:
             write_picture(weighed.plot, plot)
         print_result(weighed, as_json=as_json, written=[plot])
         return
-    with status_line() as told:
-        tuning = tune(system, demands, seconds=read_seconds(time), told=told)
+    with status_line() as progress:
+        tuning = tune(system, demands, seconds=read_seconds(time), progress=progress)
     if write is not None and tuning.met:
         _write(system, tuning, settings, write)
     if plot is not None:

@@ -28,7 +28,7 @@ from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare as prepare_to_play
 from apc.simulation.trajectory import Played, duration_of, play, provenance_of
 from apc.vary.critical import Critical, critical
-from apc.vary.crossing import Told
+from apc.vary.crossing import Progress
 from apc.vary.growth import NOMINAL, PASSIVE, criterion_of
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ def compare(
     criterion: str | None = None,
     at: str = "",
     refused: Mapping[int, str] = NOTHING,
-    told: Told | None = None,
+    progress: Progress | None = None,
 ) -> Comparison:
     """Ask the same of several scenes.
 
@@ -146,7 +146,7 @@ def compare(
         The device whose hand feels, as `hands.feel.feel` takes it; if not given, of the first peer with one.
     refused
         Of scenes, by their places, that can't be asked: why. They have a place in the table all the same.
-    told
+    progress
         Is told how far the work is.
 
     Raises
@@ -164,7 +164,7 @@ def compare(
         why = refused.get(place, "")
         if not why:
             try:
-                schemes.append(_scheme(system, chosen[place], criterion, at, told))
+                schemes.append(_scheme(system, chosen[place], criterion, at, progress))
                 continue
             except ApcError as error:
                 why = error.mistakes[0].reason
@@ -178,12 +178,12 @@ def _scheme(
     axes: Mapping[str, Choice],
     criterion: str | None,
     at: str,
-    told: Told | None,
+    progress: Progress | None,
 ) -> Scheme:
     """Return what is told of one scene. Raises ApcError, as `analyze` and `passive_hands`, if it can't be."""
     names = {axis: item.name for axis, item in axes.items()}
     missing = {axis: item.why for axis, item in axes.items() if item.why}
-    say = told or (lambda _: None)
+    say = progress or (lambda _: None)
 
     def had(key: str, command: str, compute: Callable[[], _Found]) -> _Found | None:
         try:
@@ -197,7 +197,9 @@ def _scheme(
             return None
         command = f"apc critical {names[axis]}"
         say(f"{system.name}: {command}")
-        return had(axis, command, lambda: critical(system, names[axis], criterion=criterion, told=told))
+        return had(
+            axis, command, lambda: critical(system, names[axis], criterion=criterion, progress=progress)
+        )
 
     say(f"{system.name}: its verdict")
     prepared = prepare(system)
@@ -221,7 +223,7 @@ def _scheme(
     )
 
 
-def _played(system: CompiledSystem, say: Told) -> Played:
+def _played(system: CompiledSystem, say: Progress) -> Played:
     """Return what a scene does in time, by its experiment."""
     simulation = prepare_to_play(system, Settings(duration_of(system, None)))
     say(f"{system.name}: apc simulate")

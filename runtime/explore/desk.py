@@ -18,7 +18,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 
 from apc.compiler.errors import Mistake, Place
-from apc.explore.sections import Task, Told, compute
+from apc.explore.sections import SectionAnswer, Task, compute
 from apc.processes import Workers, local_processes
 
 # Seconds after which work that is no longer wanted is ended: to start afresh takes about one.
@@ -32,7 +32,7 @@ DRAWN = 0.05
 LOST = Mistake("E981", Place("explore"), "the process that computes ended without a word: too little memory?")
 
 # Is told a section, and what it has to show.
-Deliver = Callable[[str, Told], None]
+Deliver = Callable[[str, SectionAnswer], None]
 
 
 @dataclass(slots=True, eq=False)
@@ -59,7 +59,7 @@ class Desk:
     numbers: itertools.count[int] = field(default_factory=itertools.count)
     busy: tuple[int, Task, float] | None = None
     stack: ExitStack = field(default_factory=ExitStack)
-    workers: Workers[Task, Told] | None = None
+    workers: Workers[Task, SectionAnswer] | None = None
 
     def ask(self, task: Task) -> bool:
         """Compute a section anew, in the place of what it waited for, unless that is what was asked last.
@@ -117,7 +117,7 @@ class Desk:
             self.later(self._next, 1.1 * HELD)  # a timer may come early
         return self.held is not None and now - self.held < HELD
 
-    def _done(self, number: int, task: Task, done: Future[Told]) -> None:
+    def _done(self, number: int, task: Task, done: Future[SectionAnswer]) -> None:
         if self.busy is None or self.busy[0] != number:
             return  # it was ended, and is no longer asked
         self.busy = None
@@ -126,7 +126,7 @@ class Desk:
         except (BrokenProcessPool, CancelledError):
             self._end()
             self.last.pop(task.section, None)
-            told = Told(None, LOST.sentence)
+            told = SectionAnswer(None, LOST.sentence)
         if number > self.shown.get(task.section, -1):
             self.shown[task.section] = number
             self.deliver(task.section, told)

@@ -28,7 +28,7 @@ from apc.compiler.errors import ApcError
 from apc.distribution import program_version
 from apc.explore.desk import Desk
 from apc.explore.figures import FOCUS, FeelFigure, MotionFigure, RegionFigure, RootsFigure, Words
-from apc.explore.sections import Task, Told
+from apc.explore.sections import SectionAnswer, Task
 from apc.explore.server import TOKEN
 from apc.explore.sliders import (
     PEOPLE,
@@ -522,7 +522,7 @@ class Page:
         else:
             self.document.add_next_tick_callback(call)
 
-    def _deliver(self, section: str, told: Told) -> None:
+    def _deliver(self, section: str, told: SectionAnswer) -> None:
         """Show what a section tells."""
         result = told.found
         if section == "verdict" and self.linear is None:

@@ -1,7 +1,7 @@
 """What each section of the page shows, computed where the page doesn't wait for it.
 
 Takes: a compiled model as bytes, and a `Task`: a section, the numbers that were moved, what it is asked.
-Gives: `Task`, `Told`, `compute`; `SECTIONS`.
+Gives: `Task`, `SectionAnswer`, `compute`; `SECTIONS`.
 Guarantees: every number is one that the function of the public API gives; a section that a scene has nothing
 for says so in words; what is at fault is told as `apc` tells it.
 Does not: know the browser, or keep an answer.
@@ -62,7 +62,7 @@ class Task:
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class SectionAnswer:
     """What a section has to show, as plain data and arrays; None with the reason in `why`."""
 
     found: Plain | None
@@ -76,7 +76,7 @@ def _opened(model: bytes) -> tuple[CompiledSystem, Prepared]:
     return system, prepare(system)
 
 
-def compute(model: bytes, task: Task) -> Told:
+def compute(model: bytes, task: Task) -> SectionAnswer:
     """Return what a section shows.
 
     Parameters
@@ -89,13 +89,15 @@ def compute(model: bytes, task: Task) -> Told:
     try:
         system, prepared = _opened(model)
         changed = apply(system, task.overrides)
-        return Told(SECTIONS[task.section](changed, prepared, task.asked))
+        return SectionAnswer(SECTIONS[task.section](changed, prepared, task.asked))
     except ApcError as error:
-        return Told(
+        return SectionAnswer(
             None, "\n".join(mistake.reason for mistake in error.mistakes)
         )  # whose hints are for the terminal
     except Exception as error:  # the other sections go on
-        return Told(None, f"This is a bug of apc, not of your scene: {type(error).__name__}: {error}")
+        return SectionAnswer(
+            None, f"This is a bug of apc, not of your scene: {type(error).__name__}: {error}"
+        )
 
 
 def _verdict(system: CompiledSystem, prepared: Prepared, _: None) -> Plain:

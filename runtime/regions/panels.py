@@ -28,7 +28,7 @@ from apc.regions.axes import PLACE, parse_axes
 from apc.regions.overlay import Overlay, overlay_points, parse_overlay
 from apc.regions.region import CELLS, Floats, Region, region
 from apc.result import Look, Result
-from apc.vary.crossing import Told
+from apc.vary.crossing import Progress
 
 # By what a parameter is moved to see which weights follow it: no round ratio, so that none of them agree.
 MOVE = Fraction(19, 13)
@@ -109,7 +109,7 @@ def compare_regions(
     normalize: bool = False,
     cells: int = CELLS,
     criterion: str | None = None,
-    told: Told | None = None,
+    progress: Progress | None = None,
 ) -> Panels:
     """Find the regions of some scenes with some settings.
 
@@ -126,7 +126,7 @@ def compare_regions(
     normalize
         Whether y is the effective gain: a scene that sums over its others is given y divided by their number,
         so that its coupling is as strong as that of a scene that takes their mean.
-    cells, criterion, told
+    cells, criterion, progress
         See `region.region`.
 
     Raises
@@ -150,7 +150,8 @@ def compare_regions(
     result = []
     for title, work, laid in jobs:
         regions = tuple(
-            region(system, axes, cells=cells, criterion=criterion, told=told) for system, axes, _ in work
+            region(system, axes, cells=cells, criterion=criterion, progress=progress)
+            for system, axes, _ in work
         )
         first, axes, gain = work[0]
         lines = tuple(

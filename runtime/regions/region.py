@@ -38,7 +38,7 @@ from apc.regions.strips import BRANCHES, Striped, trace_strips
 from apc.regions.survey import blurred, survey
 from apc.result import Look, Result
 from apc.threads import single_threaded
-from apc.vary.crossing import Told
+from apc.vary.crossing import Progress
 from apc.vary.evaluator import (
     PointEvaluator,
     evaluator_of_many,
@@ -236,7 +236,7 @@ def region(
     tolerance: float | None = None,
     criterion: str | None = None,
     prepared: Prepared | None = None,
-    told: Told | None = None,
+    progress: Progress | None = None,
 ) -> Region:
     """Find the boundary of the stable region of two parameters.
 
@@ -255,7 +255,7 @@ def region(
         "mean-square" or "nominal", see `critical.critical`.
     prepared
         From `analysis.prepare`, of this system with any numbers.
-    told
+    progress
         Is told, in words, how far the work is.
 
     Raises
@@ -301,7 +301,7 @@ def region(
         if start is not None and anywhere:
             at_once = _plane(system, free, rectangle, start, meant, timed=False)
             try:
-                striped = _surveyed(at_once, cells, tolerance, told)
+                striped = _surveyed(at_once, cells, tolerance, progress)
                 plane = at_once
             except ApcError as error:
                 if error.mistakes[0].code != "E905":
@@ -311,9 +311,11 @@ def region(
                 family = replace(plane.family, evaluator=points)
                 plane = replace(plane, family=family, closed_at=points.closed_at)
         elif start is not None:
-            striped = trace_strips(system, axes, times[0], start, cells=cells, tolerance=tolerance, told=told)
+            striped = trace_strips(
+                system, axes, times[0], start, cells=cells, tolerance=tolerance, progress=progress
+            )
         stepped = plane.stepped and striped is None
-        striped = striped or _surveyed(plane, cells, tolerance, told)
+        striped = striped or _surveyed(plane, cells, tolerance, progress)
         curves = tuple(_curve(plane, arc, meant) for arc in striped.arcs)
     whole = float(rectangle.width.prod())
     return Region(
@@ -390,7 +392,7 @@ def _plane(
     return _Plane(family, source.closed_at, stepped=False)
 
 
-def _surveyed(plane: _Plane, cells: int, tolerance: float, told: Told | None) -> Striped:
+def _surveyed(plane: _Plane, cells: int, tolerance: float, progress: Progress | None) -> Striped:
     """Survey the whole rectangle and follow the boundary through it, or go by steps from cell to cell."""
     deciding = Eigenvalues(plane.family)
     looked = 0
@@ -398,8 +400,8 @@ def _surveyed(plane: _Plane, cells: int, tolerance: float, told: Told | None) ->
     def samples(points: Floats) -> Floats:
         nonlocal looked
         looked += len(points)
-        if told:
-            told(f"looking at {counted(looked, 'point')}")
+        if progress:
+            progress(f"looking at {counted(looked, 'point')}")
         return _samples(plane, points)
 
     if plane.stepped:

@@ -90,7 +90,7 @@ def trace_strips(
     *,
     cells: int,
     tolerance: float,
-    told: Callable[[str], None] | None = None,
+    progress: Callable[[str], None] | None = None,
 ) -> Striped | None:
     """Follow the boundary strip by strip; None where some strip can't be had in closed form.
 
@@ -104,7 +104,7 @@ def trace_strips(
         From `analysis.prepare`; all sites linear.
     cells, tolerance
         As for `region.region`, of every strip.
-    told
+    progress
         Is told how far the work is.
 
     Raises
@@ -114,7 +114,7 @@ def trace_strips(
     """
     delay, other = axes[axis], axes[1 - axis]
     strips: list[_Strip] = []
-    for strip in _strips(system, delay, other, prepared, cells, tolerance, told):
+    for strip in _strips(system, delay, other, prepared, cells, tolerance, progress):
         if strip is None:
             return None
         strips.append(strip)
@@ -149,7 +149,7 @@ def _strips(
     prepared: Prepared,
     cells: int,
     tolerance: float,
-    told: Callable[[str], None] | None,
+    progress: Callable[[str], None] | None,
 ) -> Iterator[_Strip | None]:
     """Yield the strips in order; None for one that can't be had in closed form."""
     if reaches_count(system, delay.free):
@@ -163,7 +163,7 @@ def _strips(
     longest = system_with_delay(system, delay.free, delay.high)
     evaluator_of_many(longest, [other.free], PLACE, prepared=prepared)
     source = PointEvaluator(system, (delay.free, other.free), prepared)
-    tell = pace(system, delay.free, delay.low, delay.high, place=PLACE, told=told)
+    tell = pace(system, delay.free, delay.low, delay.high, place=PLACE, progress=progress)
     for piece in delay_pieces(system, delay.free, delay.low, prepared, place=PLACE, high=delay.high):
         high = min(piece.high, delay.high)
         tell(high)

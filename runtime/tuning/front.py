@@ -22,7 +22,7 @@ from apc.result import Result
 from apc.tuning.demands import AGAINST, FELT, Aim, Demands, Felt
 from apc.tuning.limits import Limits
 from apc.tuning.tune import Tuning, tune
-from apc.vary.crossing import Told
+from apc.vary.crossing import Progress
 
 Floats = NDArray[np.float64]
 
@@ -76,7 +76,7 @@ def front(
     *,
     points: int = POINTS,
     seconds: float = float("inf"),
-    told: Told | None = None,
+    progress: Progress | None = None,
 ) -> Front:
     """Return the best of an aim for each of several bounds on what a hand feels.
 
@@ -88,7 +88,7 @@ def front(
         What is felt, its `most` of no meaning.
     points
         How many designs.
-    seconds, told
+    seconds, progress
         As for `tune`; the time is that of all.
 
     Raises
@@ -105,9 +105,9 @@ def front(
         points = ((scenario.setting, np.append(gains, scenario.point)[None]) for scenario in every)
         return max(float(limits.measured(*point, limits.demands)[0, 0, 0]) for point in points)
 
-    best = tune(system, demands, seconds=seconds, told=told)
+    best = tune(system, demands, seconds=seconds, progress=progress)
     least = Aim(against.label, len(demands.free), False, FELT[against.name][0], ((1.0, against),))
-    other = tune(system, replace(demands, aim=least), seconds=until - time.monotonic(), told=told)
+    other = tune(system, replace(demands, aim=least), seconds=until - time.monotonic(), progress=progress)
     low, high = other.best, felt(np.array([float(gain.value) for gain in best.gains]))
     if not (best.met and other.met):
         what = f"no gains were found in these ranges that meet all demands, whatever {against.label} is"
@@ -123,7 +123,7 @@ def front(
             notes = (*notes, f"the time was up after {place} of {points} bounds, the largest first")
             break
         asked = replace(demands, felt=(*demands.felt, replace(against, most=bound)))
-        tuning = tune(system, asked, seconds=left, told=told)
+        tuning = tune(system, asked, seconds=left, progress=progress)
         if tuning.met:
             designs.append(_design(tuning, felt(np.array([float(gain.value) for gain in tuning.gains]))))
     designs.sort(key=lambda design: design.felt)

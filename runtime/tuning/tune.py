@@ -42,7 +42,7 @@ from apc.tuning.bound import none_better
 from apc.tuning.demands import HINF, PLACE, Demands, Felt
 from apc.tuning.limits import BEYOND, RESPONSES, Limits, Scenario, felt_in
 from apc.tuning.optimum import BINDS, Optimum, Search
-from apc.vary.crossing import Told
+from apc.vary.crossing import Progress
 from apc.vary.growth import MEAN_SQUARE, PASSIVE
 
 Floats = NDArray[np.float64]
@@ -188,7 +188,7 @@ def tune(
     demands: Demands,
     *,
     seconds: float = math.inf,
-    told: Told | None = None,
+    progress: Progress | None = None,
 ) -> Tuning:
     """Find the best gains, and prove that they bear all that is asked.
 
@@ -198,7 +198,7 @@ def tune(
         The compiled scene, and what `read_demands` read for it.
     seconds
         How long to go on; the best found until then is the answer, with what is not proved of it.
-    told
+    progress
         Is told how far it is.
 
     Raises
@@ -208,7 +208,7 @@ def tune(
         E996 what is asked about hands is felt nowhere.
     """
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        return _Work(system, demands, time.monotonic() + seconds, told or (lambda _: None)).done()
+        return _Work(system, demands, time.monotonic() + seconds, progress or (lambda _: None)).done()
 
 
 @dataclass(eq=False)
@@ -218,7 +218,7 @@ class _Work:
     system: CompiledSystem
     demands: Demands
     until: float
-    told: Told
+    progress: Progress
     scenarios: list[Scenario] = field(default_factory=list)
     looked: int = 0
 
@@ -303,7 +303,7 @@ class _Work:
         sign = 1.0 if self.demands.aim.larger else -1.0
         begun: list[Floats] = []
         for turn in itertools.count():
-            self.told(f"looking for gains in {len(self.scenarios)} of {len(self.every)} scenarios")
+            self.progress(f"looking for gains in {len(self.scenarios)} of {len(self.every)} scenarios")
             search = Search(self.limits, self.scenarios, column, sign)
             if not starts:
                 starts = begun = search.start(self.present, self.every)
@@ -464,7 +464,7 @@ class _Work:
             if self.late:
                 proveds.append(Proved(named, _unlooked(self.system.name, ranges)))
                 continue
-            self.told(f"proving {len(proveds) + 1} of {len(order)}")
+            self.progress(f"proving {len(proveds) + 1} of {len(order)}")
             scene = apply(self.system, [*changes, *numbers])
             passive = self.demands.criterion == PASSIVE
             if passive and self.demands.box:
@@ -609,7 +609,7 @@ class _Work:
         worst = self.limits.worst(self.every, np.array([[float(gain) for gain in gains]]))[0]
         order = np.argsort(-worst, kind="stable").tolist()
         listed = dict.fromkeys([*self._binding_scenarios(optimum), *(self.every[place] for place in order)])
-        self.told("proving that no gains do better")
+        self.progress("proving that no gains do better")
         return none_better(
             [self._scene(item) for item in list(listed)[:LIMITING]],
             self.limits.prepared,

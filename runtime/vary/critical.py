@@ -33,7 +33,7 @@ from apc.option_value import option_value
 from apc.result import Look, Result
 from apc.threads import single_threaded
 from apc.vary.counts import count_range
-from apc.vary.crossing import CELL, Crossing, Line, Search, Told, search
+from apc.vary.crossing import CELL, Crossing, Line, Progress, Search, search
 from apc.vary.delays import delay_now, pace
 from apc.vary.evaluator import (
     evaluator_of_many,
@@ -125,7 +125,7 @@ def critical(
     lower: str | None = None,
     upper: str | None = None,
     criterion: str | None = None,
-    told: Told | None = None,
+    progress: Progress | None = None,
 ) -> Critical:
     """Find the values of a parameter at which a scene becomes stable or unstable.
 
@@ -143,7 +143,7 @@ def critical(
         "mean-square": what becomes of second moments over the network as it is; "nominal": every packet on
         time; "passive": with every passive hand at every device. None: mean square where a link is
         unreliable.
-    told
+    progress
         Is told how far the search is.
 
     Raises
@@ -174,7 +174,7 @@ def critical(
         if counted:
             result = search(
                 CountLine(system, free, stable_of, *count_range(system, free, limits, present, _PLACE)),
-                told=told,
+                progress=progress,
             )
         elif by_growth:
             refuse_time(system, free, _PLACE, chosen_criterion)
@@ -182,7 +182,7 @@ def critical(
             points = growth_points(system, free, low, high, present)
             result = search(
                 GrowthLine(GrowthEvaluator(system, (free,), prepared, _PLACE, chosen_criterion), points),
-                told=told,
+                progress=progress,
             )
             if chosen_criterion == PASSIVE and not passive_hands(system, prepared).why:
                 result = replace(result, enters=True)  # where clamped devices shake all values are one
@@ -190,14 +190,14 @@ def critical(
             start = _at_start(system, prepared, free)
             begin = limits[0] or Fraction(0)
             end = limits[1] or delay_reach(system, free, begin, pieces=PIECES, further=FURTHER)[0]
-            tell = pace(system, free, begin, end, place=_PLACE, told=told)
+            tell = pace(system, free, begin, end, place=_PLACE, progress=progress)
             result = search(DelayLine(system, free, start, begin, end, tell))
         else:
             at_start = None if reaches_start(system, free) else prepare_at_start(system, prepared)
-            result = search(_line(system, free, limits, at_start or prepared), told=told)
+            result = search(_line(system, free, limits, at_start or prepared), progress=progress)
             if at_start is not None and not result.sided:
                 # Contacts close or open along the way, and other motions are left out of the verdict.
-                result = search(_line(system, free, limits, prepared), told=told)
+                result = search(_line(system, free, limits, prepared), progress=progress)
 
         def stable_now() -> bool | None:
             return stable_of(system)

@@ -35,7 +35,7 @@ Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
 # Is told, in words, how far a search is.
-Told = Callable[[str], None]
+Progress = Callable[[str], None]
 
 # A magnitude nearer to 1 than this tells no side: far above the rounding of a few dozen states.
 UNSURE = 1e-11
@@ -204,7 +204,7 @@ class _Samples:
         return _Samples(points[order], values[order], slopes[order])
 
 
-def search(line: Line, *, first: bool = False, told: Told | None = None) -> Search:
+def search(line: Line, *, first: bool = False, progress: Progress | None = None) -> Search:
     """Find the crossings of a line.
 
     Parameters
@@ -214,7 +214,7 @@ def search(line: Line, *, first: bool = False, told: Told | None = None) -> Sear
     first
         Go no further than where stability is first lost; a value that can't be judged ends the search
         then.
-    told
+    progress
         Is told how far the search is.
     """
     edges: list[Crossing] = []
@@ -226,8 +226,8 @@ def search(line: Line, *, first: bool = False, told: Told | None = None) -> Sear
     for number, stretch in enumerate(line.stretches()):
         samples, cleared, why = _scanned(stretch, first=first)
         looked, whole = looked + len(samples.points), whole and cleared
-        if told:
-            told(f"looking at {counted(looked, 'value')} of {line.label}")
+        if progress:
+            progress(f"looking at {counted(looked, 'value')} of {line.label}")
         if len(stretch.points) > 1 and len(samples.points):
             ends += samples.points[[0, -1]].tolist()
         else:

@@ -137,7 +137,7 @@ def pace(
     high: Fraction,
     *,
     place: Place,
-    told: Callable[[str], None] | None,
+    progress: Callable[[str], None] | None,
 ) -> Callable[[Fraction], None]:
     """Return what tells, as each piece begins and is given its end, how far a search over a delay is.
 
@@ -145,7 +145,7 @@ def pace(
     ----------
     system, free, low, high, place
         As for `delay_pieces`, which raises the same.
-    told
+    progress
         Is told, in words, with the time that is left if the other pieces take as long as those before.
     """
     pieces = _count(free, low, high, borders(system, free, place=place), place)
@@ -153,9 +153,9 @@ def pace(
 
     def tell(value: Fraction) -> None:
         nonlocal done
-        if told:
+        if progress:
             left = time_left(time.monotonic() - begun, done, pieces)
-            told(f"looking at {free.label} up to {float(value):.6g} s of {float(high):.6g} s{left}")
+            progress(f"looking at {free.label} up to {float(value):.6g} s of {float(high):.6g} s{left}")
         done += 1
 
     return tell

@@ -250,7 +250,7 @@ class DelayLine(_JudgedLine):
     prepared: Prepared
     low: Fraction
     high: Fraction
-    told: Callable[[Fraction], None] | None = None
+    progress: Callable[[Fraction], None] | None = None
     rigid: dict[int, list[int]] = field(default_factory=dict)
 
     def _verdict(self, value: Fraction) -> Verdict:
@@ -275,8 +275,8 @@ class DelayLine(_JudgedLine):
                 yield self._moving(piece, piece.evaluator)
 
     def _tell(self, high: Fraction) -> None:
-        if self.told:
-            self.told(min(high, self.high))
+        if self.progress:
+            self.progress(min(high, self.high))
 
     def _constant(
         self, low: Fraction, high: Fraction, inside: Fraction, there: CompiledSystem | None = None

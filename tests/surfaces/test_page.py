@@ -37,7 +37,7 @@ from apc.explore import sections
 from apc.explore.desk import Desk
 from apc.explore.motion import motion_of
 from apc.explore.page import Page, scene_of
-from apc.explore.sections import Task, Told, compute
+from apc.explore.sections import SectionAnswer, Task, compute
 from apc.explore.server import MOST, _shortened
 from apc.explore.sliders import (
     Slider,
@@ -187,15 +187,15 @@ class Held:
     """Workers that do nothing until they are told to."""
 
     def __init__(self) -> None:
-        self.asked: list[tuple[Task, Future[Told]]] = []
+        self.asked: list[tuple[Task, Future[SectionAnswer]]] = []
 
-    def submit(self, task: Task) -> Future[Told]:
+    def submit(self, task: Task) -> Future[SectionAnswer]:
         self.asked.append((task, Future()))
         return self.asked[-1][1]
 
     def finish(self, place: int) -> None:
         task, future = self.asked[place]
-        future.set_result(Told({"of": task.asked}))
+        future.set_result(SectionAnswer({"of": task.asked}))
 
 
 def at_once(call: Callable[[], None], seconds: float) -> None:
@@ -487,10 +487,11 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Page:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("apc.explore.page.Desk", Asked)
         found = Page(scene_of(scene, (), None), document)
-    found._deliver("verdict", Told(None, "none"))
+    found._deliver("verdict", SectionAnswer(None, "none"))
     names = ["user[1].device.x", "user[1].cube.x"]
     found._deliver(
-        "feel", Told({"names": names, "at": names[0], "notes": ()} | {one: np.ones(2) for one in FELT})
+        "feel",
+        SectionAnswer({"names": names, "at": names[0], "notes": ()} | {one: np.ones(2) for one in FELT}),
     )
     Asked.asked.clear()
     return found
