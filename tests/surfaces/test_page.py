@@ -489,10 +489,8 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Page:
         found = Page(scene_of(scene, (), None), document)
     found._deliver("verdict", SectionAnswer(None, "none"))
     names = ["user[1].device.x", "user[1].cube.x"]
-    found._deliver(
-        "feel",
-        SectionAnswer({"names": names, "at": names[0], "notes": ()} | {one: np.ones(2) for one in FELT}),
-    )
+    felt = {"names": names, "at": names[0], "notes": ()} | {one: np.ones(2) for one in FELT}
+    found._deliver("feel", SectionAnswer(felt))
     Asked.asked.clear()
     return found
 

@@ -59,13 +59,12 @@ def test_people_read_the_scene_s_own_units_and_programs_si(model: apc.CompiledSy
     for ask, said in (
         (lambda scene: apc.critical(scene, stiffness), "below 1.09641 N/mm\n"),
         (lambda scene: apc.critical(scene, mass), "is now 100 g\n"),
-        (lambda scene: apc.parameters(scene), "0.5 N/mm "),
+        (apc.parameters, "0.5 N/mm "),
         (lambda scene: apc.region(scene, **axes), f"{mass}             50 to 200 g"),
         (lambda scene: apc.prove_box(scene, {mass: "±5%"}), f"{mass} from 95 g to 105 g"),
     ):
-        found = ask(own)
-        assert said in str(found), str(found)
-        plain, same = (json.dumps(one.to_dict() | {"origin": None}) for one in (found, ask(model)))
+        assert said in str(ask(own))
+        plain, same = (json.dumps(ask(one).to_dict() | {"origin": None}) for one in (own, model))
         assert plain == same
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import select
+import shlex
 import shutil
 import signal
 import socket
@@ -158,31 +159,11 @@ def test_what_cant_be_played_is_told(
     Path("open to all.txt").write_text("sixteen bytes or more", encoding="utf-8")
     Path("open to all.txt").chmod(0o604)
     there = sorted(str(one) for one in Path().rglob("*"))
-    listed = [
-        (["--peer", "user[4]", *other], "E970 a peer wants one of user[1], user[2], user[3], got user[4]."),
-        (["--peer", "user[1]", "--to", "user[9]=127.0.0.1:1"], '--to: E970 a peer wants one of user[1]'),
-        (["--peer", "user[1]", "--to", "user[2]=127.0.0.1:1"], 'Write: --to "user[3]=HOST:PORT"'),
-        (["--peer", "user[1]", *other, "--to", "user[2]=127.0.0.1:9"], "E971 user[2] is given twice"),
-        (["--peer", "user[1]", *other, "--to", "user[1]=127.0.0.1:9"], "E971 user[1] is the peer that"),
-        (["--peer", "user[1]", "--to", "user[2]=127.0.0.1:0"], '0. Write: --to "user[2]=192.'),
-        (["--peer", "user[1]", *other[:2], "--to", "user[3]=127.0.0.1:1"], "two peers have one address"),
-        (["--peer", "user[1]", "--to", "user[2]=[::1]:9"], "is not known by an IPv4 address"),
-        (["--peer", "user[1]", *other, "--wait", "-1 s"], "E207 the time wants 0 s or more, got -1 s"),
-        (["--peer", "user[1]", *other, "--out", "own"], "E973 is there already, and is no folder of a run"),
-        (["--out", "three.yaml"], "E973 is there already, and is no folder."),
-        (["--out", "no/such/folder"], "E601"),
-        (["--peer", "user[1]", "--listen", "nowhere", *other], "E971 an address wants HOST:PORT"),
-        (["--peer", "user[1]", "--to", "user[2]"], "E971 an address wants PEER=HOST:PORT"),
-        (["--peer", "user[1]", "--listen", f"127.0.0.1:{port}", *other], f"can't listen at 127.0.0.1:{port}"),
-        (["--peer", "user[1]", *other, "--wait", "100 ms"], "user[2], user[3] did not say within 0.1 s"),
-        (["--peer", "user[1]", *other, "--device", "no.py"], "E976"),
-        (["--out", "own"], "E973 is there already, and is no folder of a run"),
-        (["--secret-file", "short.txt"], "E974 a secret wants 16 bytes or more, got 3."),
-        (["--secret-file", "open to all.txt"], "users of this machine. Write: chmod 600 'open to all.txt'"),
-        (["--secret-file", "none.txt"], "E974"),
-    ]  # fmt: skip
-    for words, message in listed:
-        assert run(["play", "three.yaml", "--duration", "1 s", *words]) == 1, words
+    text = (Path(__file__).parent / "play.txt").read_text(encoding="utf-8")
+    text = text.replace("$OTHER", shlex.join(other)).replace("$PORT", str(port))
+    for line in text.splitlines():
+        words, _, message = line.partition(" → ")
+        assert run(["play", "three.yaml", "--duration", "1 s", *shlex.split(words)]) == 1, words
         assert message in " ".join(capsys.readouterr().err.split()), words
     assert Path("own/thesis.txt").read_text(encoding="utf-8") == "mine"
     assert sorted(str(one) for one in Path().rglob("*")) == there  # nothing is begun
