@@ -55,7 +55,7 @@ class Workers(Generic[Task, Result]):
 
 @dataclass(frozen=True, slots=True)
 class Patience:
-    """What to do while no result comes: `told` hears of it; after `limit` seconds the work ends."""
+    """What to do while no result comes: `notify` hears of it; after `limit` seconds the work ends."""
 
     limit: float | None = None
     notify: Callable[[str], None] = lambda _: None
