@@ -1,7 +1,7 @@
 """Eigenvalues of matrices known up to an error, each with a bound.
 
 Takes: square matrices, and a bound on what each entry may be off by.
-Gives: `Enclosure`, `enclose_stack`, `enclose_eigenvalues`, `discs`; `least_radius`; `misses_one`.
+Gives: `Enclosure`, `enclose_stack`, `enclose_eigenvalues`, `discs`; `least_radius`; `misses_an_eigenvalue`.
 Guarantees: the bounds hold for every matrix within the error, whatever their conditioning; rounding in the
 bounds themselves is charged. LAPACK's results are checked by their residuals, not believed.
 Does not: know where a matrix comes from, or what is rigid (see `spectrum`).
@@ -304,7 +304,7 @@ def least_radius(matrix: Floats, slopes: Floats, error: Floats) -> float:
         return float(abs(first) - (inwards + near) * (1 + charge) - charge)
 
 
-def misses_one(matrix: Floats, error: Floats) -> bool:
+def misses_an_eigenvalue(matrix: Floats, error: Floats) -> bool:
     """Say whether 1 is certainly no eigenvalue of a matrix (n, n) known up to an error."""
     n = len(matrix)
     away = np.eye(n) - matrix

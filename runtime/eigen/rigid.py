@@ -1,7 +1,7 @@
 """The motions that nothing holds back, found in exact arithmetic.
 
 Takes: a `ClosedSystem`, or a `Loop` whose matrix was never built.
-Gives: `RigidModes`, `find_rigid_modes`, `rigid_modes_here`; `Standing`, `what_stands`; `stays_rigid`.
+Gives: `RigidModes`, `find_rigid_modes`, `rigid_modes_of`; `Standing`, `what_stands`; `stays_rigid`.
 Guarantees: found from the equations with the parameters as exact rationals, never from an eigenvalue near 1;
 a stiffness of exactly zero frees what it held.
 Does not: find a motion that only repeats from frame to frame without standing still in between, or chains of
@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import ANGLES, LENGTH
 from apc.eigen.balls import BALLS, closed_frame, frame_steps
 from apc.eigen.closing import ClosedSystem, Loop
-from apc.eigen.enclosure import misses_one
+from apc.eigen.enclosure import misses_an_eigenvalue
 from apc.eigen.null_space import null_space, null_space_modulo, residue
 from apc.eigen.peers import PeerGroup, states_of
 from apc.frame.site import LinearSite, entrywise
@@ -86,12 +86,12 @@ def find_rigid_modes(system: ClosedSystem | Loop, *, with_drifts: bool = True) -
     )
 
 
-def rigid_modes_here(system: ClosedSystem) -> RigidModes:
+def rigid_modes_of(system: ClosedSystem) -> RigidModes:
     """Return the rigid modes of a system whose matrix is that of its sites' numbers, without drifts.
 
     Where the matrix tells that 1 is none of its eigenvalues there are none, and none are looked for.
     """
-    if misses_one(system.matrix, system.error):
+    if misses_an_eigenvalue(system.matrix, system.error):
         return RigidModes(np.zeros((len(system.names), 0)), (), ())
     return find_rigid_modes(system, with_drifts=False)
 

@@ -26,7 +26,7 @@ from apc.eigen.closing import ClosedSystem
 from apc.eigen.eigenpairs import Eigenpairs, components, pairs_to
 from apc.eigen.enclosure import SMALL, WIDE, Enclosure, descending, discs, enclose_eigenvalues
 from apc.eigen.relative import Relative, relative_bounded, relative_coordinates
-from apc.eigen.rigid import RigidModes, find_rigid_modes, rigid_modes_here
+from apc.eigen.rigid import RigidModes, find_rigid_modes, rigid_modes_of
 from apc.frame.course import turns
 from apc.frame.discretize import UNIT
 from apc.frame.schedule import Propagate
@@ -151,7 +151,7 @@ def solve_spectrum(
     A drift leaves a second eigenvalue 1 behind when only the rigid direction is removed. So when every error
     disc keeps clear of 1 there is none, and the exact search for one is spared.
     """
-    solved = [_solve(system, rigid_modes_here(system)) for system in systems]
+    solved = [_solve(system, rigid_modes_of(system)) for system in systems]
     lowest = max((item.low for item in solved), default=0.0)
     notes: list[str] = []
     for place, system in enumerate(systems):

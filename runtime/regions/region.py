@@ -388,7 +388,7 @@ def _plane(
         points = PointEvaluator(system, free, prepared)
         return _Plane(DirectFamily(points, rectangle, (), (), ()), points.closed_at, stepped=True)
     source = evaluator_of_many(system, free, PLACE, prepared=prepared)
-    family = family_over(source, rectangle, source.errors, split=source.one_shape)
+    family = family_over(source, rectangle, source.errors, split=source.same_shape)
     return _Plane(family, source.closed_at, stepped=False)
 
 

@@ -1,7 +1,7 @@
 """The frame matrices of a system for many values of its parameters at once, with their derivatives.
 
 Takes: groups of peers whose sites are affine, the exchange between them, and the parameters that vary.
-Gives: `MatrixSource`, `Evaluator`; `BatchEvaluator`, `batch_evaluator`; `lifted_here`, `relative_here`,
+Gives: `MatrixSource`, `Evaluator`; `BatchEvaluator`, `batch_evaluator`; `lifted_systems`, `relative_here`,
 `inverse_size`, `is_beyond`.
 Guarantees: what is built once serves every value; rigid motions are taken out by their exact directions; a
 derivative is exact to rounding. A point whose matrices are not finite, or that has other rigid motions than
@@ -43,10 +43,10 @@ from apc.vary.wiring import (
     Wiring,
     are_rigid,
     closed_loop,
+    known_by_constants,
     reduced,
     relative_at,
     site_key,
-    told_by_constants,
     wire,
 )
 
@@ -99,7 +99,7 @@ class Evaluator(MatrixSource, Protocol):
         """The names of the systems whose matrices are given."""
 
     @property
-    def one_shape(self) -> bool:
+    def same_shape(self) -> bool:
         """Whether each system has the same states everywhere."""
 
     def closed_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
@@ -173,7 +173,7 @@ class BatchEvaluator:
         return tuple(closed_system.name for closed_system in self.closed)
 
     @property
-    def one_shape(self) -> bool:
+    def same_shape(self) -> bool:
         """Each system has the same states everywhere."""
         return True
 
@@ -226,7 +226,7 @@ class BatchEvaluator:
     def closed_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
         """Return the closed systems at one point (m,), as an analysis has them: with error bounds."""
         assert not self.timed, "another time is another schedule"
-        return tuple(map(close_loop, lifted_here(self.with_sites(self.closed, value))))
+        return tuple(map(close_loop, lifted_systems(self.with_sites(self.closed, value))))
 
     def with_sites(self, systems: Sequence[Wired], value: Sequence[float]) -> tuple[Wired, ...]:
         """Return systems with the exact sites of one point (m,); of a time, all but the steps is of it."""
@@ -404,7 +404,7 @@ def _told_apart(evaluator: BatchEvaluator) -> tuple[Wiring, ...]:
         moves = bool(np.isfinite(matrix).all() and not are_rigid(wiring, matrix).all())
         if moves and not wiring.rigid.drifts:
             there = find_rigid_modes(evaluator.with_sites(evaluator.closed, other)[place], with_drifts=False)
-            wirings.append(told_by_constants(wiring, there))
+            wirings.append(known_by_constants(wiring, there))
         else:
             wirings.append(wiring)
     return tuple(wirings)
@@ -432,7 +432,7 @@ def _fixed(evaluator: BatchEvaluator) -> dict[tuple[int, int], Mapping[int, Step
     return result
 
 
-def lifted_here(systems: Sequence[Wired]) -> tuple[Wired, ...]:
+def lifted_systems(systems: Sequence[Wired]) -> tuple[Wired, ...]:
     """Return systems whose sites are linearized and lifted at the parameters they have, each once."""
     known: dict[tuple[int, int], tuple[LinearSite, FrameMap]] = {}
 

@@ -91,7 +91,7 @@ class PointEvaluator:
         return ("all systems",)
 
     @property
-    def one_shape(self) -> bool:
+    def same_shape(self) -> bool:
         """A point may have other states than the next."""
         return False
 

@@ -23,7 +23,7 @@ from apc.compiler.errors import ApcError, Place
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.eigenpairs import eigenvalues
 from apc.eigen.modes import split
-from apc.eigen.rigid import rigid_modes_here
+from apc.eigen.rigid import rigid_modes_of
 from apc.eigen.spectrum import DRIFTS, Spectrum, solve_spectrum
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
@@ -306,7 +306,7 @@ class DelayLine(_JudgedLine):
         except ApcError:  # an analysis spares a matrix that is too large
             return 1.0
         if len(systems) not in self.rigid:
-            self.rigid[len(systems)] = [len(rigid_modes_here(system).names) for system in systems]
+            self.rigid[len(systems)] = [len(rigid_modes_of(system).names) for system in systems]
         largest = 0.0
         for system, count in zip(systems, self.rigid[len(systems)], strict=True):
             values = np.linalg.eigvals(system.matrix)

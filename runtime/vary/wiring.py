@@ -1,7 +1,7 @@
 """Closing the loop of one system for many points at once, and taking its rigid motions out.
 
 Takes: a `ClosedSystem` that stands for all points, and the one-frame maps of its sites at each.
-Gives: `Wiring`, `wire`, `told_by_constants`, `closed_loop`, `reduced`, `relative_at`,
+Gives: `Wiring`, `wire`, `known_by_constants`, `closed_loop`, `reduced`, `relative_at`,
 `are_rigid`, `site_key`.
 Guarantees: the matrices are those of `closing.close_loop` in relative coordinates, to rounding; where the
 directions are not those of a rigid motion they are NaN.
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from apc.eigen.closing import ClosedSystem, Feedback, close, feedback_of
 from apc.eigen.peers import PeerGroup
 from apc.eigen.relative import Relative, relative, relative_coordinates, relative_places
-from apc.eigen.rigid import RigidModes, find_rigid_modes, rigid_modes_here
+from apc.eigen.rigid import RigidModes, find_rigid_modes, rigid_modes_of
 from apc.frame.lift import FrameMap
 
 Floats = NDArray[np.float64]
@@ -58,7 +58,7 @@ def site_key(group: PeerGroup) -> tuple[int, int]:
 def wire(system: ClosedSystem) -> Wiring:
     """Take down who hears whom in a closed system, and its rigid motions."""
     feedback = tuple(feedback_of(system, system.layout))
-    rigid = rigid_modes_here(system)
+    rigid = rigid_modes_of(system)
     wiring = _without(system, feedback, rigid)
     if rigid.names:
         within = reduced(wiring, system.matrix[None], 1)[0]
@@ -71,7 +71,7 @@ def _without(system: ClosedSystem, feedback: tuple[Feedback, ...], rigid: RigidM
     return Wiring(system, feedback, rigid, relative_coordinates(rigid.basis), moving=False)
 
 
-def told_by_constants(wiring: Wiring, there: RigidModes) -> Wiring:
+def known_by_constants(wiring: Wiring, there: RigidModes) -> Wiring:
     """Return the wiring of directions that follow the parameters, given up for them where they don't.
 
     A held force follows its stiffness, and tells nothing of the motion where that is next to nothing; how far
