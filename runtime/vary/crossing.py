@@ -443,4 +443,4 @@ def _root(stretch: Stretch, ends: Sequence[float], growth: Sequence[float], off:
         return min(low, high, key=lambda end: abs(at(end)[0]))
     # Imported where Newton's method fails: it takes as long as an analysis.
     brentq = load_pool("scipy.optimize").brentq
-    return float(brentq(lambda value: at(value)[0], low, high, xtol=5e-324, rtol=max(off / 2, 1e-15)))
+    return float(brentq(lambda value: at(value)[0], low, high, xtol=5e-324, rtol=off / 100))
