@@ -40,7 +40,7 @@ from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.frame.radius import RADII, value_of
 from apc.frame.schedule import Selected
-from apc.moments.crowd import Hearing, hearing, instants
+from apc.moments.crowd import Hearing, build_hearing, instants
 from apc.moments.held import held_scene
 from apc.moments.traces import heard_packets, hearing_packets, trace_radius
 from apc.moments.unserved import UnservedError
@@ -62,7 +62,7 @@ ABOVE = 1 + 1e-3
 class _Heard:
     """The packet that each tick hears at the middle of the range, and the packets it may be off by."""
 
-    told: Hearing
+    hearing: Hearing
     middle: Mapping[Selected, int]
     spread: Mapping[Selected, float]  # √(a² + b²)
 
@@ -97,13 +97,13 @@ def small_gain(system: CompiledSystem, delay: Free, low: Fraction, high: Fractio
         raise UnservedError("receivers ask how old packets are, or for the packet before")
     links = tuple(replace(item, channel=HOLDING) if item is link else item for item in middle.links)
     held = held_scene(unreliable := replace(middle, links=links), prepare(unreliable))
-    loops = loops_at_right_angles(held.told.groups, held.told.exchange, MOST_STATES)
+    loops = loops_at_right_angles(held.hearing.groups, held.hearing.exchange, MOST_STATES)
     if isinstance(loops, str):
         raise UnservedError(loops)
     ratios = ratios_of(loops[0].sites, held.lossy)
     weight, sizes = weight_of(loops, held.lossy)
     heard = _heard(middle, delay, low, high)
-    apart = loops_at_right_angles(heard.told.groups, heard.told.exchange, MOST_STATES)
+    apart = loops_at_right_angles(heard.hearing.groups, heard.hearing.exchange, MOST_STATES)
     assert not isinstance(apart, str), "the same peers"
     return max(_gain(loop, heard, ratios, sizes) for loop in apart) * weight
 
@@ -133,24 +133,24 @@ def unstable_delays(
 
 def _heard(middle: CompiledSystem, delay: Free, low: Fraction, high: Fraction) -> _Heard:
     """Return what each tick hears at the middle of a range, and how far from it at the ends."""
-    told = hearing(middle, prepare(middle))
-    times = {clock.name: instants(told, clock) for clock in middle.clocks}
+    hearing = build_hearing(middle, prepare(middle))
+    times = {clock.name: instants(hearing, clock) for clock in middle.clocks}
     links = {link.name: link for link in middle.links}
     numbers, spread = {}, {}
-    for row in chain.from_iterable(told.rows.values()):
-        link, now = links[row.way.link], told.timings[row.way.delay]
+    for row in chain.from_iterable(hearing.rows.values()):
+        link, now = links[row.way.link], hearing.timings[row.way.delay]
         ends = (low, high) if row.way.delay == delay.name else (now, now)
         newest, number, oldest = (
-            heard_packets(link, number, times[link.clock], times[row.clock][row.tick], told)[0]
+            heard_packets(link, number, times[link.clock], times[row.clock][row.tick], hearing)[0]
             for number in (ends[0], now, ends[1])
         )
         numbers[row], spread[row] = number, math.hypot(newest - number, number - oldest)
-    return _Heard(told, numbers, spread)
+    return _Heard(hearing, numbers, spread)
 
 
 def _gain(loop: Loop, heard: _Heard, ratios: Ratios, sizes: Sizes) -> float:
     """Return ‖d ← r √(a² + b²)‖∞ √J of a loop, proved from above."""
-    rows = heard.told.of(loop)
+    rows = heard.hearing.of(loop)
     slots = dict.fromkeys((sent.link for site in loop.sites for sent in site.schedule.sent), 1)
     packets = [heard.middle[row] for listed in rows for row in listed]
     depth = dict.fromkeys(slots, max(1, -min(packets, default=0)))

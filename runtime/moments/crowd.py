@@ -1,8 +1,8 @@
 """The mean loops and the luck of a scene: what its second moments are made of.
 
 Takes: a `CompiledSystem` whose links lose or delay packets independently of each other.
-Gives: `crowd`; `Classes`, `classes_of`, `moments_of`; `Hearing`, `hearing`, `own_value`; `peer_classes`,
-`remembered_of`, `standing_motions`, `instants`.
+Gives: `crowd`; `Classes`, `classes_of`, `moments_of`; `Hearing`, `build_hearing`, `own_value`;
+`peer_classes`, `remembered_of`, `standing_motions`, `instants`.
 Guarantees: equal peers on complete graphs cost the same, however many they are; peers that can change places
 are one class on any graph.
 Does not: say what it can't serve (see `network`).
@@ -63,7 +63,7 @@ class Hearing:
         return [self.rows[id(site.schedule)] for site in loop.sites]
 
 
-def hearing(
+def build_hearing(
     system: CompiledSystem, prepared: Prepared, *, first: Fraction = Fraction(0), stand_in: bool = False
 ) -> Hearing:
     """Lift the peers of a scene with a row of r for each tick that hears.
@@ -142,7 +142,7 @@ class Classes:
     `weights` says what a peer of one class weighs one of another by.
     """
 
-    told: Hearing
+    hearing: Hearing
     loops: tuple[Loop, ...]
     weights: Coupling
     standing: tuple[Floats, ...]
@@ -186,7 +186,7 @@ def crowd(system: CompiledSystem, hearing: Hearing) -> Moments:
         Its peers.
     """
     of = classes_of(hearing)
-    return moments_of(of, remembered_of(system, of.told, of.loops[0]))
+    return moments_of(of, remembered_of(system, of.hearing, of.loops[0]))
 
 
 def moments_of(
@@ -209,7 +209,7 @@ def moments_of(
         only = of.only(number)
         driving = [item for item in luck if only in (None, item.listened.site)]
         listened = [item.listened if only is None else replace(item.listened, site=0) for item in driving]
-        mean, channels = mean_loop(loop, of.told.of(loop), memories, listened, of.standing[number], frames)
+        mean, channels = mean_loop(loop, of.hearing.of(loop), memories, listened, of.standing[number], frames)
         classes = tuple(range(len(loop.sites))) if only is None else (only,)
         parts.append(
             Part(mean.matrix, only, mean.at, mean.offsets, tuple(_answers(mean.misses, luck, classes)))

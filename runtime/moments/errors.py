@@ -57,7 +57,7 @@ class Peer:
 class Forced:
     """The peers of a scene, pushed; `peers` says what of z they got, by the schedule's id."""
 
-    told: Hearing
+    hearing: Hearing
     peers: Mapping[int, Peer]
 
     def of(self, sites: Sequence[PeerGroup]) -> list[tuple[int, Peer]]:
@@ -66,7 +66,7 @@ class Forced:
 
     def peer_by_peer(self) -> list[tuple[int, Peer]]:
         """Return what each peer got, one after another."""
-        return self.of(dense_loop(self.told.groups, self.told.exchange).sites)
+        return self.of(dense_loop(self.hearing.groups, self.hearing.exchange).sites)
 
 
 def forced(system: CompiledSystem, hearing: Hearing, first: Fraction = Fraction(0)) -> Forced:

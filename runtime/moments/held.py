@@ -92,7 +92,7 @@ class HeldLoop:
 class HeldScene:
     """A scene whose receivers hold what they heard last; `lossy` are the links that lose packets."""
 
-    told: Hearing
+    hearing: Hearing
     lossy: frozenset[str]
 
 
@@ -291,10 +291,10 @@ def every_channel(
     most
         How many states are the most.
     """
-    peers = scene.told.exchange.peers
+    peers = scene.hearing.exchange.peers
     if most is not None and peers > most:
         raise UnservedError(f"{peers:,} peers don't fit in one matrix of {most} states")
-    loop = dense_loop(scene.told.groups, scene.told.exchange)
+    loop = dense_loop(scene.hearing.groups, scene.hearing.exchange)
     ears: list[Ear] = []
     of_way: dict[tuple[str, int, int], list[int]] = {}
     for g in range(len(loop.sites)):

@@ -40,7 +40,7 @@ from apc.frame.names import Range
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import resolve
 from apc.frame.taylor import hull, within
-from apc.moments.crowd import Classes, classes_of, hearing, moments_of, peer_classes, remembered_of
+from apc.moments.crowd import Classes, build_hearing, classes_of, moments_of, peer_classes, remembered_of
 from apc.moments.gains import below_1
 from apc.moments.mean_loops import Remembered
 from apc.moments.network import STABLE, UNSTABLE, growth
@@ -110,7 +110,7 @@ def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question:
     prepared = prepare(system)
 
     def lifted(changed: CompiledSystem) -> Any:
-        result = hearing(changed, prepared)
+        result = build_hearing(changed, prepared)
         return result.groups, result.exchange
 
     # Inside the box, as a link may lose nothing at an end of it; and moved along each range, as chances that
@@ -121,17 +121,17 @@ def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question:
         point = [*inside[:place], interval.high - (interval.high - interval.low) / 3, *inside[place + 1 :]]
         _refuse(_changed(system, ranges, point), prepared, interval)
     opened = open_sites(system, [ranges[place] for place in own], prepared, lifted)
-    told = hearing(opened.at, prepared)
-    sites = [opened.sites[group.name] for group in told.groups]
-    frames = open_frames(sites, [group.schedule for group in told.groups])
+    hearing = build_hearing(opened.at, prepared)
+    sites = [opened.sites[group.name] for group in hearing.groups]
+    frames = open_frames(sites, [group.schedule for group in hearing.groups])
     whole = tuple((ranges[place].low, ranges[place].high) for place in own)
     maps = [frame_map.mapped(lambda block: hull(block)[0]) for frame_map in frames_over(frames, [whole])]
-    lifted_wide = [group.with_lifted(frame) for group, frame in zip(told.groups, maps, strict=True)]
-    wide = peer_classes(replace(told, groups=tuple(lifted_wide)))[0][0]
-    memories = remembered_of(opened.at, told, wide)
-    classes = classes_of(told)
+    lifted_wide = [group.with_lifted(frame) for group, frame in zip(hearing.groups, maps, strict=True)]
+    wide = peer_classes(replace(hearing, groups=tuple(lifted_wide)))[0][0]
+    memories = remembered_of(opened.at, hearing, wide)
+    classes = classes_of(hearing)
     places = {
-        site.name: next(place for place, group in enumerate(told.groups) if site.peers[0] in group.peers)
+        site.name: next(place for place, group in enumerate(hearing.groups) if site.peers[0] in group.peers)
         for loop in classes.loops
         for site in loop.sites
     }
@@ -216,7 +216,7 @@ def _memories(asked: _Question, cell: Cell) -> Sequence[Remembered]:
         return asked.memories
     system = _changed(asked.system, asked.ranges, middle(cell), shares)
     moved = _moves(asked, cell, shares)
-    return remembered_of(system, asked.classes.told, asked.wide, lost=moved)
+    return remembered_of(system, asked.classes.hearing, asked.wide, lost=moved)
 
 
 def _moves(asked: _Question, cell: Cell, shares: Sequence[int]) -> dict[str, tuple[float, ...]]:

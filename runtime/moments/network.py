@@ -22,7 +22,7 @@ from apc.frame.exchange import arcs
 from apc.frame.parameters import resolve
 from apc.moments.almost_sure import AlmostSure, almost_sure
 from apc.moments.bursts import affine, tagged_error, tagged_radius
-from apc.moments.crowd import Hearing, crowd, hearing, peer_classes
+from apc.moments.crowd import Hearing, build_hearing, crowd, peer_classes
 from apc.moments.errors import forced, moments_error
 from apc.moments.gains import Moments, mean_square_radius
 from apc.moments.held import every_channel, held_scene
@@ -164,12 +164,12 @@ def _growth(system: CompiledSystem, prepared: Prepared, bounded: bool) -> Growth
     first = _due(system, lossy)
     if memoryless:
         return _by_gain(system, prepared, bounded, first)
-    told = hearing(system, prepared, first=first, stand_in=True)
-    of = stand_in_patterns(system, told)
+    hearing = build_hearing(system, prepared, first=first, stand_in=True)
+    of = stand_in_patterns(system, hearing)
 
     def errors() -> tuple[float, str]:
-        pushed = forced(system, told, first)
-        return pattern_error(stand_in_patterns(system, pushed.told), pushed.peer_by_peer()), ""
+        pushed = forced(system, hearing, first)
+        return pattern_error(stand_in_patterns(system, pushed.hearing), pushed.peer_by_peer()), ""
 
     return _iterated(pattern_radius(of), errors)
 
@@ -200,17 +200,17 @@ def _by_gain(system: CompiledSystem, prepared: Prepared, bounded: bool, first: F
         When packets are due, where the receiver's own value stands in for a missing one; None where what was
         heard last is held.
     """
-    told = hearing(system, prepared, first=first or Fraction(0), stand_in=first is not None)
+    hearing = build_hearing(system, prepared, first=first or Fraction(0), stand_in=first is not None)
 
     def moments(hearing: Hearing) -> Moments:
         return crowd(system, hearing) if first is None else stand_in(system, hearing)
 
     def errors() -> tuple[float, str]:
-        pushed = forced(system, told, first or Fraction(0))
-        classes = pushed.of(peer_classes(pushed.told)[0][0].sites)
-        return moments_error(moments(pushed.told), classes), ""
+        pushed = forced(system, hearing, first or Fraction(0))
+        classes = pushed.of(peer_classes(pushed.hearing)[0][0].sites)
+        return moments_error(moments(pushed.hearing), classes), ""
 
-    of = moments(told)
+    of = moments(hearing)
     inner = mean_square_radius(of, bounded=bounded)
     # Of many peers whose values stand in, the nodes of a quadrature are rounded.
     proved = first is None or system.peers <= ENUMERATED
@@ -234,8 +234,8 @@ def _of_held(system: CompiledSystem, prepared: Prepared) -> Growth:
     held, chances = every_channel(system, scene)
 
     def errors() -> tuple[float, str]:
-        pushed = forced(system, scene.told)
-        whole = every_channel(system, replace(scene, told=pushed.told))
+        pushed = forced(system, scene.hearing)
+        whole = every_channel(system, replace(scene, hearing=pushed.hearing))
         if not tagged:
             return pattern_error(held_patterns(*whole), pushed.peer_by_peer()), ""
         first, *more = (tagged_error(affine(*whole), order, pushed.peer_by_peer()) for order in orders)
@@ -356,8 +356,8 @@ def judge_network(
         surely, unsure = _almost_sure(system, prepared, result)
         metres, unmeasured = _rms_error(result)
         linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
-    told = bool(np.isfinite(result.radius))
-    decided = told and result.stable is not None
+    judged = bool(np.isfinite(result.radius))
+    decided = judged and result.stable is not None
     notes = (
         result.why and f"not judged: {result.why}",
         UNPROVED if certify and decided and not result.proved else "",
@@ -369,9 +369,9 @@ def judge_network(
     return NetworkVerdict(
         topology=system.name,
         verdict=verdict_of(result),
-        stable=result.stable if told else None,
-        mean_square_radius=result.radius if told else None,
-        error=max(result.high - result.radius, result.radius - result.low) if told else None,
+        stable=result.stable if judged else None,
+        mean_square_radius=result.radius if judged else None,
+        error=max(result.high - result.radius, result.radius - result.low) if judged else None,
         exact=result.exact,
         proof=(STABLE_PROVED if result.stable else UNSTABLE_PROVED)
         if certify and decided and result.proved

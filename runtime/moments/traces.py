@@ -32,7 +32,7 @@ from apc.eigen.relative import Relative, relative, relative_coordinates, with_do
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.radius import RADII, radius_of, value_of, with_radius
 from apc.frame.schedule import Heard, Schedule, Selected, Sent
-from apc.moments.crowd import Hearing, hearing, instants
+from apc.moments.crowd import Hearing, build_hearing, instants
 from apc.moments.unserved import UnservedError
 from apc.network.timetable import instant_of
 
@@ -67,10 +67,10 @@ def trace_radius(system: CompiledSystem, prepared: Prepared) -> Found:
     UnservedError
         The period or the delays are too long to follow.
     """
-    told = hearing(system, prepared)
+    hearing = build_hearing(system, prepared)
     links = {link.name: link for link in system.links}
-    times = {clock.name: instants(told, clock) for clock in system.clocks}
-    rows = {row: None for listed in told.rows.values() for row in listed}
+    times = {clock.name: instants(hearing, clock) for clock in system.clocks}
+    rows = {row: None for listed in hearing.rows.values() for row in listed}
     slots = {name: len(times[link.clock]) for name, link in links.items()}
     frames = math.lcm(*(_period_of(links[row.way.link], slots[row.way.link]) for row in rows))
     if frames > MOST_FRAMES:
@@ -78,7 +78,7 @@ def trace_radius(system: CompiledSystem, prepared: Prepared) -> Found:
         raise UnservedError(f"{what}, and {MOST_FRAMES:,} are the most")
     heard = {
         row: heard_packets(
-            link, told.timings[row.way.delay], times[link.clock], times[row.clock][row.tick], told
+            link, hearing.timings[row.way.delay], times[link.clock], times[row.clock][row.tick], hearing
         )
         for row in rows
         for link in [links[row.way.link]]
@@ -90,11 +90,11 @@ def trace_radius(system: CompiledSystem, prepared: Prepared) -> Found:
         for name in links
     }
     result = []
-    for loop in arrange(told.groups, told.exchange).loops:
+    for loop in arrange(hearing.groups, hearing.exchange).loops:
         packets = sum(depth[sent.link] for site in loop.sites for sent in site.schedule.sent)
         if packets + sum(len(site.z_names) for site in loop.sites) > MOST_STATES:
             raise UnservedError("the recorded delays are longer than can be followed")
-        result.append(_period(loop, told, heard, depth, slots, frames))
+        result.append(_period(loop, hearing, heard, depth, slots, frames))
     low, high, radius, doubt = np.array(result).max(axis=0).tolist()
     return Found(low, high, radius, doubt, frames)
 

@@ -185,7 +185,7 @@ def held_parts(system: CompiledSystem, prepared: Prepared) -> HeldParts:
         As for `worst_case`.
     """
     scene = held_scene(system, prepared)
-    loops = loops_at_right_angles(scene.told.groups, scene.told.exchange, MOST_STATES)
+    loops = loops_at_right_angles(scene.hearing.groups, scene.hearing.exchange, MOST_STATES)
     if isinstance(loops, str):
         raise UnservedError(loops)
     lossy = scene.lossy
