@@ -13,7 +13,7 @@ from typing import Any, Literal, get_args
 
 from apc.compiler.cache import Origin, origin_of, replayable
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.components.library import Library, definition_of
+from apc.compiler.components.component_library import Library, definition_of
 from apc.compiler.equations.clocks import ClockedSystem, check_alone, partition
 from apc.compiler.equations.flatten import FlatSystem, flatten
 from apc.compiler.equations.structure import SortedSystem, sort

@@ -101,24 +101,24 @@ from .api import (
 from .api import (
     with_hands as with_hands,
 )
-from .benchmark.bench import Bench as Bench
+from .benchmark.speed_and_error import Bench as Bench
 from .comparison.comparison import Comparison as Comparison
 from .compiler.compiled import CompiledSystem as CompiledSystem
 from .compiler.errors import ApcError as ApcError
 from .frame.settable import Parameters as Parameters
-from .hands.feel import Feel as Feel
+from .hands.frequency_response import Feel as Feel
 from .hands.passivity import PassiveHands as PassiveHands
-from .moments.network import NetworkVerdict as NetworkVerdict
+from .moments.network_verdict import NetworkVerdict as NetworkVerdict
 from .network.recorded import NetworkRecording as NetworkRecording
-from .regions.region import Region as Region
+from .regions.stable_region import Region as Region
 from .reports.contents import Report as Report
 from .simulation.buzz import Buzz as Buzz
 from .simulation.trajectory import Trajectory as Trajectory
-from .sweeps.sweep import Sweep as Sweep
+from .sweeps.resumable_sweep import Sweep as Sweep
 from .tuning.front import Design as Design
 from .tuning.front import Front as Front
-from .tuning.tune import Tuning as Tuning
-from .vary.critical import Critical as Critical
+from .tuning.tuner import Tuning as Tuning
+from .vary.critical_values import Critical as Critical
 from .vary.many import Analyses as Analyses
 from .vary.margins import Margins as Margins
 from .vary.sensitivity import Sensitivities as Sensitivities

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from apc.analysis.box_proof import BoxProof
     from apc.analysis.switching import Switching
     from apc.frame.names import Range
-    from apc.moments.network import NetworkVerdict
+    from apc.moments.network_verdict import NetworkVerdict
     from apc.simulation.buzz import Buzz
 
 # How far the radius that is differentiated may be from that of the analysis, relative to 1: roundings of a
@@ -48,7 +48,7 @@ MOST_TICKS, MOST_PRODUCTS = 500, 1_000_000_000
 class NetworkAnswer(Result):
     """A verdict over the network as it is, with the sensitivities and margins of its growth."""
 
-    shown_by = "analysis:network_answer"
+    shown_by = "analysis_output:network_answer"
 
     verdict: NetworkVerdict
     sensitivities: Sensitivities
@@ -68,7 +68,7 @@ class Answer(Result):
     of the topology. `nominal` says that beside `network` all of the nominal network is wanted in words.
     """
 
-    shown_by = "analysis:answer"
+    shown_by = "analysis_output:answer"
 
     analysis: Analysis
     network: NetworkAnswer | None
@@ -186,7 +186,7 @@ def _over_network(
     """Return the answer over the network as it is; imported here, as most scenes have an ideal one."""
     if all(link.channel is None for link in system.links):
         return None
-    from apc.moments.network import judge_network
+    from apc.moments.network_verdict import judge_network
     from apc.vary.over_network import network_margins, network_sensitivities
 
     verdict = judge_network(system, prepared, certify=certify)
@@ -292,7 +292,7 @@ def proved_at(
         hands = passive_hands(system)
         verdict, stable, left = hands.verdict, hands.stable, hands.left_out
     elif unreliable(system):
-        from apc.moments.network import judge_network
+        from apc.moments.network_verdict import judge_network
 
         prepared = prepare(system)
         network = judge_network(system, prepared)
@@ -319,15 +319,15 @@ def sensitivities_of(system: CompiledSystem, prepared: Prepared, analysis: Analy
     if why := _too_large(system, prepared, analysis) or _too_many_products(system):
         return _not_told(analysis.spectral_radius, why)
     try:
-        told = sensitivities(system, prepared=prepared)
+        moved = sensitivities(system, prepared=prepared)
     except ApcError as error:
         return _not_told(analysis.spectral_radius, f"not looked for: {error.mistakes[0].what}")
     # Derivatives are of matrices in floats, the analysis is of exact exponentials: both have one radius.
-    apart = abs(told.radius - analysis.spectral_radius) - analysis.spectral_radius_error
-    if told.active and not apart <= SAME_RADIUS * max(1.0, analysis.spectral_radius):
+    apart = abs(moved.radius - analysis.spectral_radius) - analysis.spectral_radius_error
+    if moved.active and not apart <= SAME_RADIUS * max(1.0, analysis.spectral_radius):
         why = "not told: floats lose the digits of what would be differentiated"
         return _not_told(analysis.spectral_radius, why)
-    return told
+    return moved
 
 
 def _not_told(radius: float, why: str) -> Sensitivities:

@@ -25,23 +25,23 @@ if TYPE_CHECKING:
     from apc.analysis.methods import Method
     from apc.analysis.paper import PaperRoute
     from apc.analysis.switching import Switching
-    from apc.benchmark.bench import Bench
+    from apc.benchmark.speed_and_error import Bench
     from apc.comparison.comparison import Comparison
     from apc.frame.settable import Parameters
-    from apc.hands.feel import Feel
+    from apc.hands.frequency_response import Feel
     from apc.hands.passivity import PassiveHands
-    from apc.moments.network import NetworkVerdict
+    from apc.moments.network_verdict import NetworkVerdict
     from apc.network.recorded import NetworkRecording
-    from apc.regions.region import Region
+    from apc.regions.stable_region import Region
     from apc.reports.contents import Report
     from apc.result import Result
     from apc.simulation.buzz import Buzz
     from apc.simulation.trajectory import Trajectory
-    from apc.sweeps.sweep import Sweep
+    from apc.sweeps.resumable_sweep import Sweep
     from apc.tuning.demands import Demands
     from apc.tuning.front import Front
-    from apc.tuning.tune import Tuning
-    from apc.vary.critical import Critical
+    from apc.tuning.tuner import Tuning
+    from apc.vary.critical_values import Critical
     from apc.vary.many import Analyses
     from apc.vary.margins import Margins
     from apc.vary.sensitivity import Sensitivities
@@ -72,7 +72,7 @@ def compile(path: str | Path) -> CompiledSystem:
         The file is at fault; holds every mistake found.
     """
     from apc.compiler.pipeline import compile_topology
-    from apc.frame.values import check_values
+    from apc.frame.start_checks import check_values
 
     system = compile_topology(Path(path))
     check_values(system)
@@ -263,11 +263,11 @@ def critical(
     ApcError
         The input is at fault.
     """
-    from apc.vary import critical as crossings
+    from apc.vary import critical_values
 
     system = _model(model, set)
     low, high = (None if item is None else _quantity(system, parameter, item) for item in (lower, upper))
-    return crossings.critical(system, parameter, lower=low, upper=high, criterion=criterion)
+    return critical_values.critical(system, parameter, lower=low, upper=high, criterion=criterion)
 
 
 @checked
@@ -364,10 +364,10 @@ def feel(
     ApcError
         The input is at fault.
     """
-    from apc.hands import feel as felt
+    from apc.hands import frequency_response
 
     listed = [frequencies] if isinstance(frequencies, int | float) else frequencies
-    return felt.feel(_model(model, set), listed, at=at, between=between, unstable=unstable)
+    return frequency_response.feel(_model(model, set), listed, at=at, between=between, unstable=unstable)
 
 
 @checked
@@ -419,9 +419,9 @@ def judge_network(model: Scene, *, set: Values | None = None, certify: bool = Fa
     ApcError
         The input is at fault.
     """
-    from apc.moments import network
+    from apc.moments import network_verdict
 
-    return network.judge_network(_model(model, set), certify=certify)
+    return network_verdict.judge_network(_model(model, set), certify=certify)
 
 
 @checked
@@ -606,7 +606,7 @@ def region(
     ApcError
         The input is at fault.
     """
-    from apc.regions import region as stable_region
+    from apc.regions import stable_region
     from apc.regions.axes import parse_axes
 
     system = _model(model, set)
@@ -662,10 +662,10 @@ def tune(
     ApcError
         The input is at fault.
     """
-    from apc.tuning import tune as design
+    from apc.tuning import tuner
 
     system, demands = _demands(model, set, free, over, criterion, maximize, minimize, subject)
-    return design.tune(system, demands, seconds=float("inf") if seconds is None else seconds)
+    return tuner.tune(system, demands, seconds=float("inf") if seconds is None else seconds)
 
 
 @checked
@@ -779,7 +779,7 @@ def sweep(
     cluster
         The address of a Dask scheduler.
     """
-    from apc.sweeps import sweep as points
+    from apc.sweeps import resumable_sweep
 
     path = None if out is None else Path(out)
     system = _model(model, set)
@@ -788,7 +788,9 @@ def sweep(
         name: text if isinstance(text, str) else [_quantity(system, name, value) for value in text]
         for name, text in over.items()
     }
-    return points.sweep(system, values, of=of, criterion=criterion, out=path, jobs=jobs, cluster=cluster)
+    return resumable_sweep.sweep(
+        system, values, of=of, criterion=criterion, out=path, jobs=jobs, cluster=cluster
+    )
 
 
 def _several(scenes: Scene | Iterable[Scene], function: str) -> list[Scene]:
@@ -929,9 +931,11 @@ def bench(
     ApcError
         The scene can't be analysed at all.
     """
-    from apc.benchmark import bench as measuring
+    from apc.benchmark import speed_and_error
 
-    return measuring.bench(_model(model, set), rounds=measuring.ROUNDS if rounds is None else rounds)
+    return speed_and_error.bench(
+        _model(model, set), rounds=speed_and_error.ROUNDS if rounds is None else rounds
+    )
 
 
 @checked
@@ -982,14 +986,14 @@ def export(
     ApcError
         The input is at fault, or the scene can't be handed over so.
     """
-    from apc.exports import export as handing
+    from apc.exports import formats
 
     path = None if out is None else Path(out)
-    chosen = handing.format_of(to, path, option="=")
+    chosen = formats.format_of(to, path, option="=")
     system = _model(model, set)
     _check_out(model, system, path)
-    asked = handing.Asked(cut, tuple(free), peer, device, method)
-    return handing.export(system, chosen, asked, path)
+    asked = formats.Asked(cut, tuple(free), peer, device, method)
+    return formats.export(system, chosen, asked, path)
 
 
 @checked
@@ -1021,7 +1025,7 @@ def report(
         The input is at fault, or the page can't be written.
     """
     from apc.inputs import check_topology_outputs
-    from apc.present.report import check_report_path, save_report
+    from apc.present.report_output import check_report_path, save_report
     from apc.reports import contents
 
     paths = [_path(scene, "report") for scene in _several(files, "report")]
@@ -1076,7 +1080,7 @@ def show(path: str | Path, *, format: Format = "text") -> str:
 @checked
 def schema() -> dict[str, Any]:
     """Return the JSON Schema (draft 2020-12) of topologies, generated from the language and the library."""
-    from apc.compiler.components.library import Library
+    from apc.compiler.components.component_library import Library
     from apc.compiler.view.schema import topology_schema
 
     return topology_schema(Library())

@@ -116,7 +116,7 @@ def load_or_compile(path: Path) -> CompiledSystem:
     if (archive := compiled_already(path)) is not None:
         return opened(archive, path.parent)
     from apc.compiler.pipeline import compile_topology
-    from apc.frame.values import check_values
+    from apc.frame.start_checks import check_values
 
     system = compile_topology(path)
     check_values(system)

@@ -20,7 +20,7 @@ What commands take beside the 60 to 120 MB of the program, at most and within a 
 | the same: a number of all rows | MAT 32; Parquet 500 a signal and block | `present.recording` |
 | `simulate --runs`: a run | 300 each | `simulation.ensemble` |
 | `export`: a state space of n states and inputs | 40 n² | `exports.lifted` |
-| `sweep`: points × columns, of a file's two blocks of rows at most | 32 each | `sweeps.sweep` |
+| `sweep`: points × columns, of a file's two blocks of rows at most | 32 each | `sweeps.resumable_sweep` |
 
 Other things have bounds of their own: states of a matrix, packets, ticks of a frame, points of a sweep.
 What can't be known beforehand, as what a sparse factorization fills in, ends at a limit of the process.

@@ -39,7 +39,7 @@ def opened(archive: Archive, folder: Path) -> CompiledSystem:
 
         return store.opened(archive)
     from apc.compiler.pipeline import compile_again
-    from apc.frame.values import check_values
+    from apc.frame.start_checks import check_values
 
     system = compile_again(archive.origin, folder)
     check_values(system)

@@ -46,12 +46,12 @@ def check_suffix(path: Path, known: Iterable[str], option: str) -> str:
     wanted = names[0] if len(names) == 1 else f"one of {', '.join(names)}"
     what, proposed = f"the suffix of {option.removesuffix('=')}", Path(path.name or "result")
     if path == DASH:  # whoever writes it wants standard output, which takes text
-        told = (
+        hint = (
             Path("/dev/stdout")
             if any(text in names for text in TEXTS)
             else Path("result").with_suffix(names[0])
         )
-        raise ApcError(Mistake("E878", Place(str(path)), what, wanted, "none", written(option, told)))
+        raise ApcError(Mistake("E878", Place(str(path)), what, wanted, "none", written(option, hint)))
     hint = written(option, path.parent / proposed.with_suffix(names[0]))
     raise ApcError(Mistake("E878", Place(str(path)), what, wanted, path.suffix or "none", hint))
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.components.library import Library
+from apc.compiler.components.component_library import Library
 from tests.bruteforce import Scene
 from tests.topologies import compiled, replaced
 from tests.truths import text_of

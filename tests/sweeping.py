@@ -33,7 +33,7 @@ _WAITING = """\
 import signal, sys, time
 from apc.__main__ import run
 from apc.cli import progress
-from apc.sweeps.store import Parts
+from apc.sweeps.finished_parts import Parts
 signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored by what a shell starts in the background
 progress.QUIET = float('inf')
 kept, write = [], Parts.write

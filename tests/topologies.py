@@ -8,7 +8,7 @@ from pathlib import Path
 
 from apc.compiler.cache import Origin, program_digest
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.components.library import Library
+from apc.compiler.components.component_library import Library
 from apc.compiler.equations.clocks import ClockedSystem, partition
 from apc.compiler.equations.flatten import FlatSystem, flatten
 from apc.compiler.equations.structure import SortedSystem, sort

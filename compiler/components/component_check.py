@@ -231,32 +231,32 @@ class ComponentNames:
 
     def _check_names(self, expression: Expr, where: Where, mistakes: Mistakes) -> None:
         """Record names that nothing of the component has, and words and tables in the place of numbers."""
-        told = set[int]()
+        judged = set[int]()
         for node in walk(expression):
             match node:
                 case Call("==" | "!=", (Name((name,)) as left, Name() as right)) if name in self.options:
                     # Else it was decided.
-                    told |= {left.start, right.start}
+                    judged |= {left.start, right.start}
                     word, words = format_expression(right), self.options[name].words
                     what, at = f"{name} has no option {brief(word)}", _place(where, right)
                     mistakes.take(unknown("E206", at, what, word, words))
                 case Call("interpolate", (Name((name,)) as table, _)) if name in self.tables:
-                    told.add(table.start)
+                    judged.add(table.start)
                 case Call("interpolate", (other, _)):
-                    told.add(other.start)
+                    judged.add(other.start)
                     got, known = format_expression(other), ", ".join(sorted(self.tables)) or "none"
                     what, expected = "interpolate", f"the name of a table ({known} in {self.component.name})"
                     mistakes.add("E325", _place(where, other), what, expected=expected, got=got)
                 case Call("count" | "age", (Name((name,)) as every,)) if name == OTHERS:
-                    told.add(every.start)
-                case Name((name,)) if name == OTHERS and node.start not in told:
+                    judged.add(every.start)
+                case Name((name,)) if name == OTHERS and node.start not in judged:
                     heard = (".".join(path) for path in self.dimensions if path[:-1] == (OTHERS,))
                     what, sent = "a value of the other peers", next(heard, f"count({OTHERS})")
                     mistakes.add("E506", _place(where, node), what, expected=sent, got=name, hint=sent)
-                case Name((name,)) if name in self.tables and node.start not in told:
+                case Name((name,)) if name in self.tables and node.start not in judged:
                     hint = f"interpolate({name}, time)"
                     mistakes.add("E303", _place(where, node), f"{name} is a table and no number", hint=hint)
-                case Name(parts) if node.start not in told:
+                case Name(parts) if node.start not in judged:
                     self._check_name(parts, _place(where, node), mistakes)
 
     def _check_name(self, parts: Path, place: Place, mistakes: Mistakes) -> None:

@@ -37,7 +37,7 @@ from apc.compiler.equations.structure import SortedKind, SortedSystem
 from apc.compiler.equations.terms import Symbol, symbol
 from apc.compiler.errors import ApcError, Mistake
 from apc.compiler.functions.casadi_writer import Writer
-from apc.compiler.functions.exchange import (
+from apc.compiler.functions.scene_data import (
     Timings,
     all_parameters,
     check_links,

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from apc.compiler.digits import plain_float
 from apc.compiler.errors import Place
+from apc.compiler.language.csv_tables import Headings, open_table, read_bytes, read_table
 from apc.compiler.language.dimensions import SECOND
 from apc.compiler.language.probes import read_probe
-from apc.compiler.language.tables import Headings, open_table, read_bytes, read_table
 from apc.compiler.language.units import NO_UNIT, Unit
 from apc.compiler.source.reading import brief, fault
 

@@ -162,8 +162,8 @@ def read_binding(
             tree = _tree(text, place)
             actual = _dimension(tree, text, place, what, known, names_known)
             if actual is not None and actual != ANY and (actual != dimension or actual.clashes(dimension)):
-                told, hint = _misfit(tree, actual, dimension, unit)
-                raise fault("E204", place, what, unit, f"{brief(text)}, which {told}", f"{what}: {hint}")
+                got, hint = _misfit(tree, actual, dimension, unit)
+                raise fault("E204", place, what, unit, f"{brief(text)}, which {got}", f"{what}: {hint}")
             return Binding(None, tree, dimension, place)
         _refuse_beside(text, place, what, names_known)
         _refuse_mixture(text, place, what, names_known)
@@ -229,8 +229,8 @@ def _refuse_mixture(text: str, place: Place, what: str, names_known: Collection[
 def _misfit(tree: Expr, actual: Dimension, due: Dimension, unit: str) -> tuple[str, str]:
     """Return what is wrong with an expression of another dimension than is due, and what to write."""
     if actual != due:
-        told = "has no unit" if actual == DIMENSIONLESS else f"is in {format_dimension(actual)}"
-        return told, f"1 {unit}".removesuffix(" 1")
+        got = "has no unit" if actual == DIMENSIONLESS else f"is in {format_dimension(actual)}"
+        return got, f"1 {unit}".removesuffix(" 1")
     # Of a name, a sum or a choice: no product counts cycles or radians.
     text = format_expression(tree)
     whole = text if isinstance(tree, Name) else f"({text})"
@@ -255,8 +255,8 @@ def _dimension(
     for node in names(tree):
         if known(node.parts) is None:
             shown = ".".join(node.parts)
-            told = f"{what} names {brief(shown)}, which is no parameter here"
-            mistakes.take(unknown("E206", place_in(place, text, node.start), told, shown, names_known))
+            got = f"{what} names {brief(shown)}, which is no parameter here"
+            mistakes.take(unknown("E206", place_in(place, text, node.start), got, shown, names_known))
     mistakes.raise_if_any()
     return dimension_of(tree, lambda name: known(name.parts), text, place)
 

@@ -16,8 +16,8 @@ import numpy as np
 
 from apc.compiler.compiled import MOST_PLACED, Graph
 from apc.compiler.errors import Mistakes, Place
+from apc.compiler.language.csv_tables import Table, read_table
 from apc.compiler.language.dimensions import SECOND
-from apc.compiler.language.tables import Table, read_table
 from apc.compiler.language.values import AlreadyReportedError, Value
 from apc.compiler.scene.named_numbers import NamedNumbers
 from apc.compiler.source.nodes import Node, Scalar, Sequence

@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import LARGEST_COUNT, MOST_GROUPS
 from apc.compiler.components.component import Named, Number, Option, Reference, Settable, Variable
 from apc.compiler.errors import Mistakes, Place
+from apc.compiler.language.csv_tables import Column, NamedFiles, Table, read_table
 from apc.compiler.language.evaluation import evaluate
 from apc.compiler.language.expression import names
-from apc.compiler.language.tables import Column, NamedFiles, Table, read_table
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.values import AlreadyReportedError, Value
 from apc.compiler.language.vectors import SIZES, entries, entry, whole_and_index

@@ -87,7 +87,7 @@ class SceneChannel:
     trace: NDArray[np.float64] | None
 
     @property
-    def told(self) -> tuple[str, ...]:
+    def remarks(self) -> tuple[str, ...]:
         """What it is, in words."""
         lines = []
         if self.loss:

@@ -17,9 +17,9 @@ from pathlib import Path
 
 from apc.compiler.components.component import RESERVED, Number, Settable, Variable
 from apc.compiler.errors import Mistakes
+from apc.compiler.language.csv_tables import NamedFiles
 from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND, Dimension
 from apc.compiler.language.expression import names
-from apc.compiler.language.tables import NamedFiles
 from apc.compiler.language.values import (
     PEERS,
     AlreadyReportedError,

@@ -18,11 +18,11 @@ from pathlib import Path
 from apc.compiler.cache import SUFFIX
 from apc.compiler.compiled import Axis, Experiment
 from apc.compiler.components.component import Named
-from apc.compiler.components.library import Library, definition_of
+from apc.compiler.components.component_library import Library, definition_of
 from apc.compiler.components.parts import Parts, Scope
 from apc.compiler.errors import Mistake, Mistakes, Place, visible
 from apc.compiler.files import RefusedError, files_below
-from apc.compiler.language.tables import NamedFiles
+from apc.compiler.language.csv_tables import NamedFiles
 from apc.compiler.language.values import AlreadyReportedError, Value
 from apc.compiler.scene.groups import GroupReader, SceneGroup, read_counts
 from apc.compiler.scene.instances import Part, PartReader, settable_names

@@ -116,10 +116,10 @@ def not_yaml(error: yaml.MarkedYAMLError, lines: Lines) -> Mistake:
     if "cannot start any token" in (error.problem or ""):
         quoted = f"'{rest.strip()[:40]}'"
         return Mistake("E109", place, f"a text starting with {rest[:1]} needs quotes", hint=quoted)
-    told = f"{error.problem}; {error.context}"
+    problem = f"{error.problem}; {error.context}"
     before = _TEXT.search(place.source_line[: place.column - 1])
     bracket = _BRACKET.match(rest)
-    if before and bracket and "expected ','" in told:  # x[1], {1, 0} or chain[1:2] between { and }
+    if before and bracket and "expected ','" in problem:  # x[1], {1, 0} or chain[1:2] between { and }
         text = before[0] + bracket[0].rstrip()
         where = place.shifted(-len(before[0]))
         return Mistake("E109", where, f"a text with {rest[0]} in it needs quotes here", hint=f'"{text}"')
@@ -133,11 +133,11 @@ def not_yaml(error: yaml.MarkedYAMLError, lines: Lines) -> Mistake:
         "block": ((_item_among_keys, mark.line), (_item_among_keys, opening), (_without_colon, above)),
     }
     for part in slips:
-        for slip, line in slips[part] if part in told else ():
+        for slip, line in slips[part] if part in problem else ():
             if (mistake := slip(line, lines)) is not None:
                 return mistake
     for part, sentence, hint in _PROBLEMS:
-        if part in told:
+        if part in problem:
             if error.context_mark and sentence.startswith("this ") and "indented" not in sentence:
                 place = lines.of(error.context_mark)
             return Mistake("E109", place, sentence, hint=hint)

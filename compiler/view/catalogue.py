@@ -17,7 +17,7 @@ from typing import Any
 
 from apc.compiler.cache import SUFFIX, builtin_files
 from apc.compiler.components.component import Component, Connector, Number, Option, Parameter
-from apc.compiler.components.library import Library
+from apc.compiler.components.component_library import Library
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.language.vectors import by_vector
 from apc.compiler.pipeline import run_stages

@@ -178,11 +178,11 @@ def seconds(number: Fraction) -> str:
 
 
 def _link_box(link: SceneLink) -> Box:
-    delay, told = link.delay.number, () if link.channel is None else link.channel.told
+    delay, remarks = link.delay.number, () if link.channel is None else link.channel.remarks
     later = f"available {seconds(delay)} later" if delay else "available at once"
     lines = (link.name, shape_of(link), f"a packet each tick of {link.clock}", later)
     delays = (f"{d.sender} to {d.receiver}: {seconds(d.delay.number)} later" for d in link.delays)
-    return Box(f"link {link.name}", "link", (*lines, *delays, *told), link.clock)
+    return Box(f"link {link.name}", "link", (*lines, *delays, *remarks), link.clock)
 
 
 def _group_boxes(scene: Scene) -> Iterator[Box]:

@@ -25,7 +25,7 @@ from apc.compiler.components.component import (
     Settable,
     Variable,
 )
-from apc.compiler.components.library import Library
+from apc.compiler.components.component_library import Library
 from apc.compiler.components.parts import PART_KEYS
 from apc.compiler.errors import Place
 from apc.compiler.language.unit_text import format_dimension

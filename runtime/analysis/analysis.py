@@ -84,7 +84,7 @@ class Analysis(Result):
     where that was proved: closer to 1, maybe, than two floats.
     """
 
-    shown_by = "analysis:analysis"
+    shown_by = "analysis_output:analysis"
 
     topology: str
     peers: int

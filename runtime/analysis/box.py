@@ -29,12 +29,12 @@ from apc.eigen.closing import ClosedSystem
 from apc.eigen.modes import split
 from apc.eigen.peers import PeerGroup, Runs
 from apc.eigen.ratios import NotRational, Ratio, Ratios, open_site
+from apc.frame.display_units import Unit
 from apc.frame.exchange import Exchange
 from apc.frame.names import Free, Range, find
 from apc.frame.overrides import Override, apply, check_bounds
 from apc.frame.parameters import exact_numbers, scope_of
 from apc.frame.site import LinearSite
-from apc.frame.units import Unit
 from apc.network.nominal import refuse_channel_number
 from apc.option_value import option_values
 

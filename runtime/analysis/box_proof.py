@@ -70,7 +70,7 @@ class BoxProof(Result):
     verdict is without. `changing`, of a box over a delay alone, is for one that doesn't stay constant.
     """
 
-    shown_by = "analysis:box_proof"
+    shown_by = "analysis_output:box_proof"
 
     topology: str
     ranges: tuple[Range, ...]

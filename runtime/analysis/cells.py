@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.closing import ClosedSystem, Feedback, bounded_weight, close, feedback_of
-from apc.eigen.norms import balance, norms
+from apc.eigen.matrix_norms import balance, norms
 from apc.eigen.ratios import Ratio
 from apc.eigen.relative import Relative, relative, relative_coordinates, with_doubt
 from apc.eigen.rigid import RigidModes

@@ -61,7 +61,7 @@ class ContactModes(Result):
     `parts` are the switching parts by name; `notes` say what was not looked into.
     """
 
-    shown_by = "analysis:contact_modes"
+    shown_by = "analysis_output:contact_modes"
 
     topology: str
     parts: tuple[str, ...]

@@ -92,7 +92,7 @@ class Conventions(Result):
     `not_repeated` says why not. `start_matters` says whether the linearization depends on what is heard.
     """
 
-    shown_by = "analysis:conventions"
+    shown_by = "analysis_output:conventions"
 
     topology: str
     outcomes: tuple[Outcome, ...]

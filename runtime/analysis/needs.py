@@ -46,7 +46,7 @@ class Needs(Result):
     none. `pairs` names the receives that are evaluated once a pair of peers.
     """
 
-    shown_by = "analysis:needs"
+    shown_by = "analysis_output:needs"
 
     peers: int
     frame: Fraction  # s

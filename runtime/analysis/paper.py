@@ -69,7 +69,7 @@ _INSTEAD = "--method modes, which asks for none of it"
 class NamedMatrix(Result):
     """A matrix (rows, columns) and what its rows and columns are."""
 
-    shown_by = "analysis:matrix"
+    shown_by = "analysis_output:matrix"
 
     values: Floats
     rows: tuple[str, ...]
@@ -90,7 +90,7 @@ class PaperRoute(Result):
     largest first, rigid ones included.
     """
 
-    shown_by = "analysis:paper_route"
+    shown_by = "analysis_output:paper_route"
 
     ratio: int
     frame_s: float

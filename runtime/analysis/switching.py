@@ -42,7 +42,7 @@ class Switching(Result):
     or not decided.
     """
 
-    shown_by = "analysis:switching"
+    shown_by = "analysis_output:switching"
 
     topology: str
     verdict: str

@@ -71,7 +71,7 @@ class HardCase:
 class HardReport(Result):
     """All cases of a folder, and its scenes without a truth."""
 
-    shown_by = "bench:hard"
+    shown_by = "bench_output:hard"
 
     folder: str
     cases: tuple[HardCase, ...]

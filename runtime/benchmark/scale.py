@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from apc.analysis.analysis import analyze
-from apc.benchmark.bench import reason_of
+from apc.benchmark.speed_and_error import reason_of
 from apc.benchmark.timing import median_time, timed
 from apc.benchmark.truth import Truth, spectral_truth
 from apc.compiler.compiled import LARGEST_COUNT, CompiledSystem
@@ -59,7 +59,7 @@ class Scale(Result):
     `floor` says how much memory the program takes by itself.
     """
 
-    shown_by = "bench:scale"
+    shown_by = "bench_output:scale"
 
     topology: str
     group: str

@@ -69,14 +69,14 @@ def bench_command(
             raise click.UsageError("--scale compiles anew: no --set or --plot with it")
         _scale(find_input(file, compiled_too=False), counts, as_json)
         return
-    from apc.benchmark.bench import bench
+    from apc.benchmark.speed_and_error import bench
 
     system = open_scene(file, settings, {"--plot": plot}, notify=note_aside)
     with at_work("measuring"):
         result = bench(system)
     print_result(result, as_json=as_json)
     if plot is not None:  # what took minutes is printed already, should it be unable to be written
-        from apc.present.bench import bench_picture
+        from apc.present.bench_output import bench_picture
         from apc.present.pictures import write_picture
 
         write_picture(lambda: bench_picture(result), plot)

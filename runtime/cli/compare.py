@@ -92,6 +92,6 @@ def compare_command(
 def _compare_run(folder: Path, *, as_json: bool) -> None:
     """Lay a run of `apc play` beside what is said of its scene."""
     from apc.loop.beside import compare_run
-    from apc.loop.reading import read_run
+    from apc.loop.run_folder import read_run
 
     print_result(compare_run(read_run(folder)), as_json=as_json)

@@ -30,9 +30,9 @@ def check_command(
     Exit code 0 if there is none, 1 otherwise.
     """
     from apc.compiler.pipeline import check_definition, compile_topology
-    from apc.frame.values import check_values
+    from apc.frame.start_checks import check_values
     from apc.inputs import find_input
-    from apc.present.analysis import warning_lines
+    from apc.present.analysis_output import warning_lines
 
     path = find_input(file, compiled_too=False)
     if text := check_definition(path):
@@ -89,8 +89,8 @@ def _compile(path: Path) -> None:
     from apc.analysis.needs import needs
     from apc.compiler.pipeline import compile_topology
     from apc.compiler.store import save
-    from apc.frame.values import check_values
-    from apc.present.analysis import compile_text
+    from apc.frame.start_checks import check_values
+    from apc.present.analysis_output import compile_text
 
     system = compile_topology(path)
     check_values(system)

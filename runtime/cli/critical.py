@@ -28,7 +28,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 
 if TYPE_CHECKING:
     from apc.compiler.compiled import CompiledSystem
-    from apc.tuning.tune import Tuning
+    from apc.tuning.tuner import Tuning
 
 # What the name of a scene ends in.
 SCENES = (".yaml", ".yml", ".apc")
@@ -63,7 +63,7 @@ def critical_command(
     the scene is stable. FILE is a topology or a compiled model.
     """
     from apc.inputs import open_scene
-    from apc.vary.critical import critical
+    from apc.vary.critical_values import critical
 
     _check_order(path, file)
     asked = criterion_with(hands, criterion)
@@ -96,7 +96,7 @@ def _over(
     """Return the largest value that is stable in all that is given: the best of one gain."""
     from apc.frame.names import find, unit_of, value_now
     from apc.tuning.demands import read_demands
-    from apc.tuning.tune import tune
+    from apc.tuning.tuner import tune
     from apc.vary.margins import GROWTH
 
     free = find(system, path, Place("critical value"))

@@ -64,7 +64,7 @@ def export_command(
         apc export --peer "left[1]" --out left.c
         apc export --out scene.fmu
     """
-    from apc.exports.export import Asked, export, format_of
+    from apc.exports.formats import Asked, export, format_of
     from apc.inputs import open_scene
 
     chosen = format_of(to, out)

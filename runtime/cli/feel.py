@@ -51,7 +51,7 @@ def feel_command(
         apc feel --from "0.1 Hz" --to "60 Hz" --out bode.svg
     """
     from apc.hands.asked import read_frequencies
-    from apc.hands.feel import feel
+    from apc.hands.frequency_response import feel
     from apc.inputs import open_scene
     from apc.present.pictures import FORMATS, write_result
 

@@ -40,7 +40,7 @@ def library_command(
     units, defaults and limits, where it is from, and its definition, equations
     and all, as it is written.
     """
-    from apc.compiler.components.library import Library
+    from apc.compiler.components.component_library import Library
     from apc.compiler.scene.scene import readable_library
     from apc.compiler.view import catalogue
 

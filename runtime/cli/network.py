@@ -51,7 +51,7 @@ def network_command(
             raise ApcError(Mistake("E207", Place("--interval"), "the interval", expected, interval, hint))
     network_recording = describe(recording, between)
     if out is not None:
-        from apc.present.network import recording_table
+        from apc.present.network_output import recording_table
 
         write_text(out, recording_table(network_recording))
     print_result(network_recording, as_json=as_json, written=[out])

@@ -58,8 +58,8 @@ def play_command(
     """
     from apc.inputs import find_input, open_scene
     from apc.loop.device import device_function
-    from apc.loop.reading import read_run
     from apc.loop.run import check_folder, write_run
+    from apc.loop.run_folder import read_run
     from apc.loop.start import Play, play_all, play_one
     from apc.option_value import option_value
     from apc.simulation.trajectory import duration_of, parse_duration

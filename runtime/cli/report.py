@@ -19,7 +19,7 @@ from apc.cli.progress import at_work
 from apc.compiler.errors import ApcError, Mistake, Place
 
 if TYPE_CHECKING:
-    from apc.present.report import KeptScene
+    from apc.present.report_output import KeptScene
     from apc.reports.contents import Report
 
 
@@ -52,7 +52,7 @@ def report_command(
         return
     assert out is not None
     from apc.inputs import check_topology_outputs, find_input, refuse_model
-    from apc.present.report import check_report_path, save_report
+    from apc.present.report_output import check_report_path, save_report
     from apc.reports.contents import report
 
     check_report_path(out)
@@ -71,7 +71,7 @@ def _check(path: Path) -> None:
     """Compute a report anew. Raises ApcError (E991) with everything that differs."""
     import tempfile  # most commands need none
 
-    from apc.present.report import kept_report, scene_again
+    from apc.present.report_output import kept_report, scene_again
     from apc.reports.contents import report
 
     kept = kept_report(path)
@@ -96,7 +96,7 @@ def _check(path: Path) -> None:
 
 def _differs(kept_scene: KeptScene, again: Report) -> Iterator[str]:
     """Yield what differs between the sections of a scene that a report keeps and those made anew."""
-    from apc.present.report import TITLES
+    from apc.present.report_output import TITLES
     from apc.reports.contents import differences
 
     [now] = again.to_dict()["scenes"]

@@ -71,7 +71,7 @@ def sweep_command(
     """
     from apc.inputs import open_scene
     from apc.processes import Patience
-    from apc.sweeps.sweep import sweep
+    from apc.sweeps.resumable_sweep import sweep
     from apc.tables import check_table_path
 
     check_table_path(out, "--out")

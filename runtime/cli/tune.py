@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from apc.compiler.compiled import CompiledSystem
-    from apc.tuning.tune import Tuning
+    from apc.tuning.tuner import Tuning
 
 
 @command
@@ -91,10 +91,10 @@ def tune_command(
     from apc.frame.devices import FREE
     from apc.inputs import open_scene
     from apc.present.pictures import write_picture
-    from apc.present.tune import panels_of
+    from apc.present.tuning_output import panels_of
     from apc.tuning.demands import held_as_studied, read_against, read_demands, read_seconds
     from apc.tuning.front import front
-    from apc.tuning.tune import tune
+    from apc.tuning.tuner import tune
 
     note_usual(hands)
     if write is not None and write.suffix not in (".yaml", ".yml"):

@@ -4,7 +4,7 @@ Takes: a `CompiledSystem`, and names that a person gave.
 Gives: `Choice`, `choose`, `check_over`; `STIFFNESS`, `DELAY`, `LOSS`.
 Guarantees: found by structure (units, and who hears whom), never by what a part is called; where several
 could be meant, none is taken.
-Does not: vary them (see `vary.critical`).
+Does not: vary them (see `vary.critical_values`).
 """
 
 from __future__ import annotations

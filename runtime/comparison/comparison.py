@@ -2,8 +2,8 @@
 
 Takes: `CompiledSystem`s.
 Gives: `Comparison`, `Scheme`, `compare`; `FREQUENCIES`.
-Guarantees: every number is that of `analysis`, `vary.critical`, `hands.feel`, `simulation` or `effort`; what
-can't be had says why and keeps nothing else from being told.
+Guarantees: every number is that of `analysis`, `vary.critical_values`, `hands.frequency_response`,
+`simulation` or `effort`; what can't be had says why and keeps nothing else from being told.
 Does not: compute any of it itself, or say which scheme is the better one.
 """
 
@@ -21,13 +21,13 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Place
 from apc.compiler.timings import part
 from apc.hands.answers import held_names
-from apc.hands.feel import Feel, feel
-from apc.moments.network import NetworkVerdict, judge_network
+from apc.hands.frequency_response import Feel, feel
+from apc.moments.network_verdict import NetworkVerdict, judge_network
 from apc.result import Look, Result
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare as prepare_to_play
 from apc.simulation.trajectory import Played, duration_of, play, provenance_of
-from apc.vary.critical import Critical, critical
+from apc.vary.critical_values import Critical, critical
 from apc.vary.crossing import Progress
 from apc.vary.growth import NOMINAL, PASSIVE, criterion_of
 
@@ -97,7 +97,7 @@ class Scheme:
 class Comparison(Result):
     """Schemes side by side, in the order asked for; `notes` say in what they can't be compared."""
 
-    shown_by = "comparison:comparison"
+    shown_by = "comparison_output:comparison"
 
     schemes: tuple[Scheme, ...]
     notes: tuple[str, ...]
@@ -141,9 +141,10 @@ def compare(
     over
         Which stiffness, delay and loss are varied, in the scenes that have them: see `choice.choose`.
     criterion
-        What stable means, as for `vary.critical.critical`.
+        What stable means, as for `vary.critical_values.critical`.
     at
-        The device whose hand feels, as `hands.feel.feel` takes it; if not given, of the first peer with one.
+        The device whose hand feels, as `frequency_response.feel` takes it; if not given, of the first peer
+        with one.
     refused
         Of scenes, by their places, that can't be asked: why. They have a place in the table all the same.
     progress

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.eigenpairs import Eigenpairs, components, eigenpairs, inverses
-from apc.eigen.norms import PRODUCT_ROUNDINGS, balance, norms
+from apc.eigen.matrix_norms import PRODUCT_ROUNDINGS, balance, norms
 from apc.frame.discretize import UNIT
 from apc.threads import load_pool
 

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.norms import PRODUCT_ROUNDINGS
+from apc.eigen.matrix_norms import PRODUCT_ROUNDINGS
 from apc.frame.discretize import UNIT
 from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, with_radius
 from apc.threads import load_pool

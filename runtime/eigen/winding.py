@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.norms import PRODUCT_ROUNDINGS
+from apc.eigen.matrix_norms import PRODUCT_ROUNDINGS
 from apc.frame.discretize import UNIT
 
 Floats = NDArray[np.float64]

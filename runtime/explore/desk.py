@@ -122,14 +122,14 @@ class Desk:
             return  # it was ended, and is no longer asked
         self.busy = None
         try:
-            told = done.result()
+            answer = done.result()
         except (BrokenProcessPool, CancelledError):
             self._end()
             self.last.pop(task.section, None)
-            told = SectionAnswer(None, LOST.sentence)
+            answer = SectionAnswer(None, LOST.sentence)
         if number > self.shown.get(task.section, -1):
             self.shown[task.section] = number
-            self.deliver(task.section, told)
+            self.deliver(task.section, answer)
         self._next()
         if self.busy is None and self.behind is not None:
             self.later(self.behind._next, DRAWN)

@@ -431,7 +431,7 @@ class MotionFigure:
         times = f"{max(slower, 1 / slower):.2g}"
         pace = "as fast as it is" if times == "1" else f"{times} times {'slower' if slower > 1 else 'faster'}"
         self.words.say(
-            *motion.told,
+            *motion.remarks,
             f"A colour is a peer, a kind of line a body: {legend}. Played {pace}.",
             *([f"{motion.others} more peers are not shown."] if motion.others else []),
         )

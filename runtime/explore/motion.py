@@ -34,7 +34,7 @@ class Motion:
     """What is seen of a scene: times (rows,) in s, n bodies, and what stands still: (row, mm), or discs.
 
     `x`, `y` and `angle` (rows, n) are where each body is, in mm and rad; `y` is None where all move along
-    lines, a row a peer. `bodies` are their peers and what they are at the start. `told` says it in words;
+    lines, a row a peer. `bodies` are their peers and what they are at the start. `remarks` say it in words;
     `others` is how many peers are not shown.
     """
 
@@ -45,7 +45,7 @@ class Motion:
     angle: Floats
     walls: tuple[tuple[int, float], ...]
     discs: tuple[tuple[float, float, float], ...]
-    told: tuple[str, ...]
+    remarks: tuple[str, ...]
     others: int
 
 
@@ -66,10 +66,10 @@ def motion_of(system: CompiledSystem, *, struck: bool) -> Motion:
     """
     planar = moves_in_plane(system)
     views = views_of(system)
-    told = []
+    remarks = []
     if struck:
         system, what = strike(system)
-        told.append(f"{what} is struck: it starts at {SPEED * MM:g} mm/s.")
+        remarks.append(f"{what} is struck: it starts at {SPEED * MM:g} mm/s.")
     shown = tuple((view.name, body) for view in views for body in view.bodies)
     names = [
         [f"{peer}.{state}" for state in (body.states[0], body.states[planar], *body.turning)]
@@ -85,14 +85,14 @@ def motion_of(system: CompiledSystem, *, struck: bool) -> Motion:
     if apart.any():
         last = max(int(np.argmax(apart)), 2)
         values, time = values[:last], time[:last]
-        told.append(f"Shown until something is {FAR:g} m from where it began.")
+        remarks.append(f"Shown until something is {FAR:g} m from where it began.")
     texts = np.unique(np.linspace(0, len(time) - 1, min(ROWS, len(time))).astype(int))
     columns = {signal.name: place for place, signal in enumerate(played.signals)}
     tracks = [values[texts][:, [columns[text] for text in name]] for name in names]
     x, y = (np.stack([track[:, place] for track in tracks], axis=1) for place in (0, 1))
     angle = np.stack([heading(track[:, 2:]) for track in tracks], axis=1)
     fixed = [(row, surface) for row, view in enumerate(views) for surface in view.surfaces]
-    told.append(f"It {played.summary.verdict}.")
+    remarks.append(f"It {played.summary.verdict}.")
     return Motion(
         time=time[texts],
         bodies=shown,
@@ -109,6 +109,6 @@ def motion_of(system: CompiledSystem, *, struck: bool) -> Motion:
                 if isinstance(disc, Disc)
             )
         ),
-        told=tuple(told),
+        remarks=tuple(remarks),
         others=system.peers - len(views),
     )

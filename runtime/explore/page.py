@@ -354,8 +354,8 @@ class Page:
 
     def _save_numbers(self, result: Plain) -> None:
         values = {slider.label: slider.texts[place] for slider, place in self._pairs()}
-        told = {"topology": self.system.name, "apc": program_version(), "set": values, **result}
-        self.out.data = {"name": [f"{self.system.name}.json"], "text": [json_text(told)]}
+        answer = {"topology": self.system.name, "apc": program_version(), "set": values, **result}
+        self.out.data = {"name": [f"{self.system.name}.json"], "text": [json_text(answer)]}
 
     @property
     def _overrides(self) -> tuple[Override, ...]:
@@ -522,9 +522,9 @@ class Page:
         else:
             self.document.add_next_tick_callback(call)
 
-    def _deliver(self, section: str, told: SectionAnswer) -> None:
+    def _deliver(self, section: str, answer: SectionAnswer) -> None:
         """Show what a section tells."""
-        result = told.found
+        result = answer.found
         if section == "verdict" and self.linear is None:
             self.linear = result is not None and result["linear"]
             self.at_once = result is not None and result["at_once"]
@@ -533,7 +533,7 @@ class Page:
             self._later(lambda: self.roots.show(self.modes), FRAMES)
         if result is None:
             clearing = {"region": self.region.clear, "feel": self.feel.clear, "motion": self.motion.clear}
-            clearing.get(section, self._words(section).nothing)(told.why)
+            clearing.get(section, self._words(section).nothing)(answer.why)
             return
         match section:
             case "verdict":

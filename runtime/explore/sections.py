@@ -29,15 +29,15 @@ from apc.frame.names import Free, Range, unit_of
 from apc.frame.overrides import Override, apply
 from apc.hands.answers import held_names
 from apc.hands.asked import read_frequencies
-from apc.hands.feel import feel
-from apc.moments.network import judge_network
+from apc.hands.frequency_response import feel
+from apc.moments.network_verdict import judge_network
 from apc.present.forms import Plain
 from apc.present.region_picture import drawn_points, stable_outlines
 from apc.processes import model_of_bytes
-from apc.regions.region import region
+from apc.regions.stable_region import region
 from apc.tuning.demands import held_as_studied, read_demands
-from apc.tuning.tune import tune
-from apc.vary.critical import critical
+from apc.tuning.tuner import tune
+from apc.vary.critical_values import critical
 from apc.vary.evaluator import reaches_count, reaches_time
 from apc.vary.growth import MEAN_SQUARE
 from apc.vary.locus import eigenvalues_at
@@ -232,11 +232,11 @@ def _critical(system: CompiledSystem, name: str) -> str:
 
 def _numbers(system: CompiledSystem, prepared: Prepared, asked: tuple[Range, Range, str] | None) -> Plain:
     """Return what is downloaded: the analysis and the region as `--json` prints them."""
-    told = {"analyze": analyze(system, prepared=prepared).to_dict()}
+    document = {"analyze": analyze(system, prepared=prepared).to_dict()}
     if asked is not None:
         x, y, criterion = asked
-        told["region"] = region(system, (x, y), criterion=criterion, prepared=prepared).to_dict()
-    return told
+        document["region"] = region(system, (x, y), criterion=criterion, prepared=prepared).to_dict()
+    return document
 
 
 SECTIONS: dict[str, Callable[[CompiledSystem, Prepared, Any], Plain]] = {

@@ -21,10 +21,10 @@ from typing import Any
 from apc.compiler.compiled import CompiledSystem, group_count
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import with_unit
+from apc.frame.display_units import as_shown
 from apc.frame.linearize import start_names
 from apc.frame.names import Free, Range, named_times, parameter_of, unit_of
 from apc.frame.overrides import Override, parse_override
-from apc.frame.units import as_shown
 from apc.vary.evaluator import free_parameters
 from apc.vary.margins import STIFFNESSES, coupler_parameters
 

@@ -23,9 +23,9 @@ import numpy as np
 from apc.compiler.plain import straight
 from apc.compiler.weights import sum_weights
 from apc.distribution import program_version
+from apc.exports.identifiers import identifier, unique
 from apc.exports.peer_step import Line, Move, Peer, has_edge
 from apc.exports.texts import filled, number
-from apc.exports.words import identifier, unique
 from apc.simulation.machine import straight_lines
 from apc.simulation.pairs import pair_function
 from apc.simulation.signals import LocalSignal, ticking_partitions

@@ -34,7 +34,7 @@ class Code(Result):
     topology: str
     code: Peer
     method: str
-    shown_by: ClassVar[str] = "exports:code"
+    shown_by: ClassVar[str] = "exports_output:code"
 
 
 def peer_code(system: CompiledSystem, *, peer: str = "", device: str = "", method: str = "") -> Code:

@@ -51,7 +51,7 @@ class Unit(Result):
     duration: float
     guid: str
     texts: Mapping[str, str]
-    shown_by: ClassVar[str] = "exports:unit"
+    shown_by: ClassVar[str] = "exports_output:unit"
 
     @property
     def identifier(self) -> str:
@@ -62,8 +62,8 @@ class Unit(Result):
     def description(self) -> str:
         """The model description, modelDescription.xml."""
         name = f"{self.peer} of {self.system.name}" if self.peer else self.system.name
-        told = {"name": name, "about": self.system.about, "variables": self.scene.variables}
-        return filled("fmu.xml", unit=self, version=program_version(), **told)
+        fields = {"name": name, "about": self.system.about, "variables": self.scene.variables}
+        return filled("fmu.xml", unit=self, version=program_version(), **fields)
 
 
 def unit_of(system: CompiledSystem, scene: CScene, *, peer: str = "") -> Unit:

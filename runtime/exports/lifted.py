@@ -38,7 +38,7 @@ from apc.distribution import versions
 from apc.eigen.closing import Loop, close_outside, lay_out_loop
 from apc.eigen.modes import dense_loop
 from apc.eigen.peers import PeerGroup, states_of
-from apc.exports.words import Port
+from apc.exports.identifiers import Port
 from apc.finite_equations import finite_equations
 from apc.frame.devices import Device, Push, find_push
 from apc.frame.discretize import TOO_LARGE, discretize
@@ -80,7 +80,7 @@ class StateSpace(Result):
     argument each in SI, that gives A, B, C and D.
     """
 
-    shown_by = "exports:state_space"
+    shown_by = "exports_output:state_space"
 
     topology: str
     cut: str
@@ -197,14 +197,14 @@ def about(system: CompiledSystem) -> tuple[float, tuple[str, ...]]:
 
 def made_by(system: CompiledSystem) -> str:
     """Return what a scene's export is made of, as one line of JSON."""
-    told = {
+    about = {
         "topology": system.name,
         "texts": texts_of(system),
         "parameters": parameters_of(system),
         "timings": [(timing.name, str(timing.value)) for timing in system.timings],
         "versions": versions("casadi", "numpy"),
     }
-    return json.dumps(told, ensure_ascii=False)
+    return json.dumps(about, ensure_ascii=False)
 
 
 def lifted(

@@ -38,9 +38,9 @@ from apc.exports.expressions import (
     unit_of_modelica,
     written,
 )
+from apc.exports.identifiers import identifier as word
 from apc.exports.peer_step import computing, heard_of
 from apc.exports.texts import filled, quoted
-from apc.exports.words import identifier as word
 from apc.finite_equations import finite_equations
 from apc.frame.ages import stamped
 from apc.frame.exchange import Exchange, build_exchange, check_mean
@@ -68,7 +68,7 @@ class ModelicaModel(Result):
     `clocks` are the lines that declare them.
     """
 
-    shown_by = "exports:modelica"
+    shown_by = "exports_output:modelica"
 
     topology: str
     name: str

@@ -30,7 +30,7 @@ from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.interpolation import jacobian
 from apc.compiler.language.vectors import whole_and_index
-from apc.exports.words import identifier, unique
+from apc.exports.identifiers import identifier, unique
 from apc.frame import schedule as frames
 from apc.frame.devices import Device, coupled_directly, find_device, find_devices
 from apc.frame.discretize import moved_together

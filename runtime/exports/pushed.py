@@ -15,7 +15,7 @@ from typing import Any
 import casadi
 
 from apc.compiler.compiled import CompiledSystem, Hold, Kind, Parameter, Timing
-from apc.compiler.functions.exchange import NO_DELAY
+from apc.compiler.functions.scene_data import NO_DELAY
 from apc.frame.devices import Device, coupled_directly, find_devices, rewritten
 from apc.frame.jacobians import jacobians
 from apc.frame.parameters import resolve

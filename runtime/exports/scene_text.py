@@ -22,6 +22,7 @@ from fractions import Fraction
 from typing import Any
 
 from apc.exports.c_text import memory, parameter_units
+from apc.exports.identifiers import identifier, unique
 from apc.exports.peer_step import (
     MOST_HEARD,
     Peer,
@@ -32,7 +33,6 @@ from apc.exports.peer_step import (
     sites_of,
 )
 from apc.exports.pushed import FORCE_ON
-from apc.exports.words import identifier, unique
 from apc.network.channel import luck_key
 from apc.network.timetable import Luck, luck_of
 from apc.simulation.machine import luck_text

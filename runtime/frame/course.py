@@ -198,9 +198,9 @@ def _courses(
             for mode in np.flatnonzero(states >= n_x):
                 item = schedule.carried[states[mode] - n_x]
                 ticks = [replace(item, index=item.index + i) for i in range(schedule.ticks[item.partition])]
-                told = [computed[tick].reshape(2, count)[:, mode] for tick in ticks if tick in computed]
+                courses = [computed[tick].reshape(2, count)[:, mode] for tick in ticks if tick in computed]
                 path[:, mode] = last[mode]
-                path[: len(told), mode] = told
+                path[: len(courses), mode] = courses
             return np.asarray(path[..., 0] + 1j * path[..., 1])
 
 

@@ -655,7 +655,7 @@ def published(name: str) -> dict[str, tuple[str, str, str]]:
         E930 the library has no such component, or it says no such bounds.
     """
     # The library reads YAML, which no analysis of a compiled model does otherwise.
-    from apc.compiler.components.library import Library
+    from apc.compiler.components.component_library import Library
 
     library = Library()
     result = {

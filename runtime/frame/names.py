@@ -25,7 +25,7 @@ from apc.compiler.compiled import (
 )
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.words import with_unit
-from apc.frame.units import Unit
+from apc.frame.display_units import Unit
 
 # The sections of a topology, which a name may start with.
 SECTIONS = ("clocks", "couplers", "hands", "links", "masses", "parameters")

@@ -18,13 +18,13 @@ from typing import TypeVar
 import numpy as np
 
 from apc.compiler.compiled import CompiledSystem, Group, Parameter, Timing, group_count
-from apc.compiler.crowd import peers_of, recounted
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
 from apc.compiler.language.evaluation import exact_value
+from apc.compiler.peer_counts import peers_of, recounted
 from apc.compiler.words import with_unit
+from apc.frame.display_units import Unit, as_shown
 from apc.frame.names import GIVEN, OVERRIDE, Free, find, unit_of
 from apc.frame.parameters import Scope, columns_of, scope_of
-from apc.frame.units import Unit, as_shown
 
 N = TypeVar("N", Parameter, Timing)
 
@@ -225,12 +225,12 @@ def check_bounds(
     """
     low, high, value = parameter.minimum, parameter.maximum, parameter.value
 
-    def told(number: float) -> str:
+    def shown(number: float) -> str:
         by, unit = as_shown(number, Unit.of(parameter))
         return with_unit(f"{number * by:g}", unit)
 
     def out(expected: str, number: float) -> None:
-        mistakes.add(code, place, name, expected=f"{expected} {told(number)}", got=told(value))
+        mistakes.add(code, place, name, expected=f"{expected} {shown(number)}", got=shown(value))
 
     if low is not None and parameter.open_minimum and value <= low:
         out("more than", low)

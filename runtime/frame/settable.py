@@ -22,9 +22,9 @@ from apc.compiler.compiled import (
     counts_peers,
     group_count,
 )
+from apc.frame.display_units import Unit
 from apc.frame.names import Free, is_named, named_times, parameter_of, values_by_group
 from apc.frame.parameters import columns_of
-from apc.frame.units import Unit
 from apc.result import Result
 
 
@@ -56,7 +56,7 @@ class Parameters(Result):
     topology: str
     rows: tuple[Settable, ...]
 
-    shown_by: ClassVar[str] = "vary:parameters"
+    shown_by: ClassVar[str] = "vary_output:parameters"
 
 
 def parameters(system: CompiledSystem) -> Parameters:

@@ -29,7 +29,7 @@ from apc.frame.devices import clamped, directions_of, replaced_hands, without_ha
 from apc.frame.discretize import UNIT
 from apc.frame.radius import RADII, radius_of, solve, value_of, with_radius
 from apc.hands.port import PortLoop, port_loops
-from apc.moments.network import Growth
+from apc.moments.network_verdict import Growth
 from apc.network.nominal import left_out
 from apc.result import Result
 from apc.threads import load_pool, single_threaded
@@ -94,7 +94,7 @@ class PassiveHands(Result):
     follows from the equations alone.
     """
 
-    shown_by = "hands:passive"
+    shown_by = "hands_output:passive"
 
     topology: str
     verdict: str

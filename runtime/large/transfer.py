@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.norms import balance, norms
+from apc.eigen.matrix_norms import balance, norms
 from apc.frame.discretize import UNIT
 from apc.frame.lift import FrameMap
 from apc.frame.radius import RADII, Matrix, radius_of, solve, value_of, with_radius

@@ -21,12 +21,12 @@ from apc.analysis.analysis import Analysis, analyze
 from apc.compiler.compiled import CompiledSystem, Link
 from apc.loop.peer import live_scene, traced
 from apc.loop.run import PeerRun, Run, delays_of, trace_name
-from apc.moments.network import NetworkVerdict, judge_network
+from apc.moments.network_verdict import NetworkVerdict, judge_network
 from apc.network.recorded import NetworkRecording, describe_delays
 from apc.network.timetable import START, Seen
 from apc.result import Result
-from apc.simulation.blocks import blocks
 from apc.simulation.population import Population
+from apc.simulation.rows_in_time import blocks
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
 from apc.simulation.stepwise import Stepwise
@@ -84,7 +84,7 @@ class RunComparison(Result):
     simulated, and the largest number played; empty where there is no simulation, and `why_not` says why.
     """
 
-    shown_by: ClassVar[str] = "loop:run_comparison"
+    shown_by: ClassVar[str] = "loop_output:run_comparison"
 
     topology: str
     folder: str

@@ -197,9 +197,9 @@ class Post:
         if sort == DATA and len(body) >= DATA_BODY.size:
             link, count, values = DATA_BODY.unpack_from(body)
             if len(body) == DATA_BODY.size + 8 * values:
-                told = struct.unpack_from(f"<{values}d", body, DATA_BODY.size)
-                if all(map(math.isfinite, told)):
-                    return Data(sender, time, link, count, told)
+                numbers = struct.unpack_from(f"<{values}d", body, DATA_BODY.size)
+                if all(map(math.isfinite, numbers)):
+                    return Data(sender, time, link, count, numbers)
         elif sort == HELLO and len(body) == HELLO_BODY.size:
             hello = Hello(sender, time, *HELLO_BODY.unpack(body))
             return hello if hello.nonce else None

@@ -38,8 +38,8 @@ from apc.loop.packets import DROPPED, Address, Answer, Data, Hello, Post
 from apc.loop.realtime import now
 from apc.network.channel import PacketSource, channel_law
 from apc.network.timetable import START, Seen
-from apc.simulation.blocks import pushes, unsolved
 from apc.simulation.population import instants_within
+from apc.simulation.rows_in_time import pushes, unsolved
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare
 from apc.simulation.stepwise import Stepwise
@@ -150,7 +150,7 @@ class Loop:
         self.session = 0  # what all peers that play together know it by; 0 while not known
         # Of each other the shortest round trip, and how far its clock was ahead then.
         self.offsets: dict[int, tuple[int, int]] = {}
-        self.told: Answer | None = None  # the first that said when the scene begins
+        self.began: Answer | None = None  # the first that said when the scene begins
         self.knocked = 0  # when others were asked last
         self.first = 0  # the frame with which it joins
         self.stopped = False
@@ -209,12 +209,12 @@ class Loop:
         while not self.session:
             self._knock(self.others)
             self.take_in(now() + KNOCK)
-            if self.told is not None:
+            if self.began is not None:
                 for _ in range(TRIPS):
                     self._knock(self.others)
                     self.take_in(now() + BETWEEN)
-                self.begins = self.told.begins - self.offsets[self.told.sender][1]
-                self.session = self.told.session
+                self.begins = self.began.begins - self.offsets[self.began.sender][1]
+                self.session = self.began.session
             elif leads and set(self.others) == set(self.post.nonces):
                 self.begins, self.session = now() + HEAD_START, self.post.nonce
             elif now() > end:
@@ -305,8 +305,8 @@ class Loop:
         trip = (came - answer.asked) - (answer.time - answer.came)
         ahead = ((answer.came - answer.asked) + (answer.time - came)) // 2
         self.offsets[answer.sender] = min(self.offsets.get(answer.sender, (trip, ahead)), (trip, ahead))
-        if answer.session and self.told is None:
-            self.told = answer
+        if answer.session and self.began is None:
+            self.began = answer
 
     def _send(self, datagram: bytes, address: Address) -> None:
         try:

@@ -23,7 +23,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import check_target, same_file, unwritable
 from apc.loop.peer import NANO, Loop
-from apc.simulation.blocks import instants_of
+from apc.simulation.rows_in_time import instants_of
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -26,10 +26,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.norms import balance
+from apc.eigen.matrix_norms import balance
 from apc.eigen.relative import Relative, relative_places, relative_rows
 from apc.frame.radius import value_of
-from apc.moments.errors import Peer, largest_error
+from apc.moments.copies_apart import Peer, largest_error
 from apc.moments.held import Chance, HeldLoop
 from apc.moments.patterns import largest, settled
 from apc.threads import load_pool

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from apc.eigen.dissipation import is_positive
 from apc.eigen.enclosure import enclose_eigenvalues
-from apc.eigen.norms import balance
+from apc.eigen.matrix_norms import balance
 from apc.eigen.relative import Relative
 from apc.frame.discretize import UNIT
 from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, with_radius

@@ -43,7 +43,7 @@ from apc.frame.taylor import hull, within
 from apc.moments.crowd import Classes, build_hearing, classes_of, moments_of, peer_classes, remembered_of
 from apc.moments.gains import below_1
 from apc.moments.mean_loops import Remembered
-from apc.moments.network import STABLE, UNSTABLE, growth
+from apc.moments.network_verdict import STABLE, UNSTABLE, growth
 from apc.moments.packet_memory import is_memoryless
 from apc.network.channel import channel_law
 from apc.network.nominal import channel_numbers, unreliable

@@ -22,12 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
+from apc.eigen.matrix_norms import balance
 from apc.eigen.modes import dense_loop
-from apc.eigen.norms import balance
 from apc.eigen.relative import Relative, relative, relative_coordinates
 from apc.frame.radius import value_of
+from apc.moments.copies_apart import Peer, largest_error
 from apc.moments.crowd import Hearing, standing_motions
-from apc.moments.errors import Peer, largest_error
 from apc.moments.held import Chance, HeldLoop
 from apc.moments.mean_loops import standing_state
 from apc.moments.stand_in import receivers_of

@@ -82,7 +82,7 @@ class NetworkRecording(Result):
     where the interval is not known; `delays` (n,) are all, infinite for a lost packet.
     """
 
-    shown_by: ClassVar[str] = "network:recording"
+    shown_by: ClassVar[str] = "network_output:recording"
 
     file: str
     program: str
@@ -180,25 +180,25 @@ def _left_out(
     program: str, packets: int, law: Law | None, correlation: float, between: float
 ) -> tuple[str, ...]:
     """Return what the keys of a link say nothing of, or take for granted."""
-    told = [HALVED] if program else []
+    remarks = [HALVED] if program else []
     if law is None:
-        return (*told, "every packet was lost: nothing is known of delays")
+        return (*remarks, "every packet was lost: nothing is known of delays")
     if correlation:
-        told.append(
+        remarks.append(
             f"delays follow one another (correlation {correlation:.2f} from packet to packet), and a jitter "
             "is drawn for each packet on its own; a trace has them as they were"
         )
     if law.distance > MISFIT / math.sqrt(packets):
-        told.append(
+        remarks.append(
             "delays are spread as none of the distributions that a jitter can have; a trace has them as they "
             "were"
         )
     if not math.isnan(between):
-        told.append(
+        remarks.append(
             f"a packet was recorded every {between * 1e3:.4g} ms: a link sends at its own clock, and a trace "
             "gives it a row a packet, whatever time lay between them"
         )
-    return tuple(told)
+    return tuple(remarks)
 
 
 def _share(these: NDArray[np.bool_], among: NDArray[np.bool_]) -> Share:

@@ -79,7 +79,7 @@ def save_animation(system: CompiledSystem, trajectory: Trajectory, path: Path) -
     times = np.linspace(start, end, round(RATE * seconds) + 1)
     rows = np.minimum(np.searchsorted(trajectory.time, times), len(trajectory.time) - 1)
     speed = (end - start) / seconds
-    told = "" if abs(speed - 1) < 1e-3 else f", {speed:.2g} × as fast as it is"
+    pace = "" if abs(speed - 1) < 1e-3 else f", {speed:.2g} × as fast as it is"
     pixels = [2 * round(side * DPI / 2) for side in figure.get_size_inches()]  # ffmpeg wants even ones
     figure.set_size_inches(*(side / DPI for side in pixels))
     title = figure.suptitle(" ", fontsize=11)
@@ -92,7 +92,7 @@ def save_animation(system: CompiledSystem, trajectory: Trajectory, path: Path) -
             named = Path(folder, f"moving{path.suffix.lower()}")  # writers go by the suffix
             with writer.saving(figure, named, DPI):
                 for row in rows.tolist():
-                    title.set_text(f"{system.name}: {trajectory.time[row]:.3f} s{told}")
+                    title.set_text(f"{system.name}: {trajectory.time[row]:.3f} s{pace}")
                     for actor, track, turn in zip(actors, tracks, turns, strict=True):
                         actor.move(track[row], turn[row])
                     writer.grab_frame()

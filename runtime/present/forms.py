@@ -18,7 +18,7 @@ from fractions import Fraction
 from typing import Any
 
 from apc.compiler.words import measured, with_unit, wrapped
-from apc.frame.units import as_shown
+from apc.frame.display_units import as_shown
 from apc.later import Later
 from apc.result import Result
 

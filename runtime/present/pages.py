@@ -25,7 +25,7 @@ from apc.present.pictures import svg_image
 _COMMENTS = re.compile(r"(^#.*\n)|[ \t]+#.*$", re.MULTILINE)
 
 
-def page(template: str, **told: Any) -> str:
+def page(template: str, **fields: Any) -> str:
     """Return a page; in its template `image(figure, title)` is a picture.
 
     Raises
@@ -35,7 +35,7 @@ def page(template: str, **told: Any) -> str:
     """
     every = Environment(loader=PackageLoader("apc.present", ""), autoescape=True, undefined=StrictUndefined)
     return every.get_template(template).render(
-        **told, image=lambda figure, title: Markup(svg_image(figure, title))
+        **fields, image=lambda figure, title: Markup(svg_image(figure, title))
     )
 
 

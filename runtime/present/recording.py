@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import begin_file, drop_file, finish_file, is_special, partial_name
 from apc.memory import refuse_beyond
-from apc.present.simulation import provenance_json
-from apc.simulation.blocks import Block
+from apc.present.simulation_output import provenance_json
+from apc.simulation.rows_in_time import Block
 from apc.simulation.simulation import Simulation
 from apc.simulation.trajectory import provenance_of
 from apc.suffixes import check_suffix

@@ -28,7 +28,7 @@ from apc.regions.panels import Panel
 
 if TYPE_CHECKING:
     from apc.regions.panels import Panels
-    from apc.regions.region import Region
+    from apc.regions.stable_region import Region
 
 Floats = NDArray[np.float64]
 

@@ -26,7 +26,7 @@ from apc.frame.parameters import resolve
 from apc.option_value import with_last_unit
 from apc.regions.axes import PLACE, parse_axes
 from apc.regions.overlay import Overlay, overlay_points, parse_overlay
-from apc.regions.region import CELLS, Floats, Region, region
+from apc.regions.stable_region import CELLS, Floats, Region, region
 from apc.result import Look, Result
 from apc.vary.crossing import Progress
 
@@ -52,7 +52,7 @@ class Panel:
 class Panels(Result):
     """Regions to be seen together; `normalized` says that y is an effective gain, see `gain_factor`."""
 
-    shown_by = "region:panels"
+    shown_by = "region_output:panels"
 
     panels: tuple[Panel, ...]
     normalized: bool

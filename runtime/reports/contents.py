@@ -4,7 +4,7 @@ Takes: topologies and settings.
 Gives: `Section`, `SceneReport`, `Report`; `report`; `differences`.
 Guarantees: every number is that of the command beside it; a section that a scene can't fill says why. A
 report keeps the scene's own texts, so that it can be computed anew from itself alone.
-Does not: draw, or write files (see `present.report`).
+Does not: draw, or write files (see `present.report_output`).
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from apc.distribution import versions
 from apc.frame.names import parameter_of, unit_of
 from apc.frame.overrides import apply, parse_override
 from apc.hands.asked import read_frequencies
-from apc.hands.feel import feel
+from apc.hands.frequency_response import feel
 from apc.inputs import open_scene
-from apc.moments.network import judge_network
+from apc.moments.network_verdict import judge_network
 from apc.regions.axes import parse_axes
-from apc.regions.region import region
+from apc.regions.stable_region import region
 from apc.result import Result
 from apc.simulation.trajectory import simulate
-from apc.vary.critical import critical
+from apc.vary.critical_values import critical
 from apc.vary.growth import MEAN_SQUARE, NOMINAL
 from apc.vary.margins import STIFFNESSES, coupler_parameters
 
@@ -60,7 +60,7 @@ class Section:
 
     key: str
     command: str
-    told: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
     results: tuple[Result, ...] = ()
     drawn: tuple[Any, ...] = ()
     refused: str = ""
@@ -83,7 +83,7 @@ class SceneReport:
 class Report(Result):
     """Scenes side by side; `comparison` is there where they are several."""
 
-    shown_by = "report:report"
+    shown_by = "report_output:report"
 
     scenes: tuple[SceneReport, ...]
     comparison: Comparison | None
@@ -170,9 +170,9 @@ def _texts(system: CompiledSystem) -> Iterable[tuple[str, str]]:
 
 
 def _compiled(system: CompiledSystem, call: str) -> Section:
-    told = [f"Warning: {warning}" for warning in system.warnings]
-    told += [f"left out: {name}, as {reason}" for name, reason in system.dropped]
-    return Section("compiled", f"apc compile {call.split(' --set')[0]}", tuple(told), (needs(system),))
+    remarks = [f"Warning: {warning}" for warning in system.warnings]
+    remarks += [f"left out: {name}, as {reason}" for name, reason in system.dropped]
+    return Section("compiled", f"apc compile {call.split(' --set')[0]}", tuple(remarks), (needs(system),))
 
 
 def _answered(system: CompiledSystem) -> tuple[Answer, str]:
@@ -209,7 +209,7 @@ def _criticals(
     verdict: Result | None = None,
 ) -> Section:
     """Return where the verdict changes along what `apc compare` looks at, behind a verdict that is known."""
-    told, drawn = [], []
+    remarks, drawn = [], []
     results: list[Result] = [] if verdict is None else [verdict]
     commands = [] if verdict is None else [f"apc analyze {call}"]
     for axis, name, why in asked:
@@ -218,15 +218,15 @@ def _criticals(
         except ApcError as error:
             result, why = None, _why(error)
         if result is None:
-            told.append(f"{axis}: {why}")
+            remarks.append(f"{axis}: {why}")
             continue
         stiff = axis == STIFFNESS
         commands.append(f"apc critical {name} {call}{f' --plot {axis}.svg' if stiff else ''}")
         results.append(result)
         drawn += [result] if stiff else []
     if not results:
-        return Section(key, "", refused=" ".join(told))
-    return Section(key, " && ".join(commands), tuple(told), tuple(results), tuple(drawn))
+        return Section(key, "", refused=" ".join(remarks))
+    return Section(key, " && ".join(commands), tuple(remarks), tuple(results), tuple(drawn))
 
 
 def _region(system: CompiledSystem, call: str) -> Section:
@@ -255,16 +255,16 @@ def _response(system: CompiledSystem, call: str) -> Section:
     if system.peers > MOST_PLAYED:
         why = f"{counted(system.peers, 'peer', ',')} are more than the {MOST_PLAYED} that a report plays"
         return Section("response", "", refused=f"{why}; apc simulate does")
-    duration, told = system.experiment.duration, []
+    duration, remarks = system.experiment.duration, []
     length = "" if duration else f" --duration {shlex.quote(f'{float(SECONDS):g} s')}"
     trajectory = simulate(system, duration=duration or SECONDS)
     if trajectory.summary.verdict == "rests" and (push := _push(system)):
-        told.append(f"At rest as it stands: here it starts with {push}.")
+        remarks.append(f"At rest as it stands: here it starts with {push}.")
         length += f" --set {shlex.quote(push)}"
         pushed = apply(system, [parse_override(system, push)])
         trajectory = simulate(pushed, duration=duration or SECONDS)
     command = f"apc simulate {call}{length} --plot run.svg"
-    return Section("response", command, tuple(told), (trajectory,), (trajectory,))
+    return Section("response", command, tuple(remarks), (trajectory,), (trajectory,))
 
 
 def _push(system: CompiledSystem) -> str:

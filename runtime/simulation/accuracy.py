@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.simulation.blocks import Block, blocks
+from apc.simulation.rows_in_time import Block, blocks
 from apc.simulation.settings import finer
 from apc.simulation.signals import Signal
 from apc.simulation.simulation import Simulation, prepare

@@ -94,7 +94,7 @@ class Buzz(Result):
     whether it was played to its end. `notes` say what the prediction is worth.
     """
 
-    shown_by = "simulation:buzz"
+    shown_by = "simulation_output:buzz"
 
     topology: str
     predicted: Predicted | None

@@ -26,7 +26,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
 from apc.finite_equations import finite_equations
 from apc.memory import refuse_beyond
-from apc.moments.network import growth, verdict_of
+from apc.moments.network_verdict import growth, verdict_of
 from apc.network.nominal import unreliable
 from apc.processes import (
     Patience,
@@ -38,7 +38,7 @@ from apc.processes import (
     this_process,
 )
 from apc.result import Result
-from apc.simulation.blocks import blocks
+from apc.simulation.rows_in_time import blocks
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
 from apc.simulation.summary import BAND, Watch
@@ -103,7 +103,7 @@ class Ensemble(Result):
     `mean_square` is None where no packet is lost or late.
     """
 
-    shown_by = "simulation:ensemble"
+    shown_by = "simulation_output:ensemble"
 
     topology: str
     duration: Fraction

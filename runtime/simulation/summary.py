@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import ANGLES, LENGTH, CompiledSystem, Group
-from apc.simulation.blocks import Block
+from apc.simulation.rows_in_time import Block
 from apc.simulation.signals import Signal
 from apc.simulation.simulation import Simulation
 

@@ -24,8 +24,8 @@ from apc.memory import refuse_beyond
 from apc.option_value import option_value
 from apc.result import Look, Result
 from apc.simulation.accuracy import ErrorEstimate, compare_with
-from apc.simulation.blocks import Block, blocks
 from apc.simulation.flow import Tolerance
+from apc.simulation.rows_in_time import Block, blocks
 from apc.simulation.settings import DEFAULT, Method, Settings
 from apc.simulation.signals import Signal
 from apc.simulation.simulation import Simulation, check_length, prepare
@@ -63,7 +63,7 @@ class Played(Result):
     `error` is there if it was asked for.
     """
 
-    shown_by = "simulation:played"
+    shown_by = "simulation_output:played"
 
     topology: str
     summary: Summary

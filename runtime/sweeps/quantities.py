@@ -131,7 +131,7 @@ def _finite(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
 def _growth(system: CompiledSystem, argument: str) -> Quantity:
     """Return the verdict in mean square and what second moments grow by in a frame."""
     from apc.analysis.analysis import prepare  # the nominal quantities need none of it
-    from apc.moments.network import growth, verdict_of
+    from apc.moments.network_verdict import growth, verdict_of
 
     if argument:
         raise ApcError(Mistake("E884", PLACE, "analyze", "no parameter", argument[:80], "--of analyze"))
@@ -208,7 +208,7 @@ def _one_by_one(
 
 def _critical(system: CompiledSystem, argument: str, criterion: str = "nominal") -> Quantity:
     """Return the value at which the verdict changes with one parameter, and on which side it is stable."""
-    from apc.vary.critical import critical  # a sweep of verdicts needs none of it
+    from apc.vary.critical_values import critical  # a sweep of verdicts needs none of it
 
     if not argument:
         form = "--of critical:coordination.stiffness"

@@ -21,7 +21,7 @@ from apc.compiler.errors import ApcError, Mistake
 from apc.result import Result
 from apc.tuning.demands import AGAINST, FELT, Aim, Demands, Felt
 from apc.tuning.limits import Limits
-from apc.tuning.tune import Tuning, tune
+from apc.tuning.tuner import Tuning, tune
 from apc.vary.crossing import Progress
 
 Floats = NDArray[np.float64]
@@ -50,7 +50,7 @@ class Front(Result):
     not look at, `notes` how far the search came.
     """
 
-    shown_by = "tune:front"
+    shown_by = "tuning_output:front"
 
     topology: str
     aim: str

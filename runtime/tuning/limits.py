@@ -31,7 +31,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake
 from apc.eigen.eigenpairs import eigenvalues
 from apc.frame.overrides import Override, apply
-from apc.hands.feel import COUPLED, feel
+from apc.hands.frequency_response import COUPLED, feel
 from apc.threads import load_pool
 from apc.tuning.demands import HINF, PLACE, SUBJECT, Demands, Felt
 from apc.vary.batch import BatchEvaluator, MatrixSource
@@ -375,23 +375,23 @@ def felt_in(
     hertz = [felt.frequency_hz for felt in asked if not math.isnan(felt.frequency_hz)] or [1.0]
     beside = {PART_OF[felt.name] for felt in asked if felt.name in PART_OF}
     # Beside what is stable, too, the slopes of a search want what is felt wherever there is something to say.
-    told = feel(system, hertz, unstable="h2" not in beside, beside=beside, prepared=prepared)
+    felt_response = feel(system, hertz, unstable="h2" not in beside, beside=beside, prepared=prepared)
     result = []
     for felt in asked:
         value, off, hz = 0.0, 0.0, felt.frequency_hz
         if felt.name in RESPONSES:
-            response, bound = (getattr(told, name) for name in RESPONSES[felt.name])
+            response, bound = (getattr(felt_response, name) for name in RESPONSES[felt.name])
             value = abs(complex(response[hertz.index(felt.frequency_hz)]))
             off = value * float(bound[hertz.index(felt.frequency_hz)])
-        elif felt.name == "damping" and told.low_frequency is not None:
-            value, off = told.low_frequency.damping, told.low_frequency.errors[1]
-        elif felt.name == "error_h2" and told.h2 and told.h2[0].error_m is not None:
-            value, off = told.h2[0].error_m, told.h2[0].errors[0] or 0.0
+        elif felt.name == "damping" and felt_response.low_frequency is not None:
+            value, off = felt_response.low_frequency.damping, felt_response.low_frequency.errors[1]
+        elif felt.name == "error_h2" and felt_response.h2 and felt_response.h2[0].error_m is not None:
+            value, off = felt_response.h2[0].error_m, felt_response.h2[0].errors[0] or 0.0
         elif felt.name == HINF:
-            if COUPLED in told.notes:
+            if COUPLED in felt_response.notes:
                 what = f"{felt.label} is not told of peers that differ, which move apart together"
                 raise ApcError(Mistake("E996", PLACE, what, hint="feel.error_h2"))
-            for mode in (mode for mode in told.hinf if mode.of == "error"):
+            for mode in (mode for mode in felt_response.hinf if mode.of == "error"):
                 peak = mode.sampled_data
                 own = (peak.norm, peak.error, peak.frequency_hz)
                 if not math.isnan(felt.frequency_hz):

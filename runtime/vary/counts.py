@@ -13,8 +13,8 @@ from collections.abc import Iterator, Sequence
 from fractions import Fraction
 
 from apc.compiler.compiled import CompiledSystem, group_count
-from apc.compiler.crowd import least_peers
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.peer_counts import least_peers
 from apc.frame.names import Free, Range
 from apc.frame.overrides import Override, apply
 from apc.vary.delays import Piece

@@ -26,7 +26,7 @@ from apc.frame.ages import aged
 from apc.frame.names import Free, parameter_of, unit_of
 from apc.frame.overrides import Override, apply
 from apc.hands.passivity import loop_growths, passive_growth
-from apc.moments.network import Growth, growth
+from apc.moments.network_verdict import Growth, growth
 from apc.network.nominal import channel_numbers, unreliable
 from apc.vary.crossing import OneStretch, Stretch, Verdict
 from apc.vary.evaluator import reaches_time

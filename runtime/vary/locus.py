@@ -27,7 +27,7 @@ from apc.threads import single_threaded
 from apc.vary.evaluator import evaluator_of_many, reaches_count, reaches_time
 
 if TYPE_CHECKING:
-    from apc.vary.critical import Critical
+    from apc.vary.critical_values import Critical
 
 POINTS = 100  # values looked at
 BEYOND = 2.0  # times what matters most is looked up to: the present value, and where stability changes

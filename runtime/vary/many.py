@@ -213,7 +213,7 @@ class Analyses(Result):
     those of `Rows`; `left_out` says what of the scene the answers do not look at.
     """
 
-    shown_by = "vary:analyses"
+    shown_by = "vary_output:analyses"
 
     topology: str
     parameters: tuple[str, ...]

@@ -26,8 +26,8 @@ from apc.eigen.modes import arrange
 from apc.eigen.peers import states_of
 from apc.eigen.spectrum import DRIFTS, finite
 from apc.finite_equations import finite_equations
+from apc.frame.display_units import Unit
 from apc.frame.names import Free, named_times, parameter_of, unit_of, value_now
-from apc.frame.units import Unit
 from apc.result import Result
 from apc.threads import single_threaded
 from apc.vary.crossing import ESTIMATE, Crossing, search
@@ -85,7 +85,7 @@ class Margin:
 class Margins(Result):
     """The margins that were found; `note` says why there are none."""
 
-    shown_by = "vary:margins"
+    shown_by = "vary_output:margins"
 
     rows: tuple[Margin, ...]
     note: str

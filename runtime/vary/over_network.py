@@ -25,7 +25,7 @@ from apc.compiler.words import counted
 from apc.finite_equations import finite_equations
 from apc.frame.names import Free, named_times, unit_of, value_now
 from apc.frame.overrides import Override
-from apc.moments.network import Growth, growth
+from apc.moments.network_verdict import Growth, growth
 from apc.network.nominal import channel_numbers
 from apc.threads import single_threaded
 from apc.vary.crossing import Search, search

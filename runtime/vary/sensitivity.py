@@ -28,8 +28,8 @@ from apc.eigen.eigenpairs import driving_parts, eigenpairs
 from apc.eigen.modes import split
 from apc.eigen.spectrum import solve_spectrum
 from apc.finite_equations import finite_equations
+from apc.frame.display_units import Unit
 from apc.frame.names import Free, parameter_of
-from apc.frame.units import Unit
 from apc.network.nominal import channel_numbers
 from apc.result import Result
 from apc.threads import single_threaded
@@ -80,7 +80,7 @@ class Sensitivities(Result):
     there is none.
     """
 
-    shown_by = "vary:sensitivities"
+    shown_by = "vary_output:sensitivities"
 
     radius: float
     active: tuple[tuple[complex, str], ...]

@@ -16,7 +16,7 @@ import sys
 from datetime import UTC, datetime
 from pathlib import Path
 
-from apc.benchmark.bench import machine
+from apc.benchmark.speed_and_error import machine
 from apc.benchmark.timing import waited
 from tests.bench.judge import HEAD, NOISE, ROW
 

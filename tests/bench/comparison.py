@@ -27,7 +27,7 @@ import numpy as np
 
 import apc
 from apc.benchmark.timing import median_time, take_turns
-from apc.simulation.blocks import blocks
+from apc.simulation.rows_in_time import blocks
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
 from tests.bench.by_hand import (

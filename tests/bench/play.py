@@ -19,8 +19,8 @@ from apc.loop.beside import compare_run
 from apc.loop.peer import Loop
 from apc.loop.run import Run
 from apc.loop.start import Play, play_all
-from apc.present.loop import ticks_text
-from apc.simulation.blocks import pushes
+from apc.present.loop_output import ticks_text
+from apc.simulation.rows_in_time import pushes
 from tests.bench.judge import judged, parser_of
 from tests.topologies import AVERAGE, SCENES, compiled, replaced
 

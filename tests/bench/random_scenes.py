@@ -24,7 +24,7 @@ from apc.analysis.analysis import Analysis, analyze, prepare
 from apc.answer import sensitivities_of
 from apc.benchmark.timing import timed
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.components.library import Library
+from apc.compiler.components.component_library import Library
 from apc.compiler.errors import ApcError
 from apc.eigen.balls import precision
 from apc.frame.overrides import apply

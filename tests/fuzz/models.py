@@ -36,10 +36,10 @@ from apc.compiler.store import model_of
 from apc.inputs import load_fresh
 from apc.loop.beside import compare_run
 from apc.loop.peer import Loop
-from apc.loop.reading import read_run
 from apc.loop.run import run_of, write_run
+from apc.loop.run_folder import read_run
 from apc.processes import digest_of
-from apc.sweeps.store import open_parts
+from apc.sweeps.finished_parts import open_parts
 from tests.fuzz.inputs import MODELS, Input, any_value, mutated
 from tests.fuzz.trees import Pairs, Tree, as_json, changed, of_json
 from tests.topologies import AVERAGE, replaced

@@ -64,7 +64,7 @@ class _Scene:
         """Return all that a datagram might change."""
         loop = self.loop
         kept = loop.player.packets.tobytes(), list(loop.player.arrivals), len(loop.player.ahead)
-        return kept, dict(loop.post.nonces), dict(loop.post.keys), dict(loop.offsets), loop.told, loop.begins
+        return kept, dict(loop.post.nonces), dict(loop.post.keys), dict(loop.offsets), loop.began, loop.begins
 
 
 def _met(patch: pytest.MonkeyPatch, system: CompiledSystem) -> _Scene:
@@ -96,7 +96,7 @@ def _playing(here: _Scene, forged: Forgery, may: bool) -> str:
 def _meeting(here: _Scene, forged: Forgery, may: bool) -> str:
     """Return what is wrong as a peer meets the others and is given a datagram first."""
     loop, told = here.loop, ""
-    loop.begins, loop.session, loop.told = 0, 0, None
+    loop.begins, loop.session, loop.began = 0, 0, None
     loop.offsets.clear()
     here.wire.coming.clear()
     here.wire.send(*forged)

@@ -202,7 +202,7 @@ def test_a_scenes_words_are_never_read_as_python(tmp_path: Path) -> None:
         'x"""\\\nimport os; os.abort()\n"""{0}', found.cut, found.frame_s, *found.matrices,
         *(found.states, found.inputs, found.outputs), ('"""\nraise SystemExit',), '"""\nraise SystemExit',
     )  # fmt: skip
-    from apc.exports.files import write_script
+    from apc.exports.state_space_files import write_script
 
     write_script(path := tmp_path / "loop.py", evil)
     pytest.importorskip("control")

@@ -14,7 +14,7 @@ import pytest
 import apc
 from apc.__main__ import run
 from apc.compiler.errors import ApcError
-from apc.hands.feel import feel
+from apc.hands.frequency_response import feel
 from tests.hands.handled import responses
 from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, compiled, replaced
 

@@ -17,7 +17,7 @@ import apc
 from apc.__main__ import run
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.moments.network import NetworkVerdict
+from apc.moments.network_verdict import NetworkVerdict
 from tests.held_scenes import scene, system_of
 from tests.lossy import unreliable
 from tests.topologies import AVERAGE, compiled, replaced

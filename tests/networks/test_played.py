@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import Column, CompiledSystem
-from apc.simulation.blocks import blocks
+from apc.simulation.rows_in_time import blocks
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
 from tests.lossy import apart

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import apc
-from apc.moments.network import NetworkVerdict
+from apc.moments.network_verdict import NetworkVerdict
 from tests.held_scenes import frames, growth, scene
 from tests.topologies import replaced
 

@@ -176,7 +176,7 @@ def test_a_model_of_somebody_else_needs_no_file_beside_it_and_not_this_library(
         Path(path).unlink()
     write("mass.yaml", "component: Mass\nabout: Nothing.\n")
     library = {**cache.builtin_files(), "Mass": Path("mass.yaml").resolve()}
-    for module in ("apc.compiler.components.library", "apc.compiler.cache"):
+    for module in ("apc.compiler.components.component_library", "apc.compiler.cache"):
         monkeypatch.setattr(f"{module}.builtin_files", lambda: library)
     assert store.encoded(other()) == expected
 

@@ -281,8 +281,8 @@ def test_of_answers_the_shortest_round_trip_tells_a_clock_and_the_first_the_begi
     for asked, begins in ((1_000, 0), (2_000, 9_000), (1_000, 8_000)):
         loop._met(Answer(1, 5_000, 3, 4, asked, 4_000, begins, int(begins > 0)), 6_000)
     assert loop.offsets[1][0] == 6_000 - 2_000 - 1_000
-    assert loop.told is not None
-    assert loop.told.begins == 9_000
+    assert loop.began is not None
+    assert loop.began.begins == 9_000
 
 
 def test_a_forged_datagram_is_dropped_in_meeting_and_in_playing(monkeypatch: pytest.MonkeyPatch) -> None:

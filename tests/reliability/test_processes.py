@@ -17,7 +17,7 @@ from apc.processes import local_processes, model_bytes
 from apc.simulation.ensemble import play_many
 from apc.simulation.settings import Settings
 from apc.sweeps.grid import build_grid, parse_axis
-from apc.sweeps.sweep import LOST, sweep
+from apc.sweeps.resumable_sweep import LOST, sweep
 from apc.sweeps.work import Work, compute_part
 from tests.sweeping import CHEAP, alive, children, parts
 from tests.topologies import AVERAGE, compiled, replaced

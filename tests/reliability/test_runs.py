@@ -17,8 +17,8 @@ import pytest
 
 import apc
 from apc.compiler.errors import ApcError
-from apc.loop.reading import read_run
 from apc.loop.run import PeerRun, run_of, write_run
+from apc.loop.run_folder import read_run
 from apc.processes import digest_of
 from tests.fuzz.models import recorded
 from tests.surfaces.wire import Wire, loop_at

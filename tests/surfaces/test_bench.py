@@ -13,12 +13,12 @@ from pathlib import Path
 import pytest
 
 import apc
-from apc.benchmark.bench import SAME, Bench, Measured, bench, pareto_front
 from apc.benchmark.hard import compare, run_hard_cases
 from apc.benchmark.scale import scale
+from apc.benchmark.speed_and_error import SAME, Bench, Measured, bench, pareto_front
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.present.bench import bench_picture
+from apc.present.bench_output import bench_picture
 from tests.commands import Cli, write
 from tests.hard.truths import HERE, TRUTHS, truth_of
 from tests.topologies import AVERAGE, SCENES, compiled, replaced
@@ -117,7 +117,7 @@ def test_numbers_of_peers_that_are_none_are_refused(scene: str, counts: list[int
 def test_a_picture_that_cannot_be_is_refused_before_anything_is_measured(
     plot: str, message: str, cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("apc.benchmark.bench.bench", lambda *_: pytest.fail("it is measured"))
+    monkeypatch.setattr("apc.benchmark.speed_and_error.bench", lambda *_: pytest.fail("it is measured"))
     if "E875" in message:
         monkeypatch.setitem(sys.modules, "matplotlib", None)
     ran = cli(f"bench '{SCENES}/template.yaml' --plot {plot}")
@@ -140,7 +140,7 @@ def test_what_goes_wrong_in_the_end_costs_no_figures(
         (found, "--plot bench.png", ["E601 can't be written"]),
         (broken, "", ["E922", note]),
     ):
-        monkeypatch.setattr("apc.benchmark.bench.bench", lambda *_, measured=measured: measured)
+        monkeypatch.setattr("apc.benchmark.speed_and_error.bench", lambda *_, measured=measured: measured)
         ran = cli(f"bench '{SCENES}/template.yaml' {plot}")
         assert ran.code == 1 and all(one in ran.err for one in messages)
         assert "analyze chooses modes" in ran.out

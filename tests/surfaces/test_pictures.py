@@ -15,7 +15,7 @@ import pytest
 
 import apc
 from apc.present import animation
-from apc.present.analysis import analysis_picture
+from apc.present.analysis_output import analysis_picture
 from apc.present.pictures import colours_of, write_figure
 from apc.present.region_picture import panels_picture
 from apc.regions.panels import compare_regions

@@ -24,8 +24,8 @@ import pytest
 from apc.__main__ import run
 from apc.compiler.errors import ApcError, Mistake
 from apc.loop.device import device_function
-from apc.loop.reading import read_run
 from apc.loop.run import run_of
+from apc.loop.run_folder import read_run
 from apc.loop.start import Part, Play, play_all
 from apc.processes import Workers
 from tests.surfaces.wire import Other, Wire, loop_at, send_packets

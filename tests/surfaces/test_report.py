@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 import apc
-from apc.present import report as pages
-from apc.present.report import kept_report, report_page
+from apc.present import report_output as pages
+from apc.present.report_output import kept_report, report_page
 from apc.reports.contents import Report, differences
 from tests.commands import Cli, folder, write
 from tests.topologies import AVERAGE, SCENES, replaced

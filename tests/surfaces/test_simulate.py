@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apc.simulation import blocks, simulation
+from apc.simulation import rows_in_time, simulation
 from tests.commands import Cli, folder, write
 from tests.topologies import AVERAGE, SCENES, replaced
 
@@ -88,14 +88,14 @@ def test_a_scene_at_rest_is_said_to_rest_and_an_unstable_one_is_an_answer(cli: C
 
 def test_ctrl_c_keeps_what_is_done(moved: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(simulation, "MOST_FRAMES", 5)
-    pushes = blocks.pushes
+    pushes = rows_in_time.pushes
 
     def interrupted(played: simulation.Simulation, first: int) -> list[np.ndarray | None]:
         if first >= 10:
             raise KeyboardInterrupt
         return pushes(played, first)
 
-    monkeypatch.setattr(blocks, "pushes", interrupted)
+    monkeypatch.setattr(rows_in_time, "pushes", interrupted)
     ran = moved("simulate --duration 1s --out run.csv")
     assert ran.code == 130 and "run.csv is written" in ran.out
     assert ran.err.startswith("stopped at 0.079 s of 1 s; what was done is kept")

@@ -7,7 +7,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from apc.present.simulation import error_text
+from apc.present.simulation_output import error_text
 from apc.simulation.settings import parse_method
 from apc.simulation.trajectory import simulate
 from tests.fifty_digits.truth import exact_course

@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from apc.compiler.errors import ApcError
-from apc.simulation.blocks import blocks
+from apc.simulation.rows_in_time import blocks
 from apc.simulation.settings import Method, Settings, parse_method
 from apc.simulation.simulation import prepare
 from apc.simulation.trajectory import Trajectory, simulate

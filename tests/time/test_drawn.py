@@ -14,7 +14,7 @@ import apc
 from apc.compiler.compiled import CompiledSystem
 from apc.present.bodies import heading
 from apc.present.pictures import write_picture
-from apc.present.simulation import paths_of
+from apc.present.simulation_output import paths_of
 from apc.present.still import draw_actors
 from tests.topologies import AVERAGE, SCENES, compiled, library, replaced
 

@@ -14,9 +14,9 @@ import pytest
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.pipeline import compile_topology
 from apc.frame.overrides import apply, parse_override
-from apc.simulation.blocks import blocks
 from apc.simulation.native import compiler
 from apc.simulation.propagate import MOST_EXACT
+from apc.simulation.rows_in_time import blocks
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare
 from apc.simulation.trajectory import Trajectory, simulate

@@ -16,7 +16,7 @@ import scipy.io
 
 from apc.compiler.errors import ApcError
 from apc.present.recording import SUFFIXES, open_recording
-from apc.simulation.blocks import blocks
+from apc.simulation.rows_in_time import blocks
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
 from apc.simulation.trajectory import simulate

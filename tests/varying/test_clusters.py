@@ -16,7 +16,7 @@ from apc.compiler.errors import ApcError
 from apc.processes import Patience
 from apc.sweeps import cluster as sweep_cluster
 from apc.sweeps import work as sweep_work
-from apc.sweeps.sweep import sweep
+from apc.sweeps.resumable_sweep import sweep
 from tests.sweeping import CHEAP, parts
 from tests.topologies import compiled, told
 
@@ -62,7 +62,7 @@ def test_workers_with_other_versions_are_refused(
     tmp_path: Path, address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     other = tuple((name, "1.2.3" if name == "numpy" else v) for name, v in sweep_work.program_versions())
-    monkeypatch.setattr("apc.sweeps.sweep.program_versions", lambda: other)
+    monkeypatch.setattr("apc.sweeps.resumable_sweep.program_versions", lambda: other)
     with pytest.raises(ApcError, match=r"E888 a worker has numpy .* \(here 1\.2\.3\): the same numbers"):
         sweep(MODEL, OVER, out=tmp_path / "r.csv", cluster=address)
     assert list(tmp_path.iterdir()) == []

@@ -17,7 +17,7 @@ from apc.__main__ import run
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.eigen.balls import precision
-from apc.vary.critical import Critical
+from apc.vary.critical_values import Critical
 from apc.vary.margins import Margin
 from tests.bench import random_scans
 from tests.bruteforce import Scene, as_ball, frame_matrices, frame_matrix

@@ -19,7 +19,7 @@ from apc.compiler.errors import ApcError
 from apc.present.region_picture import stable_outlines
 from apc.regions.boundary import relative_to
 from apc.regions.curves import between, tangents
-from apc.regions.region import Region
+from apc.regions.stable_region import Region
 from tests.paper_limit import limit as limit_of
 from tests.reference import CONTACT_LIMITS
 from tests.topologies import AVERAGE, MESH, ROOT, SCENES, compiled, replaced

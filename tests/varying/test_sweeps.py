@@ -23,7 +23,7 @@ import pytest
 import apc
 from apc.__main__ import run
 from apc.compiler import seal
-from apc.sweeps.sweep import Sweep, sweep
+from apc.sweeps.resumable_sweep import Sweep, sweep
 from tests.sweeping import CHEAP, alive, children, parts, start, start_waiting, wait_for_parts
 from tests.topologies import AVERAGE, ONE_MASS, SCENES, compiled, told
 

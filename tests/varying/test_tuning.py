@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import apc
-from apc.present.tune import panels_of
+from apc.present.tuning_output import panels_of
 from apc.tuning.demands import read_against, read_demands
 from apc.tuning.front import front
 from tests.commands import Cli, write

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from numpy.typing import NDArray
 
 from apc.compiler.words import counted, in_hertz, known_digits, with_unit, wrapped
-from apc.frame.units import as_shown
+from apc.frame.display_units import as_shown
 from apc.optional import need
 from apc.present.forms import (
     MEANT,
@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     import pandas
 
     from apc.frame.settable import Parameters, Settable
-    from apc.sweeps.sweep import Sweep
-    from apc.vary.critical import Critical
+    from apc.sweeps.resumable_sweep import Sweep
+    from apc.vary.critical_values import Critical
     from apc.vary.many import Analyses
     from apc.vary.margins import Margins
     from apc.vary.sensitivity import Sensitivities
@@ -164,7 +164,7 @@ def _count_lines(critical: Critical) -> Lines:
 
 def critical_picture(critical: Critical, ax: Any) -> Any:
     """Draw where the eigenvalues go; return the matplotlib Axes."""
-    from apc.present.analysis import locus_picture
+    from apc.present.analysis_output import locus_picture
     from apc.vary.locus import root_locus
 
     return locus_picture(root_locus(critical.system, critical), ax)

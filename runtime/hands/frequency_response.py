@@ -26,7 +26,7 @@ from apc.finite_equations import finite_equations
 from apc.frame.discretize import UNIT
 from apc.hands.answers import AROUND, Responses, Weights, held_names, responses
 from apc.hands.asked import Port, check_frequencies, find_port, next_peer, ticks_in
-from apc.hands.norms import Peak, noise_variance, sampled_data_peak, tick_peak
+from apc.hands.system_norms import Peak, noise_variance, sampled_data_peak, tick_peak
 from apc.hands.viscosity import Viscosity, network_viscosity
 from apc.network.nominal import left_out
 from apc.result import Look, Result
@@ -111,7 +111,7 @@ class Feel(Result):
     `bound` is what the impedance may be off by, relatively; `transmitted_bound` and `error_bound` the others.
     """
 
-    shown_by = "hands:feel"
+    shown_by = "hands_output:feel"
 
     topology: str
     at: str

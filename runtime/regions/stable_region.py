@@ -158,7 +158,7 @@ class Region(Result):
     linear; `criterion` what stable means; `left_out` says what of the scene the answer does not look at.
     """
 
-    shown_by = "region:region"
+    shown_by = "region_output:region"
 
     topology: str
     x: Range

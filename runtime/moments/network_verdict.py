@@ -22,8 +22,8 @@ from apc.frame.exchange import arcs
 from apc.frame.parameters import resolve
 from apc.moments.almost_sure import AlmostSure, almost_sure
 from apc.moments.bursts import affine, tagged_error, tagged_radius
+from apc.moments.copies_apart import forced, moments_error
 from apc.moments.crowd import Hearing, build_hearing, crowd, peer_classes
-from apc.moments.errors import forced, moments_error
 from apc.moments.gains import Moments, mean_square_radius
 from apc.moments.held import every_channel, held_scene
 from apc.moments.packet_memory import is_memoryless
@@ -87,7 +87,7 @@ class NetworkVerdict(Result):
     served, as `notes` say. `linearized`: the scene is not linear, and this holds near its start only.
     """
 
-    shown_by = "network:network"
+    shown_by = "network_output:network"
 
     topology: str
     verdict: str

@@ -226,19 +226,19 @@ def network_answer_document(network_answer: NetworkAnswer) -> Plain:
 
 def answer_document(answer: Answer) -> Plain:
     """Return what `apc analyze --json` prints: the analysis with more keys."""
-    told = answer.analysis.to_dict()
-    told |= picked(answer, "network", "sensitivities", "contact_modes", "switching", "buzz")
-    told |= {
+    plain = answer.analysis.to_dict()
+    plain |= picked(answer, "network", "sensitivities", "contact_modes", "switching", "buzz")
+    plain |= {
         "margins": document(answer.margins.rows),
         "margins_note": answer.margins.note,
         "buzz_note": "" if answer.buzz else answer.no_buzz or NOT_PLAYED,
         "warnings": [*answer.warnings, *filter(None, (answer.conventions.warning,))],
     }
     if answer.detailed:
-        told["conventions"] = answer.conventions.to_dict()
+        plain["conventions"] = answer.conventions.to_dict()
     if answer.box is not None:
-        told["box"] = answer.box.to_dict()
-    return told
+        plain["box"] = answer.box.to_dict()
+    return plain
 
 
 def _mode_table(modes: Sequence[Mode]) -> Lines:

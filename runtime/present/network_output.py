@@ -18,7 +18,7 @@ from apc.compiler.words import counted, wrapped
 from apc.present.forms import LINEARIZED, Lines, Plain, labelled, notes, radius_text, record, sentences
 
 if TYPE_CHECKING:
-    from apc.moments.network import NetworkVerdict
+    from apc.moments.network_verdict import NetworkVerdict
     from apc.moments.worst import LossesInARow
     from apc.network.recorded import NetworkRecording, Share
 

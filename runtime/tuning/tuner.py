@@ -141,7 +141,7 @@ class Tuning(Result):
     where it is not.
     """
 
-    shown_by = "tune:tuning"
+    shown_by = "tuning_output:tuning"
 
     topology: str
     aim: str
@@ -177,7 +177,7 @@ class Tuning(Result):
         Raises
         ------
         ApcError
-            E875 matplotlib is not installed; those of `regions.region` and `trajectory.simulate`.
+            E875 matplotlib is not installed; those of `regions.stable_region` and `trajectory.simulate`.
         """
         return self._shown("picture", ax)
 

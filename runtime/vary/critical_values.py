@@ -79,7 +79,7 @@ class Critical(Result):
     same. `system` is the scene.
     """
 
-    shown_by = "vary:critical"
+    shown_by = "vary_output:critical"
     pictured = False  # which takes a hundred analyses
 
     topology: str

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from apc.compiler.words import counted
 from apc.loop.packets import DROPPED
 from apc.present.forms import Lines, notes, record, table
-from apc.present.network import recording_document
+from apc.present.network_output import recording_document
 
 if TYPE_CHECKING:
     from apc.loop.beside import Measured, RunComparison, Ticks, WayRun

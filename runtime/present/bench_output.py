@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-from apc.benchmark.bench import SAME, Bench, Comparison, Measured
+from apc.benchmark.speed_and_error import SAME, Bench, Comparison, Measured
 from apc.compiler.words import counted, wrapped
 from apc.present.forms import Lines, notes, record, table
 from apc.present.pictures import COLOURS, legend_below, new_figure
@@ -65,9 +65,9 @@ def _task(comparison: Comparison) -> Lines:
         yield from table(rows, "<>>>><")
         yield ""
         known = any(measured.error is not None for measured in comparison.measured)
-        told = [f"error and bound are {comparison.relative}", BETTER] if known else []
+        legend = [f"error and bound are {comparison.relative}", BETTER] if known else []
         reference = f"{'' if known else 'no '}reference: {comparison.reference}"
-        yield from notes(_times(comparison), *told, _choice(comparison), reference, *comparison.notes)
+        yield from notes(_times(comparison), *legend, _choice(comparison), reference, *comparison.notes)
     yield from notes(*(f"{name} left out: {reason}" for name, reason in comparison.refused))
 
 

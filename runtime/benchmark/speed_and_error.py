@@ -35,8 +35,8 @@ from apc.frame.discretize import UNIT
 from apc.frame.jacobians import jacobians
 from apc.frame.parameters import resolve
 from apc.result import Result
-from apc.simulation.blocks import blocks
 from apc.simulation.flow import state_scales
+from apc.simulation.rows_in_time import blocks
 from apc.simulation.settings import CVODES, DEFAULT, EXACT, RK4, SEMI_IMPLICIT, Method, Settings, finer
 from apc.simulation.simulation import Simulation, prepare
 from apc.threads import single_threaded
@@ -120,7 +120,7 @@ class Comparison:
 class Bench(Result):
     """Both tasks on a scene; `machine` says where."""
 
-    shown_by = "bench:bench"
+    shown_by = "bench_output:bench"
 
     topology: str
     peers: int

@@ -33,7 +33,6 @@ from apc.compiler.compiled import (
 )
 from apc.compiler.components.component import Number as NumberParameter
 from apc.compiler.components.component import Variable
-from apc.compiler.crowd import COUNT_ABOUT, heard_sums, with_heard
 from apc.compiler.equations.connections import ZERO
 from apc.compiler.equations.flatten import FlatKind, HoldCrossing
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
@@ -42,6 +41,7 @@ from apc.compiler.language.evaluation import evaluate, formula_of
 from apc.compiler.language.expression import Expr, Name, format_expression
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.values import Value, renamed
+from apc.compiler.peer_counts import COUNT_ABOUT, heard_sums, with_heard
 from apc.compiler.scene.groups import SceneGroup
 from apc.compiler.scene.links import PROBABILITIES
 from apc.compiler.scene.scene import Scene

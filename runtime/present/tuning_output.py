@@ -19,12 +19,12 @@ from apc.compiler.compiled import LENGTH
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import counted, enumerated, in_hertz, wrapped
 from apc.frame.overrides import Override, apply
-from apc.present.analysis import range_document, range_text
+from apc.present.analysis_output import range_document, range_text
 from apc.present.forms import MEANT, Lines, Plain, labelled, notes, quantity, record, span, table, uncertain
 from apc.present.pictures import COLOURS, legend_below, new_figure
 from apc.present.region_picture import draw_panel
 from apc.regions.panels import Panel
-from apc.regions.region import Region, region
+from apc.regions.stable_region import Region, region
 from apc.simulation.strike import WATCHED, strike
 from apc.simulation.trajectory import simulate
 from apc.tuning.bound import SHARE
@@ -33,7 +33,7 @@ from apc.tuning.demands import RADIUS, SETTLING
 if TYPE_CHECKING:
     from apc.compiler.compiled import CompiledSystem
     from apc.tuning.front import Front
-    from apc.tuning.tune import Binding, Tuning
+    from apc.tuning.tuner import Binding, Tuning
 
 # Digits of what is typed, and of what a limit buys.
 TYPED, BUYS = 12, 3

@@ -74,8 +74,8 @@ def _makers(name: str) -> tuple[Callable[..., Result], Callable[[Path, Any], Non
             from apc.exports.fmu import write_fmu
 
             return scene_unit, write_fmu
-    from apc.exports.files import write_mat, write_npz, write_script
     from apc.exports.free import state_space_of
+    from apc.exports.state_space_files import write_mat, write_npz, write_script
 
     return state_space_of, {"control": write_script, "mat": write_mat, "npz": write_npz}[name]
 

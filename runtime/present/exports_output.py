@@ -46,7 +46,9 @@ def state_space_text(state_space: StateSpace) -> Lines:
 
 def state_space_control(state_space: StateSpace) -> Any:
     """Return a state space as python-control's."""
-    from apc.exports.files import as_control  # what writes files is asked for where one is written
+    from apc.exports.state_space_files import (
+        as_control,  # what writes files is asked for where one is written
+    )
 
     return as_control(state_space)
 

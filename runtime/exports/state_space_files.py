@@ -15,8 +15,8 @@ import numpy as np
 
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import write_file, write_text
+from apc.exports.identifiers import Port, identifier, words
 from apc.exports.texts import filled
-from apc.exports.words import Port, identifier, words
 from apc.optional import need
 
 if TYPE_CHECKING:

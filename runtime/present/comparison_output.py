@@ -38,7 +38,7 @@ from apc.tables import Column, Row, Tabled
 
 if TYPE_CHECKING:
     from apc.comparison.comparison import Comparison, Scheme
-    from apc.vary.critical import Critical
+    from apc.vary.critical_values import Critical
 
 NONE = "–"
 DIGITS = 6  # of what is felt, at most
@@ -174,14 +174,14 @@ def _varied(scheme: Scheme, key: str, feet: dict[str, int]) -> tuple[str, str]:
     critical: Critical | None = getattr(scheme, key)
     if critical is None:
         return _marked(NONE, _why(scheme, key), feet), NONE
-    told = []
+    remarks = []
     if len(critical.crossings) > 1:
-        told.append(
+        remarks.append(
             f"{counted(len(critical.crossings), 'crossing')} in all: apc critical {critical.parameter}"
         )
     if critical.groups:
-        told.append("one value for all groups, which differ in the scene")
-    return _marked(_reach(critical), told, feet), critical.parameter
+        remarks.append("one value for all groups, which differ in the scene")
+    return _marked(_reach(critical), remarks, feet), critical.parameter
 
 
 def _reach(critical: Critical) -> str:

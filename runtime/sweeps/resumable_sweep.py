@@ -30,9 +30,9 @@ from apc.memory import refuse_beyond
 from apc.network.nominal import left_out, refuse_channel_number
 from apc.processes import Patience, Workers, cores, local_processes, model_bytes, results, this_process
 from apc.result import Result
+from apc.sweeps.finished_parts import Parts, open_parts
 from apc.sweeps.grid import Grid, build_grid, check_size, parse_axis
 from apc.sweeps.quantities import BEGINNINGS, Cells, by_criterion, find_quantity
-from apc.sweeps.store import Parts, open_parts
 from apc.sweeps.work import Computed, Work, compute_part, program_versions
 from apc.tables import BLOCK, Column, check_table_path, read_table, write_table
 from apc.vary.growth import MEAN_SQUARE, NOMINAL, PASSIVE, criterion_of, refuse_time
@@ -69,7 +69,7 @@ class Sweep(Result):
     versions. `notes` tell what was out of the ordinary.
     """
 
-    shown_by = "vary:sweep"
+    shown_by = "vary_output:sweep"
 
     topology: str
     of: str

@@ -30,7 +30,7 @@ from apc.present.pictures import COLOURS, legend_below, new_figure
 from apc.tables import Column, Tabled
 
 if TYPE_CHECKING:
-    from apc.hands.feel import Extremes, Feel
+    from apc.hands.frequency_response import Extremes, Feel
     from apc.hands.passivity import PassiveHands, PassiveMode
 
 Floats = NDArray[np.float64]
@@ -151,11 +151,11 @@ def feel_text(feel: Feel) -> Lines:
     headings = ("frequency", "impedance", "phase", "arrives", "copies apart", "alias")
     units = ("Hz", "N*s/m", "degrees", "mm/s/N", "mm/N", "")
     yield from table([headings, units, *_rows_shown(feel)], ">>>>>>")
-    told = [f"arrives: at {feel.between}"] if feel.between else []
-    told += [f"copies: of {feel.copy}, from the mean of the others'"] if feel.copy else []
-    told += ["alias: the largest part that sampling moves to another frequency, beside that at this one"]
+    legend = [f"arrives: at {feel.between}"] if feel.between else []
+    legend += [f"copies: of {feel.copy}, from the mean of the others'"] if feel.copy else []
+    legend += ["alias: the largest part that sampling moves to another frequency, beside that at this one"]
     yield ""
-    yield from sentences("; ".join(told))
+    yield from sentences("; ".join(legend))
     if feel.hinf and feel.stable is not False:
         yield "\n  Largest gain at any frequency (H∞), forces of any course:"
         yield from table([_extreme(extremes) for extremes in feel.hinf])

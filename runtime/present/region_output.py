@@ -15,15 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.words import counted, known_digits, measured
-from apc.frame.units import as_shown
-from apc.present.analysis import range_document
+from apc.frame.display_units import as_shown
+from apc.present.analysis_output import range_document
 from apc.present.forms import MEANT, Lines, Plain, notes, picked, quantity, sentences, span, table
 from apc.present.region_picture import panel_letter, panels_picture, region_picture  # noqa: F401 -- looked up
 from apc.tables import Column, Row, Tabled
 
 if TYPE_CHECKING:
     from apc.regions.panels import Panel, Panels
-    from apc.regions.region import Curve, Region
+    from apc.regions.stable_region import Curve, Region
 
 Floats = NDArray[np.float64]
 
