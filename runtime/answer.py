@@ -13,13 +13,14 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
-from apc.analysis.analysis import Analysis, Prepared, analyze, near_start, prepare
+from apc.analysis.analysis import Analysis, analyze, near_start
 from apc.analysis.contact_modes import ContactModes, contact_modes
 from apc.analysis.conventions import Conventions, conventions
 from apc.analysis.methods import PAPER
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.spectrum import UNSTABLE
+from apc.frame.instance import Prepared, prepare
 from apc.result import Result
 from apc.vary.margins import NOT_STABLE, Margins
 from apc.vary.margins import margins as margins_of
@@ -99,7 +100,7 @@ def judge(
     certify
         Prove the verdict in ball arithmetic.
     prepared
-        From `analysis.prepare`, of this system with any numbers.
+        From `instance.prepare`, of this system with any numbers.
     """
     if method != PAPER:
         return analyze(system, method=method, certify=certify, prepared=prepared)
@@ -312,7 +313,7 @@ def sensitivities_of(system: CompiledSystem, prepared: Prepared, analysis: Analy
     Parameters
     ----------
     system, prepared
-        The compiled scene, and what `analysis.prepare` made of it.
+        The compiled scene, and what `instance.prepare` made of it.
     analysis
         Its analysis.
     """

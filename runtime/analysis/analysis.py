@@ -11,7 +11,7 @@ Does not: read files, or draw.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any, Unpack
@@ -24,7 +24,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
 from apc.eigen.closing import Loop, close_loop
 from apc.eigen.modes import arrange
-from apc.eigen.peers import MOST_STATES, PeerGroup, group_of_row, peer_groups, states_of, used_ways
+from apc.eigen.peers import MOST_STATES, PeerGroup, peer_groups, representatives, states_of, used_ways
 from apc.eigen.rest import unrest
 from apc.eigen.rigid import Standing, what_stands
 from apc.eigen.spectrum import (
@@ -37,15 +37,11 @@ from apc.eigen.spectrum import (
     up_to,
 )
 from apc.finite_equations import finite_equations
-from apc.frame.ages import at_timings, linear_sites
+from apc.frame.ages import linear_sites
 from apc.frame.discretize import TOO_LARGE
-from apc.frame.exchange import Exchange, build_exchange
-from apc.frame.jacobians import SiteJacobians
-from apc.frame.linearize import at_start, reaches_start, sends_nothing
+from apc.frame.exchange import Exchange
+from apc.frame.instance import Instance, Prepared, instance, starting
 from apc.frame.names import Free
-from apc.frame.parameters import Numbers, resolve
-from apc.frame.schedule import ORDER, Schedule
-from apc.frame.scheduling import build_schedules
 from apc.network.nominal import left_out, unreliable
 from apc.result import Look, Result
 from apc.threads import single_threaded
@@ -53,22 +49,6 @@ from apc.threads import single_threaded
 NOT_LINEAR = "left out: the scene is not linear, and this holds near its start values only"
 
 SETTLED = 0.02  # of where it began: a motion counts as settled
-
-
-@dataclass(frozen=True, slots=True)
-class Prepared:
-    """What analyses of one system with different numbers have in common.
-
-    The Jacobians (one a kind) hold for any numbers; the schedules (one a group) for these timings and this
-    order of coincident events. With `starting` the Jacobians are those where each kind starts (see
-    `prepare_at_start`).
-    """
-
-    jacobians: tuple[SiteJacobians, ...]
-    schedules: tuple[Schedule, ...]
-    timings: Mapping[str, Fraction]
-    order: tuple[str, ...]
-    starting: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,25 +103,12 @@ class Analysis(Result):
         )
 
 
-def prepare(system: CompiledSystem) -> Prepared:
-    """Do what analyses with different numbers can share.
-
-    Parameters
-    ----------
-    system
-        The compiled scene.
-    """
-    timings = {timing.name: timing.value for timing in system.timings}
-    return _scheduled(system, linear_sites(system, timings, ORDER), timings, ORDER)
-
-
 def prepare_at_start(
     system: CompiledSystem, prepared: Prepared, varied: Sequence[Free] = ()
 ) -> Prepared | None:
     """Return what was prepared with every kind linearized where it starts, as its parameters say.
 
-    None where what is heard at the start decides as well (see `start.at_start`), unless that is 0 from
-    every peer, whatever `varied` parameters are.
+    None where that can't be: see `instance.starting`.
 
     Parameters
     ----------
@@ -158,24 +125,7 @@ def prepare_at_start(
         As `plan.refuse_varying`.
     """
     refuse_varying(system, prepared.jacobians)
-    result = _starting(system, prepared.jacobians, varied)
-    return None if result is None else replace(prepared, jacobians=result, starting=True)
-
-
-def _starting(
-    system: CompiledSystem, sites: tuple[SiteJacobians, ...], varied: Sequence[Free] = ()
-) -> tuple[SiteJacobians, ...] | None:
-    """Return the Jacobians of each kind where it starts, None where one's don't follow from parameters."""
-    used = {group.kind for group in system.groups}
-    silent = False
-    if any(at_start(sites[kind]) is None for kind in used):
-        silent = not any(reaches_start(system, free) for free in varied) and all(
-            sends_nothing(system.kinds[group.kind], rows)
-            for group, rows in zip(system.groups, resolve(system).parameters, strict=True)
-        )
-    listed = [at_start(site, silent=silent) if kind in used else site for kind, site in enumerate(sites)]
-    result = tuple(site for site in listed if site is not None)
-    return result if len(result) == len(sites) else None
+    return starting(system, prepared, varied)
 
 
 def near_start(system: CompiledSystem, prepared: Prepared | None = None) -> tuple[str, ...]:
@@ -196,6 +146,10 @@ def near_start(system: CompiledSystem, prepared: Prepared | None = None) -> tupl
         groups, _ = lifted_groups(system, prepared=prepared)
     except ApcError:  # at these values there is no answer
         return (NOT_LINEAR,)
+    return _near_start(groups)
+
+
+def _near_start(groups: Sequence[PeerGroup]) -> tuple[str, ...]:
     moves = unrest(groups)
     return (*([f"{moves}; what happens is played: apc simulate"] if moves else []), NOT_LINEAR)
 
@@ -231,19 +185,17 @@ def analyze(
         serve this scene; and those of `plan.refuse_varying` and `peers.peer_groups`.
     """
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        numbers = resolve(system)
-        prepared = timed(system, prepared or prepare(system), numbers)
-        exchange = build_exchange(system, numbers.timings)
-        plan = make_plan(system, prepared.jacobians, prepared.schedules, numbers, exchange, method)
+        scene = instance(system, prepared)
+        plan = make_plan(scene, method)
         if not plan.groups:
-            spectrum, notes = _solve_populations(system, prepared, numbers, exchange)
+            spectrum, notes = _solve_populations(scene)
         elif plan.method == "determinant":
             spectrum, notes = _solve_determinant(plan.loops), ()
             small = all(loop.states <= MOST_STATES for loop in plan.loops)
             if (
                 method == "auto" and spectrum.stable is None and small
             ):  # matrices bound what the determinant leaves open
-                arranged = arrange(plan.groups, exchange)
+                arranged = arrange(plan.groups, scene.exchange)
                 plan = replace(plan, method=arranged.method, notes=arranged.notes)
                 spectrum = _solve_closed(system, plan.loops, certify=certify)
         else:
@@ -252,8 +204,8 @@ def analyze(
             raise cannot_serve(system, method, "what a frame's ticks round hides the peers' own eigenvalues")
         if certify and (not plan.groups or plan.method == "determinant"):
             notes = (*notes, f"not proved, as method {plan.method} has no matrix of balls")
-        linearized = not all(prepared.jacobians[group.kind].affine for group in system.groups)
-        population = () if plan.loops else _representatives(system, prepared, numbers, exchange)
+        linearized = not scene.affine
+        population = () if plan.loops else representatives(scene)
         stands = _what_stands(spectrum, plan.loops, population)
         verdict, stable = spectrum.verdict, spectrum.stable
         if verdict in (STABLE_TRANSLATING, DRIFTS):
@@ -265,12 +217,9 @@ def analyze(
             proof += f", of the {' on the '.join(name for name, is_so in of if is_so)}"
     return Analysis(
         topology=system.name,
-        peers=exchange.peers,
-        frame_s=float(prepared.schedules[0].frame_s),
-        states_per_peer=max(
-            states_of(schedule, prepared.jacobians[group.kind])
-            for schedule, group in zip(prepared.schedules, system.groups, strict=True)
-        ),
+        peers=scene.exchange.peers,
+        frame_s=float(scene.schedules[0].frame_s),
+        states_per_peer=max(map(states_of, scene.schedules, scene.sites)),
         method=plan.method,
         verdict=verdict,
         stable=stable,
@@ -281,7 +230,7 @@ def analyze(
         linearized=linearized,
         notes=(*plan.notes, *notes, *spectrum.notes),
         proof=proof,
-        left_out=(*near_start(system, prepared), *left_out(system)),
+        left_out=(*(_near_start(plan.groups) if linearized else ()), *left_out(system)),
         unfelt=stands.names,
         translations=stands.translations,
         rotations=stands.rotations,
@@ -326,19 +275,6 @@ def _remembers(group: PeerGroup) -> bool:
     )
 
 
-def _representatives(
-    system: CompiledSystem, prepared: Prepared, numbers: Numbers, exchange: Exchange
-) -> list[PeerGroup]:
-    """Return the first peer of each group, as many as there are peers in it."""
-    return [
-        group_of_row(
-            *(prepared.jacobians[group.kind], numbers.parameters[place][0], prepared.schedules[place]),
-            *(exchange, place, group.count),
-        )
-        for place, group in enumerate(system.groups)
-    ]
-
-
 def _solve_closed(system: CompiledSystem, loops: Sequence[Loop], *, certify: bool) -> Spectrum:
     """Solve loops by their matrices."""
     closed = tuple(close_loop(loop) for loop in loops)
@@ -358,17 +294,15 @@ def _solve_determinant(loops: Sequence[Loop]) -> Spectrum:
     return solve_loops(loops)
 
 
-def _solve_populations(
-    system: CompiledSystem, prepared: Prepared, numbers: Numbers, exchange: Exchange
-) -> tuple[Spectrum, tuple[str, ...]]:
+def _solve_populations(scene: Instance) -> tuple[Spectrum, tuple[str, ...]]:
     """Solve peers that all differ."""
     from apc.large.determinant_spectrum import solve_populations
     from apc.large.populations import populations
     from apc.large.translation import count_translations
 
-    listed = populations(system, prepared.jacobians, prepared.schedules, numbers)
-    rigid = count_translations(listed, exchange)
-    spectrum = solve_populations(listed, exchange, rigid=rigid or 0)
+    peers = populations(scene)
+    rigid = count_translations(scene, peers)
+    spectrum = solve_populations(peers, scene.exchange, rigid=rigid or 0)
     free = "the first peer moves freely in a way that not all others do: left open"
     return spectrum, () if rigid is not None else (free,)
 
@@ -383,51 +317,6 @@ def lifted_groups(
     ApcError
         As `plan.refuse_varying` and `peers.peer_groups`.
     """
-    numbers = resolve(system)
-    prepared = timed(system, prepared or prepare(system), numbers)
-    refuse_varying(system, prepared.jacobians)
-    exchange = build_exchange(system, numbers.timings)
-    groups = peer_groups(system, prepared.jacobians, prepared.schedules, numbers, exchange)
-    return groups, exchange
-
-
-def timed(system: CompiledSystem, prepared: Prepared, numbers: Numbers) -> Prepared:
-    """Return what was prepared, with the schedules of these timings."""
-    if numbers.timings == prepared.timings:
-        return prepared
-    return prepared_at(system, prepared, numbers.timings)
-
-
-def prepared_at(system: CompiledSystem, prepared: Prepared, timings: Mapping[str, Fraction]) -> Prepared:
-    """Return what was prepared for other timings: with their schedules, and with the ages they make.
-
-    Raises
-    ------
-    ApcError
-        E845 where what is heard at these timings decides how a kind moves where it starts.
-    """
-    sites = at_timings(system, prepared.jacobians, timings, prepared.order)
-    if prepared.starting and sites is not prepared.jacobians:
-        result = _starting(system, sites)
-        if result is None:
-            raise hangs_on_heard(system)
-        sites = result
-    return replace(_scheduled(system, sites, timings, prepared.order), starting=prepared.starting)
-
-
-def hangs_on_heard(system: CompiledSystem) -> ApcError:
-    """Return the refusal of a delay of a scene whose kinds' parameters don't say how these start."""
-    what = "how the scene moves hangs on what is heard at the start: a delay can't be searched"
-    hint = "apc critical of a stiffness or damping"
-    return ApcError(Mistake("E845", Place(system.origin.topology), what, hint=hint))
-
-
-def _scheduled(
-    system: CompiledSystem,
-    built: tuple[SiteJacobians, ...],
-    timings: Mapping[str, Fraction],
-    order: tuple[str, ...],
-) -> Prepared:
-    """Add the schedules of these timings to the Jacobians."""
-    schedules = build_schedules(system, timings, [site.pattern for site in built], order=order)
-    return Prepared(built, schedules, timings, order)
+    scene = instance(system, prepared)
+    refuse_varying(system, scene.jacobians)
+    return peer_groups(scene), scene.exchange

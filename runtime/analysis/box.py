@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, lifted_groups
+from apc.analysis.analysis import lifted_groups
 from apc.compiler.compiled import CompiledSystem, Formula, Group, Parameter
 from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
@@ -31,6 +31,7 @@ from apc.eigen.peers import PeerGroup, Runs
 from apc.eigen.ratios import NotRational, Ratio, Ratios, open_site
 from apc.frame.display_units import Unit
 from apc.frame.exchange import Exchange
+from apc.frame.instance import Prepared
 from apc.frame.names import Free, Range, find
 from apc.frame.overrides import Override, apply, check_bounds
 from apc.frame.parameters import exact_numbers, scope_of
@@ -163,7 +164,7 @@ def open_systems(
     system, ranges
         The compiled scene and what is left open.
     prepared
-        From `analysis.prepare`.
+        From `instance.prepare`.
 
     Raises
     ------
@@ -210,7 +211,7 @@ def open_sites(
     system, ranges
         The compiled scene and what is left open.
     prepared
-        From `analysis.prepare`.
+        From `instance.prepare`.
     lifted
         Gives the peers of a scene in groups, lifted.
 

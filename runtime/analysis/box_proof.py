@@ -23,13 +23,14 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, analyze, prepare
+from apc.analysis.analysis import analyze
 from apc.analysis.box import open_systems
 from apc.analysis.cells import Cell, OpenSystem, contracted, matrices_over, open_system
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.timings import part
 from apc.eigen.rigid import find_rigid_modes, stays_rigid, what_stands
 from apc.eigen.spectrum import UNSTABLE, up_to
+from apc.frame.instance import Prepared, prepare
 from apc.frame.names import Range
 from apc.frame.overrides import Override, apply
 from apc.result import Result
@@ -172,7 +173,7 @@ def open_questions(
     system, ranges, inside
         As for `prove_box`.
     prepared
-        From `analysis.prepare`.
+        From `instance.prepare`.
     """
     questions: list[OpenSystem] = []
     notes: list[str] = []

@@ -15,12 +15,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-from apc.analysis.analysis import Prepared, analyze, prepare
+from apc.analysis.analysis import analyze
 from apc.analysis.switches import SwitchedKind, SwitchingPart, bind, find_switches, switching_parts
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.timings import part
 from apc.eigen.spectrum import UNSTABLE
+from apc.frame.instance import Prepared, prepare
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.linearize import linearize
 from apc.frame.parameters import Numbers, resolve
@@ -100,7 +101,7 @@ def contact_modes(system: CompiledSystem, *, prepared: Prepared | None = None) -
     system
         The compiled scene, with the numbers to analyse.
     prepared
-        From `analysis.prepare`, of this system with these timings; saves building the Jacobians again.
+        From `instance.prepare`, of this system with these timings; saves building the Jacobians again.
 
     Raises
     ------

@@ -23,11 +23,12 @@ from typing import Any
 import casadi
 import numpy as np
 
-from apc.analysis.analysis import Analysis, Prepared, analyze, prepare
+from apc.analysis.analysis import Analysis, analyze
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.timings import part
 from apc.frame.ages import at_timings
+from apc.frame.instance import Prepared, prepare
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.schedule import ORDER, Act, Propagate, Schedule, Send, Tick, Value
 from apc.frame.scheduling import build_schedules
@@ -135,7 +136,7 @@ def conventions(
     system
         The compiled scene, with the numbers to analyse.
     prepared
-        From `analysis.prepare`, of this system with these timings; saves building the Jacobians again.
+        From `instance.prepare`, of this system with these timings; saves building the Jacobians again.
     default
         The analysis under the default conventions, if it was done before.
     quick

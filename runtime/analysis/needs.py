@@ -12,14 +12,12 @@ from fractions import Fraction
 
 import numpy as np
 
-from apc.analysis.analysis import prepare
 from apc.analysis.plan import make_plan
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.finite_equations import finite_equations
-from apc.frame.exchange import build_exchange
+from apc.frame.instance import instance, prepare
 from apc.frame.jacobians import edge_name
-from apc.frame.parameters import resolve
 from apc.result import Result
 
 
@@ -76,11 +74,9 @@ def _needs(system: CompiledSystem) -> Needs:
         )
         for place, kind in enumerate(system.kinds)
     )
-    numbers = resolve(system)
-    exchange = build_exchange(system, numbers.timings)
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # the sizes count here, not the numbers
-            plan = make_plan(system, prepared.jacobians, prepared.schedules, numbers, exchange)
+            plan = make_plan(instance(system, prepared))
         method, systems, refused = plan.method, plan.systems, ""
     except ApcError as error:  # a scene that can't be analysed may still be run
         method, systems, refused = "", (), error.mistakes[0].sentence

@@ -25,7 +25,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared
 from apc.analysis.contact_modes import parts_of_kinds, settings
 from apc.analysis.pushes import Push, push_of
 from apc.analysis.switches import bind, find_switches
@@ -37,6 +36,7 @@ from apc.eigen.relative import relative_coordinates, relative_rows, with_doubt
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.discretize import UNIT, discretize
 from apc.frame.exchange import build_exchange
+from apc.frame.instance import Prepared, instance
 from apc.frame.lift import FrameMap, compose, step_durations, with_roundings
 from apc.frame.parameters import resolve
 from apc.frame.ports import with_cuts
@@ -99,7 +99,7 @@ def contact_groups(
     Parameters
     ----------
     system, prepared
-        The compiled scene, and what `analysis.prepare` made of it.
+        The compiled scene, and what `instance.prepare` made of it.
 
     Raises
     ------
@@ -124,10 +124,10 @@ def contact_groups(
                 return push
         if not on[group.kind].parameters_suffice:
             return f"some force at {group.name} is not linear, or looks at each of the others by itself"
-    exchange = build_exchange(system, numbers.timings)
+    scene = instance(system, replace(prepared, jacobians=on))
     kinds = {id(site_jacobians): kind for kind, site_jacobians in enumerate(on)}
     pairs = []
-    for peers in peer_groups(system, on, prepared.schedules, numbers, exchange):
+    for peers in peer_groups(scene):
         kind = kinds[id(peers.jacobians)]
         pushes = (
             push_of(switched[kind], part, prepared.jacobians[kind], peers.parameters) for part in parts[kind]

@@ -1,6 +1,6 @@
 """How a system is going to be analysed: by which method, as which systems.
 
-Takes: a `CompiledSystem` with its Jacobians, schedules and numbers, and the exchange between its peers.
+Takes: an `Instance` of a scene.
 Gives: `Plan`, `make_plan`; `refuse_varying`, `is_large_ring`, `not_populations`.
 Guarantees: nothing is solved, and no matrix of a whole system is built.
 Does not: analyse (see `analysis`).
@@ -21,9 +21,8 @@ from apc.eigen.graph_loops import common_graph
 from apc.eigen.modes import arrange, dense_loop, refuse_dense
 from apc.eigen.peers import MOST_STATES, PeerGroup, more_differ, peer_groups, too_large, used_ways
 from apc.frame.exchange import Exchange
+from apc.frame.instance import Instance
 from apc.frame.jacobians import SiteJacobians
-from apc.frame.parameters import Numbers
-from apc.frame.schedule import Schedule
 from apc.memory import refuse_beyond
 
 # Up to so many states of motion of peers that differ, one matrix of all is quicker than what spares it, and
@@ -80,22 +79,13 @@ def refuse_varying(system: CompiledSystem, jacobians: Sequence[SiteJacobians]) -
             raise ApcError(Mistake("E810", place, f"{what}: {why}", hint="apc simulate"))
 
 
-def make_plan(
-    system: CompiledSystem,
-    jacobians: Sequence[SiteJacobians],
-    schedules: Sequence[Schedule],
-    numbers: Numbers,
-    exchange: Exchange,
-    method: str = "auto",
-) -> Plan:
+def make_plan(instance: Instance, method: str = "auto") -> Plan:
     """Choose the method that serves a system, or see that one serves it that is asked for.
 
     Parameters
     ----------
-    system
-        The compiled scene.
-    jacobians, schedules, numbers, exchange
-        One a kind, one a group, and what they are evaluated with.
+    instance
+        The scene with its numbers.
     method
         One of `methods.METHODS`, not the paper's.
 
@@ -106,17 +96,18 @@ def make_plan(
         of `refuse_varying` and `peers.peer_groups`.
     """
     assert method in METHODS and method != PAPER, f"no such method: {method}"
-    refuse_varying(system, jacobians)
-    if method in ("auto", "determinant") and not not_populations(system, jacobians):
-        prompt = method == "determinant" and _prompt(schedules, numbers, exchange)
-        if prompt or _many(system, jacobians, schedules, numbers, exchange):
-            sparse = [way.link for way in used_ways(schedules) if not exchange.is_complete(way.link)]
-            if not sparse:
-                return _plan_populations(schedules, exchange)
-            if method == "determinant":
-                reason = f"the peers differ, and not all of them hear all others over {sparse[0]}"
-                raise cannot_serve(system, method, reason)
-    groups = peer_groups(system, jacobians, schedules, numbers, exchange)
+    system, exchange = instance.system, instance.exchange
+    refuse_varying(system, instance.jacobians)
+    can = method in ("auto", "determinant") and not not_populations(system, instance.jacobians)
+    if can and ((method == "determinant" and _prompt(instance)) or _many(instance)):
+        ways = used_ways(instance.schedules)
+        sparse = [way.link for way in ways if not exchange.is_complete(way.link)]
+        if not sparse:
+            return _plan_populations(instance)
+        if method == "determinant":
+            reason = f"the peers differ, and not all of them hear all others over {sparse[0]}"
+            raise cannot_serve(system, method, reason)
+    groups = peer_groups(instance)
     if is_large_ring(groups, exchange):
         what = f"a ring of {exchange.peers:,} peers is as many systems, up to {LARGEST_RING:,} are solved"
         raise ApcError(Mistake("E804", Place(exchange.scene), what, hint=f"count: {LARGEST_RING}"))
@@ -198,36 +189,30 @@ def not_populations(system: CompiledSystem, jacobians: Sequence[SiteJacobians]) 
     return ""
 
 
-def _many(
-    system: CompiledSystem,
-    jacobians: Sequence[SiteJacobians],
-    schedules: Sequence[Schedule],
-    numbers: Numbers,
-    exchange: Exchange,
-) -> bool:
+def _many(instance: Instance) -> bool:
     """Say whether so many peers differ that they are not worth an object each."""
-    states = sum(
-        len(rows) * len(system.kinds[group.kind].states)
-        for rows, group in zip(numbers.parameters, system.groups, strict=True)
-    )
-    if states <= FEW_STATES:
+    sizes = [len(site.kind.states) for site in instance.sites]
+    different = map(len, instance.numbers.parameters)
+    if sum(count * size for count, size in zip(different, sizes, strict=True)) <= FEW_STATES:
         return False
     # Peers that are all alike are a few systems of one peer's size, however large that is.
-    most = max(len(kind.states) for kind in system.kinds)
-    return more_differ(system, jacobians, numbers, exchange, max(1, FEW_STATES // most))
+    return more_differ(instance, max(1, FEW_STATES // max(sizes)))
 
 
-def _prompt(schedules: Sequence[Schedule], numbers: Numbers, exchange: Exchange) -> bool:
+def _prompt(instance: Instance) -> bool:
     """Say whether peers differ, all hear all others, and few packets are on their way."""
-    complete = all(exchange.is_complete(way.link) for way in used_ways(schedules))
+    schedules = instance.schedules
+    complete = all(instance.exchange.is_complete(way.link) for way in used_ways(schedules))
     short = max(sum(schedule.depths) for schedule in schedules) <= LONG_LINES
-    return complete and short and sum(map(len, numbers.parameters)) > 1
+    return complete and short and sum(map(len, instance.numbers.parameters)) > 1
 
 
-def _plan_populations(schedules: Sequence[Schedule], exchange: Exchange) -> Plan:
+def _plan_populations(instance: Instance) -> Plan:
     """Plan for peers by the thousand that all hear all others."""
-    rows = len(
-        {(exchange.role(place), sent) for place, schedule in enumerate(schedules) for sent in schedule.sent}
-    )
+    rows = {
+        (instance.exchange.role(place), sent)
+        for place, schedule in enumerate(instance.schedules)
+        for sent in schedule.sent
+    }
     note = "peers of different numbers, by one determinant of what is sent in a frame"
-    return Plan("determinant", (), (), ((1, rows),), (note,))
+    return Plan("determinant", (), (), ((1, len(rows)),), (note,))

@@ -21,13 +21,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from apc.analysis.analysis import Prepared, prepare
 from apc.analysis.circle_criterion import is_proved, least_of, weights_of
 from apc.analysis.contact_modes import ContactModes
 from apc.analysis.opened import OpenLoop, open_loops
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.timings import part
+from apc.frame.instance import Prepared, prepare
 from apc.result import Result
 
 STABLE, CANNOT, OPEN = "stable", "cannot be", "not decided"
@@ -68,7 +68,7 @@ def switching(system: CompiledSystem, modes: ContactModes, *, prepared: Prepared
     modes
         Its modes of contact.
     prepared
-        From `analysis.prepare`, of this system with these timings.
+        From `instance.prepare`, of this system with these timings.
     """
     if any(link.channel is not None for link in system.links):
         return Switching(system.name, OPEN, "packets may be lost or late, and it is looked for on time only")

@@ -14,12 +14,13 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeVar, Unpack
 
-from apc.analysis.analysis import Analysis, Prepared, analyze, prepare
+from apc.analysis.analysis import Analysis, analyze
 from apc.comparison.choice import DELAY, LOSS, STIFFNESS, Choice, check_over, choose
 from apc.comparison.effort import Effort, effort
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Place
 from apc.compiler.timings import part
+from apc.frame.instance import Prepared, prepare
 from apc.hands.answers import held_names
 from apc.hands.frequency_response import Feel, feel
 from apc.moments.network_verdict import NetworkVerdict, judge_network

@@ -1,7 +1,7 @@
 """The groups of peers that move alike: one site each, linearized and lifted once for all of them.
 
-Takes: a `CompiledSystem`, its numbers, Jacobians and schedules, and the exchange.
-Gives: `PeerGroup`, `peer_groups`, `group_of_row`, `more_differ`; `used_ways`, `states_of`; `too_large`;
+Takes: an `Instance` of a scene.
+Gives: `PeerGroup`, `peer_groups`, `representatives`, `more_differ`; `used_ways`, `states_of`; `too_large`;
 `Peers`, `Runs`.
 Guarantees: as few groups as there are peers of different dynamics, found in a time that grows with the number
 of peers, not with its square; peers that follow one another take no memory, however many they are. A site
@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.weights import exact_weight
 from apc.finite_equations import at_its_part
 from apc.frame.exact import evaluate_exact
 from apc.frame.exchange import Exchange, check_mean
+from apc.frame.instance import Instance
 from apc.frame.jacobians import SiteJacobians, edge_name
 from apc.frame.lift import FrameMap, check_packets, lift
 from apc.frame.linearize import (
@@ -38,7 +38,7 @@ from apc.frame.linearize import (
     start_sends,
     start_values,
 )
-from apc.frame.parameters import Numbers, exact_numbers
+from apc.frame.parameters import exact_numbers
 from apc.frame.schedule import Schedule, Way
 from apc.frame.site import LinearSite, rational_floats
 
@@ -277,15 +277,8 @@ def too_large(exchange: Exchange, what: str, states: int, *, auto: bool = False)
 class StartClasses:
     """Classes of peers that start alike at the start of time, each hearing the others where they start."""
 
-    def __init__(
-        self,
-        system: CompiledSystem,
-        jacobians: Sequence[SiteJacobians],
-        schedules: Sequence[Schedule],
-        numbers: Numbers,
-        exchange: Exchange,
-        parts: Sequence[Sequence[tuple[int, Peers]]],
-    ) -> None:
+    def __init__(self, instance: Instance, parts: Sequence[Sequence[tuple[int, Peers]]]) -> None:
+        numbers, exchange = instance.numbers, instance.exchange
         self.exchange = exchange
         self.counts = [sum(len(peers) for _, peers in part) for part in parts]
         self.groups = [part[0][0] for part in parts]
@@ -294,8 +287,8 @@ class StartClasses:
             numbers.parameters[group][numbers.rows[group][int(part[0][1][0])]]
             for group, part in zip(self.groups, parts, strict=True)
         ]
-        self.sites = [jacobians[system.groups[group].kind] for group in self.groups]
-        self.schedules = [schedules[group] for group in self.groups]
+        self.sites = [instance.sites[group] for group in self.groups]
+        self.schedules = [instance.schedules[group] for group in self.groups]
         exact: dict[tuple[int, bytes], tuple[list[Fraction], dict[str, list[Fraction]]]] = {}
         self.parameters: list[list[Fraction]] = []
         self.sent: list[dict[str, list[Fraction]]] = []
@@ -430,27 +423,8 @@ PEEK = 1024
 _Key = tuple[int, int, bytes]
 
 
-def peer_groups(
-    system: CompiledSystem,
-    jacobians: Sequence[SiteJacobians],
-    schedules: Sequence[Schedule],
-    numbers: Numbers,
-    exchange: Exchange,
-) -> tuple[PeerGroup, ...]:
+def peer_groups(instance: Instance) -> tuple[PeerGroup, ...]:
     """Find the groups of equal peers of a system, linearize each once.
-
-    Parameters
-    ----------
-    system
-        The compiled scene.
-    jacobians
-        One a kind.
-    schedules
-        One a group of the scene.
-    numbers
-        The parameters and timings.
-    exchange
-        The links.
 
     Raises
     ------
@@ -459,55 +433,51 @@ def peer_groups(
         minimum that is not smooth at the start, E804 more different peers than one system can hold, E808 a
         value that is not finite.
     """
-    used = [jacobians[group.kind] for group in system.groups]
     try:
-        if all(site.parameters_suffice for site in used):
-            return _by_matrices(system, jacobians, schedules, numbers, exchange)
-        return _by_start(system, jacobians, schedules, numbers, exchange)
+        if all(site.parameters_suffice for site in instance.sites):
+            return _by_matrices(instance)
+        return _by_start(instance)
     except ApcError as error:
-        where = system.origin.topology, system.origin.texts
-        raise ApcError(at_its_part(mistake, *where) for mistake in error.mistakes) from None
+        origin = instance.system.origin
+        raise ApcError(
+            at_its_part(mistake, origin.topology, origin.texts) for mistake in error.mistakes
+        ) from None
 
 
-def _by_matrices(
-    system: CompiledSystem,
-    jacobians: Sequence[SiteJacobians],
-    schedules: Sequence[Schedule],
-    numbers: Numbers,
-    exchange: Exchange,
-) -> tuple[PeerGroup, ...]:
+def _by_matrices(instance: Instance) -> tuple[PeerGroup, ...]:
     """Group peers of equal matrices, whatever their start values and constant forces."""
+    numbers, exchange = instance.numbers, instance.exchange
     rows: dict[_Key, tuple[int, Floats]] = {}
     members: dict[_Key, list[tuple[int, Peers]]] = {}
-    for place, group in enumerate(system.groups):
-        parameters = numbers.parameters[place]
-        keys: list[_Key] = []
-        for vector, matrices in zip(
-            parameters, linearize_rows(jacobians[group.kind], parameters), strict=True
-        ):
-            keys.append((group.kind, exchange.role(place), matrices.tobytes()))
-            rows.setdefault(keys[-1], (place, vector))
-        for key, peers in _split(keys, numbers.rows[place]):
+    for place, (parameters, row_of) in enumerate(zip(numbers.parameters, numbers.rows, strict=True)):
+        keys = _keys(instance, place, parameters)
+        for key, vector in zip(keys, parameters, strict=True):
+            rows.setdefault(key, (place, vector))
+        for key, peers in _split(keys, row_of):
             members.setdefault(key, []).append((place, peers))
-    check_size([jacobians[key[0]] for key in members], exchange)
+    check_size([instance.jacobians[key[0]] for key in members], exchange)
     peer_groups = []
     for number, (key, parts) in enumerate(members.items()):
         place, vector = rows[key]
-        built = jacobians[key[0]]
+        built = instance.sites[place]
         site = linearize(built, vector)
-        peer_groups.append(build_group(number, parts, vector, built, site, schedules[place], exchange))
+        peer_groups.append(
+            build_group(number, parts, vector, built, site, instance.schedules[place], exchange)
+        )
     return tuple(peer_groups)
 
 
-def _by_start(
-    system: CompiledSystem,
-    jacobians: Sequence[SiteJacobians],
-    schedules: Sequence[Schedule],
-    numbers: Numbers,
-    exchange: Exchange,
-) -> tuple[PeerGroup, ...]:
+def _keys(instance: Instance, place: int, parameters: Floats) -> list[_Key]:
+    """Return what peers of a group that are equal have in common, for each row of parameters."""
+    role, kind = instance.exchange.role(place), instance.system.groups[place].kind
+    rows = linearize_rows(instance.jacobians[kind], parameters)
+    return [(kind, role, matrices.tobytes()) for matrices in rows]
+
+
+def _by_start(instance: Instance) -> tuple[PeerGroup, ...]:
     """Group peers that start alike among others that start alike, and linearize them there."""
-    links = {way.link for way in used_ways(schedules)}
+    system, numbers, exchange = instance.system, instance.numbers, instance.exchange
+    links = {way.link for way in used_ways(instance.schedules)}
     complete = all(exchange.is_complete(link) for link in links)
     members: dict[tuple[Any, ...], list[tuple[int, Peers]]] = {}
     for place, group in enumerate(system.groups):
@@ -525,7 +495,7 @@ def _by_start(
         what = f"more than {MOST_DIFFERENT} peers that differ, in their place in a graph or at the start,"
         raise ApcError(Mistake("E804", Place(exchange.scene), f"{what} can't be linearized pair by pair"))
     parts = sorted(members.values(), key=lambda part: (part[0][0], int(part[0][1][0])))
-    sites = StartClasses(system, jacobians, schedules, numbers, exchange, parts)
+    sites = StartClasses(instance, parts)
     listened = [sites.listen(g) for g in range(len(parts))]
 
     # Peers apart in the graph are one group if they turned out alike, and weigh all others alike.
@@ -540,7 +510,7 @@ def _by_start(
         )
         joined.setdefault(merged.setdefault(same, g), []).extend(parts[g])
     first = list(joined)
-    built = [jacobians[system.groups[parts[g][0][0]].kind] for g in first]
+    built = [sites.sites[g] for g in first]
     check_size(built, exchange)
     return tuple(
         build_group(
@@ -549,7 +519,7 @@ def _by_start(
             sites.vectors[g],
             site,
             linearize(site, sites.vectors[g], listened[g][0]),
-            schedules[parts[g][0][0]],
+            sites.schedules[g],
             exchange,
             listening=listened[g][0],
             gains=listened[g][1],
@@ -558,56 +528,26 @@ def _by_start(
     )
 
 
-def more_differ(
-    system: CompiledSystem,
-    jacobians: Sequence[SiteJacobians],
-    numbers: Numbers,
-    exchange: Exchange,
-    count: int,
-) -> bool:
-    """Say whether there are more than `count` peers of different matrices, all affine and without edges.
-
-    Parameters
-    ----------
-    system
-        The compiled scene.
-    jacobians
-        One a kind.
-    numbers
-        The scene's numbers.
-    exchange
-        The links.
-    count
-        How many are not too many; with one more the search ends.
-    """
+def more_differ(instance: Instance, count: int) -> bool:
+    """Say whether there are more than `count` peers of different matrices, all affine and without edges."""
     keys: set[_Key] = set()
-    for place, group in enumerate(system.groups):
-        parameters = numbers.parameters[place]
+    for place, parameters in enumerate(instance.numbers.parameters):
         for start in range(0, len(parameters), PEEK):
-            rows = linearize_rows(jacobians[group.kind], parameters[start : start + PEEK])
-            keys |= {(group.kind, exchange.role(place), row.tobytes()) for row in rows}
-            if len(keys) > count:
+            keys.update(_keys(instance, place, parameters[start : start + PEEK]))
+            if len(keys) > count:  # mostly the first ones tell
                 return True
     return False
 
 
-def group_of_row(
-    built: SiteJacobians, vector: Floats, schedule: Schedule, exchange: Exchange, group: int, count: int
-) -> PeerGroup:
-    """Return `count` peers of the scene's group `group` as if all were like one of them.
-
-    Parameters
-    ----------
-    built, vector, schedule
-        Its kind's Jacobians, its parameters (n_p,), its schedule.
-    exchange
-        The links.
-    group, count
-        The scene's group, and how many.
-    """
-    site = linearize(built, vector)
-    parts = [(group, Runs((range(count),)))]
-    return build_group(group, parts, vector, built, site, schedule, exchange)
+def representatives(instance: Instance) -> list[PeerGroup]:
+    """Return the first peer of each group of the scene, as many as there are peers in it."""
+    result = []
+    for place, (built, schedule) in enumerate(zip(instance.sites, instance.schedules, strict=True)):
+        vector = instance.numbers.parameters[place][0]
+        parts = [(place, Runs((range(instance.system.groups[place].count),)))]
+        site = linearize(built, vector)
+        result.append(build_group(place, parts, vector, built, site, schedule, instance.exchange))
+    return result
 
 
 def _split(keys: Sequence[_Key], row_of: Integers) -> list[tuple[_Key, Peers]]:

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from apc.analysis.analysis import Analysis, Prepared, analyze, prepare, prepare_at_start
+from apc.analysis.analysis import Analysis, analyze, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import in_hertz
@@ -25,6 +25,7 @@ from apc.eigen.spectrum import Mode
 from apc.explore.motion import motion_of
 from apc.explore.sliders import text_of
 from apc.finite_equations import finite_equations
+from apc.frame.instance import Prepared, prepare
 from apc.frame.names import Free, Range, unit_of
 from apc.frame.overrides import Override, apply
 from apc.hands.answers import held_names

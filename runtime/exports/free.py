@@ -21,7 +21,7 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import prepare, prepare_at_start
+from apc.analysis.analysis import prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.plain import symbolic
@@ -29,6 +29,7 @@ from apc.eigen.peers import PeerGroup
 from apc.exports.identifiers import Port, words
 from apc.exports.lifted import Numbers, StateSpace, lifted, peers_of, state_space, steps_in_floats
 from apc.frame.devices import Push
+from apc.frame.instance import prepare
 from apc.frame.linearize import site_of_entries
 from apc.frame.names import Free, find, unit_of
 from apc.frame.parameters import free_values

@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, lifted_groups, near_start, prepare
+from apc.analysis.analysis import lifted_groups, near_start
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.distribution import versions
@@ -43,6 +43,7 @@ from apc.finite_equations import finite_equations
 from apc.frame.devices import Device, Push, find_push
 from apc.frame.discretize import TOO_LARGE, discretize
 from apc.frame.exchange import Exchange
+from apc.frame.instance import Prepared, prepare
 from apc.frame.lift import MOST_PACKETS, FrameMap, check_packets, compose, step_durations
 from apc.frame.ports import OUTSIDE, with_cuts, with_holds, with_ports
 from apc.frame.radius import FLOATS, RADII, Arithmetic

@@ -1,6 +1,6 @@
 """How peers answer a push at one of them, put together from the answers of modes.
 
-Takes: a `CompiledSystem` with what `analysis.prepare` made of it, and two devices.
+Takes: a `CompiledSystem` with what `instance.prepare` made of it, and two devices.
 Gives: `Responses`, `responses`; `Weights`; `held_names`.
 Guarantees: an answer is exact for the sampled, held and sent signals of the scene, with a bound on its
 rounding.
@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, lifted_groups
+from apc.analysis.analysis import lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.language.vectors import whole_and_index
@@ -31,6 +31,7 @@ from apc.eigen.rigid import find_rigid_modes
 from apc.frame.devices import OWN_MASS, Device, coupled_directly, find_device, find_devices
 from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange
+from apc.frame.instance import Prepared
 from apc.frame.parameters import resolve
 from apc.frame.radius import RADII, with_radius
 from apc.hands.asked import Port
@@ -60,7 +61,7 @@ def responses(system: CompiledSystem, prepared: Prepared, port: Port, other: Por
     Parameters
     ----------
     system, prepared
-        The compiled scene, and what `analysis.prepare` made of it.
+        The compiled scene, and what `instance.prepare` made of it.
     port, other
         The two devices.
 

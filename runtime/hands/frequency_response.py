@@ -17,13 +17,14 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, near_start, prepare
 from apc.analysis.analysis import analyze as judge
+from apc.analysis.analysis import near_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
 from apc.finite_equations import finite_equations
 from apc.frame.discretize import UNIT
+from apc.frame.instance import Prepared, prepare
 from apc.hands.answers import AROUND, Responses, Weights, held_names, responses
 from apc.hands.asked import Port, check_frequencies, find_port, next_peer, ticks_in
 from apc.hands.system_norms import Peak, noise_variance, sampled_data_peak, tick_peak
@@ -174,7 +175,7 @@ def feel(
     beside
         What is told beside the responses, of `BESIDE`; some tens of milliseconds each.
     prepared
-        From `analysis.prepare`, of this system with any numbers.
+        From `instance.prepare`, of this system with any numbers.
 
     Raises
     ------

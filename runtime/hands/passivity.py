@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, analyze, lifted_groups, near_start, prepare
+from apc.analysis.analysis import analyze, lifted_groups, near_start
 from apc.analysis.contact_modes import contact_modes
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
@@ -27,6 +27,7 @@ from apc.eigen.modes import split
 from apc.finite_equations import finite_equations
 from apc.frame.devices import clamped, directions_of, replaced_hands, without_hands
 from apc.frame.discretize import UNIT
+from apc.frame.instance import Prepared, prepare
 from apc.frame.radius import RADII, radius_of, solve, value_of, with_radius
 from apc.hands.port import PortLoop, port_loops
 from apc.moments.network_verdict import Growth
@@ -134,7 +135,7 @@ def passive_hands(
     system
         The compiled scene, with the numbers to analyse.
     prepared
-        From `analysis.prepare`, of this system with any numbers.
+        From `instance.prepare`, of this system with any numbers.
     certify
         Whether what is said of clamped devices is to be proved in ball arithmetic, where they decide.
 

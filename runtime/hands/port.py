@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, lifted_groups
+from apc.analysis.analysis import lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import Loop, close_loop
@@ -38,6 +38,7 @@ from apc.eigen.rigid import find_rigid_modes
 from apc.frame.devices import Device, coupled_directly, find_device, no_device
 from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange
+from apc.frame.instance import Prepared
 from apc.frame.ports import Ports, with_holds, with_ports
 from apc.frame.radius import RADII, radius_of, solve, value_of, with_radius
 from apc.frame.schedule import Act, Propagate, Schedule, Send, Tick
@@ -103,7 +104,7 @@ def port_loops(system: CompiledSystem, prepared: Prepared, *, option: str) -> tu
     Parameters
     ----------
     system, prepared
-        The compiled scene, and what `analysis.prepare` made of it.
+        The compiled scene, and what `instance.prepare` made of it.
     option
         What asked for it.
 

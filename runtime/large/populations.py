@@ -15,16 +15,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import Feedback, close, lay_out
 from apc.eigen.peers import states_of
 from apc.eigen.spectrum import LEAST_SHARE, oscillation
 from apc.frame.course import turns
+from apc.frame.instance import Instance
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.lift import FrameMap, lift
 from apc.frame.linearize import linearize, linearize_rows, site_of
-from apc.frame.parameters import Numbers
 from apc.frame.radius import RADII, rounded
 from apc.frame.schedule import Schedule
 from apc.frame.site import LinearSite, every_matrix
@@ -69,38 +68,25 @@ class Population:
         return any(sending.link == link for sending in self.jacobians.kind.sends)
 
 
-def populations(
-    system: CompiledSystem,
-    jacobians: Sequence[SiteJacobians],
-    schedules: Sequence[Schedule],
-    numbers: Numbers,
-) -> tuple[Population, ...]:
-    """Linearize and lift all different peers of a system.
+def populations(instance: Instance) -> tuple[Population, ...]:
+    """Linearize and lift all different peers of a system, every kind of it affine and without edge functions.
 
-    Parameters
-    ----------
-    system
-        The compiled scene, every kind of it affine and without edge functions.
-    jacobians
-        One a kind.
-    schedules
-        One a group of the scene.
-    numbers
-        The parameters and timings.
+    Raises
+    ------
+    ApcError
+        E804 more different peers than the memory holds.
     """
+    system, schedules, numbers = instance.system, instance.schedules, instance.numbers
     if sum(map(len, numbers.rows)) > MOST_DIFFERENT:
         what = f"{system.peers:,} peers, some of whom differ, and {MOST_DIFFERENT:,} are the most of these"
         raise ApcError(Mistake("E804", Place(system.origin.topology), what, hint="smaller counts"))
-    states = [
-        states_of(schedule, jacobians[group.kind])
-        for group, schedule in zip(system.groups, schedules, strict=True)
-    ]
+    states = list(map(states_of, schedules, instance.sites))
     needed = ENTRY * sum(len(rows) * n**2 for rows, n in zip(numbers.parameters, states, strict=True))
     what = f"{sum(map(len, numbers.parameters)):,} different peers of up to {max(states)} states"
     refuse_beyond(needed, "E804", Place(system.origin.topology), what, "fewer peers that differ")
     result = []
-    for place, (group, schedule) in enumerate(zip(system.groups, schedules, strict=True)):
-        site, parameters = jacobians[group.kind], numbers.parameters[place]
+    for place, (site, schedule) in enumerate(zip(instance.sites, schedules, strict=True)):
+        group, parameters = system.groups[place], numbers.parameters[place]
         matrices = linearize_rows(site, parameters)
         parts = [
             lift(site_of(site, matrices[start : start + CHUNK]), schedule)

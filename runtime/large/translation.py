@@ -23,10 +23,10 @@ import numpy as np
 
 from apc.eigen.closing import Loop
 from apc.eigen.modes import complete_loops
-from apc.eigen.peers import PeerGroup, group_of_row
+from apc.eigen.peers import representatives
 from apc.eigen.rigid import find_rigid_modes, stays_rigid
 from apc.frame.exact import evaluate_exact, is_rational
-from apc.frame.exchange import Exchange
+from apc.frame.instance import Instance
 from apc.frame.jacobians import guards_of
 from apc.frame.linearize import site_of_entries
 from apc.frame.parameters import exact_numbers
@@ -36,35 +36,20 @@ from apc.large.populations import Population
 LARGEST = 2**61 - 1  # of what random numbers are made of: a prime
 
 
-def representatives(populations: Sequence[Population], exchange: Exchange) -> list[PeerGroup]:
-    """Return the first peer of each population, as many as there are peers in it."""
-    return [
-        group_of_row(
-            population.jacobians,
-            population.parameters[0],
-            population.schedule,
-            exchange,
-            population.group,
-            len(population.rows),
-        )
-        for population in populations
-    ]
-
-
-def count_translations(populations: Sequence[Population], exchange: Exchange) -> int | None:
+def count_translations(instance: Instance, populations: Sequence[Population]) -> int | None:
     """Return how many independent motions nothing holds back on complete graphs; None if it can't be told.
 
     Parameters
     ----------
+    instance
+        The scene, all links of it complete.
     populations
-        All peers.
-    exchange
-        The links, all of them complete.
+        Its peers, by their groups.
     """
-    groups = representatives(populations, exchange)
+    groups = representatives(instance)
     population_of = {id(group): population for group, population in zip(groups, populations, strict=True)}
     total = 0
-    for loop in complete_loops(groups, exchange):
+    for loop in complete_loops(groups, instance.exchange):
         free = len(find_rigid_modes(loop, with_drifts=False).names)
         if free and not hold_for_all(loop, [population_of[id(group)] for group in loop.sites]):
             return None

@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.enclosure import enclose_eigenvalues
+from apc.frame.instance import Prepared
 from apc.frame.radius import RADII, radius_of, value_of
 from apc.moments.held import Chance, HeldLoop, every_channel, held_scene
 
@@ -63,7 +63,7 @@ def almost_sure(system: CompiledSystem, prepared: Prepared, *, seed: int = 0) ->
     system
         The compiled scene, with the numbers to analyse.
     prepared
-        From `analysis.prepare`, of this system with any numbers.
+        From `instance.prepare`, of this system with any numbers.
     seed
         Of the luck.
     """

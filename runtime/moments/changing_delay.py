@@ -29,13 +29,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import prepare
 from apc.compiler.compiled import Channel, CompiledSystem
 from apc.eigen.closing import Feedback, Loop, close, feedback_of, lay_out_loop
 from apc.eigen.dissipation import peak_gain, proves_gain
 from apc.eigen.modes import loops_at_right_angles
 from apc.eigen.relative import relative, relative_coordinates, relative_rows, with_doubt
 from apc.eigen.rigid import find_rigid_modes
+from apc.frame.instance import prepare
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.frame.radius import RADII, value_of

@@ -18,13 +18,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, lifted_groups
+from apc.analysis.analysis import lifted_groups
 from apc.compiler.compiled import Clock, CompiledSystem, Kind
 from apc.eigen.closing import Coupling, Loop, without_packets
 from apc.eigen.modes import complete_degrees, complete_loops, couple, dense_loop, split_exchangeable
 from apc.eigen.peers import PeerGroup, used_ways
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.exchange import Exchange
+from apc.frame.instance import Prepared
 from apc.frame.lift import FrameMap
 from apc.frame.parameters import resolve
 from apc.frame.radius import radius_of, value_of
@@ -71,7 +72,7 @@ def build_hearing(
     Parameters
     ----------
     system, prepared
-        The compiled scene, and what `analysis.prepare` made of it.
+        The compiled scene, and what `instance.prepare` made of it.
     first
         When frames begin, in seconds.
     stand_in

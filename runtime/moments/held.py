@@ -25,12 +25,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, lifted_groups, timed
+from apc.analysis.analysis import lifted_groups
 from apc.compiler.compiled import CompiledSystem, Link
 from apc.eigen.closing import Feedback, Loop, bounded_weight, close, feedback_of, lay_out_loop
 from apc.eigen.modes import dense_loop
 from apc.eigen.peers import MOST_STATES, PeerGroup
 from apc.eigen.relative import Relative, relative_coordinates, relative_rows, with_doubt
+from apc.frame.instance import Prepared, prepared_at
 from apc.frame.parameters import resolve
 from apc.frame.radius import RADII, value_of
 from apc.frame.schedule import Heard, Schedule
@@ -104,10 +105,10 @@ def held_scene(system: CompiledSystem, prepared: Prepared) -> HeldScene:
     system
         The compiled scene, with the numbers to analyse.
     prepared
-        From `analysis.prepare`, of this system with any numbers.
+        From `instance.prepare`, of this system with any numbers.
     """
     numbers = resolve(system)
-    at = timed(system, prepared, numbers)
+    at = prepared_at(system, prepared, numbers.timings)
     lossy = [link for link in system.links if link.channel is not None]
     if not lossy:
         raise UnservedError("every link is reliable")

@@ -25,7 +25,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, prepare
 from apc.analysis.box import open_sites
 from apc.analysis.box_proof import TOGETHER, UNDECIDED, BoxProof, Looked, middle, search_box
 from apc.analysis.cells import Cell, OpenFrames, contracted, frames_over, open_frames
@@ -35,6 +34,7 @@ from apc.compiler.timings import part
 from apc.eigen.closing import Loop, without_packets
 from apc.eigen.rigid import stays_rigid
 from apc.frame.discretize import UNIT
+from apc.frame.instance import Prepared, prepare
 from apc.frame.lift import FrameMap
 from apc.frame.names import Range
 from apc.frame.overrides import Override, apply

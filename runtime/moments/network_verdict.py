@@ -14,11 +14,11 @@ from fractions import Fraction
 
 import numpy as np
 
-from apc.analysis.analysis import Prepared, prepare
 from apc.compiler.compiled import CompiledSystem, Link
 from apc.compiler.multiples import common_multiple
 from apc.finite_equations import finite_equations
 from apc.frame.exchange import arcs
+from apc.frame.instance import Prepared, prepare
 from apc.frame.parameters import resolve
 from apc.moments.almost_sure import AlmostSure, almost_sure
 from apc.moments.bursts import affine, tagged_error, tagged_radius
@@ -136,7 +136,7 @@ def growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool = True) 
     Parameters
     ----------
     system, prepared
-        The compiled scene, and what `analysis.prepare` made of it with any numbers.
+        The compiled scene, and what `instance.prepare` made of it with any numbers.
     bounded
         Whether bounds are asked for; without them, they may be the radius itself.
     """
@@ -341,7 +341,7 @@ def judge_network(
     system
         The compiled scene, with the numbers to analyse.
     prepared
-        From `analysis.prepare`, of this system with any numbers.
+        From `instance.prepare`, of this system with any numbers.
     certify
         Whether a proof is asked for: which numbers carry it.
     """

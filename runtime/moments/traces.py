@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem, Link
 from apc.eigen.closing import Loop, close, feedback_of, lay_out_loop
 from apc.eigen.enclosure import enclose_eigenvalues
@@ -30,6 +29,7 @@ from apc.eigen.modes import arrange
 from apc.eigen.peers import MOST_STATES
 from apc.eigen.relative import Relative, relative, relative_coordinates, with_doubt
 from apc.eigen.rigid import find_rigid_modes
+from apc.frame.instance import Prepared
 from apc.frame.radius import RADII, radius_of, value_of, with_radius
 from apc.frame.schedule import Heard, Schedule, Selected, Sent
 from apc.moments.crowd import Hearing, build_hearing, instants
@@ -60,7 +60,7 @@ def trace_radius(system: CompiledSystem, prepared: Prepared) -> Found:
     Parameters
     ----------
     system, prepared
-        The compiled scene, and what `analysis.prepare` made of it.
+        The compiled scene, and what `instance.prepare` made of it.
 
     Raises
     ------

@@ -32,7 +32,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, prepare
 from apc.compiler.compiled import CompiledSystem, Link
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import Loop
@@ -41,6 +40,7 @@ from apc.eigen.enclosure import enclose_eigenvalues
 from apc.eigen.modes import loops_at_right_angles
 from apc.eigen.peers import PeerGroup
 from apc.frame.discretize import UNIT
+from apc.frame.instance import Prepared, prepare
 from apc.frame.radius import RADII, radius_of, value_of
 from apc.frame.schedule import Way
 from apc.moments.held import Ear, HeldLoop, ears_of, held_loop, held_scene, lossy_rows
@@ -127,7 +127,7 @@ def worst_case(system: CompiledSystem, prepared: Prepared) -> LossesInARow:
     system
         The compiled scene, with the numbers to analyse.
     prepared
-        From `analysis.prepare`, of this system with any numbers.
+        From `instance.prepare`, of this system with any numbers.
     """
     try:
         parts = held_parts(system, prepared)

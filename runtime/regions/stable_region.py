@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, analyze, near_start, prepare, prepare_at_start
+from apc.analysis.analysis import analyze, near_start, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake
 from apc.compiler.timings import part
@@ -26,6 +26,7 @@ from apc.eigen.closing import ClosedSystem
 from apc.eigen.spectrum import mode_near
 from apc.finite_equations import finite_equations
 from apc.frame.devices import replaced_hands
+from apc.frame.instance import Prepared, prepare
 from apc.frame.names import Free, Range, notes_for_all_groups
 from apc.frame.overrides import apply
 from apc.network.nominal import left_out, refuse_channel_number
@@ -254,7 +255,7 @@ def region(
     criterion
         "mean-square" or "nominal", see `critical.critical`.
     prepared
-        From `analysis.prepare`, of this system with any numbers.
+        From `instance.prepare`, of this system with any numbers.
     progress
         Is told, in words, how far the work is.
 

@@ -20,10 +20,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, lifted_groups
+from apc.analysis.analysis import lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.relative import relative_bounded
 from apc.eigen.spectrum import mode_near
+from apc.frame.instance import Prepared
 from apc.frame.names import Range, parameter_of
 from apc.regions.axes import PLACE
 from apc.regions.boundary import Arc, straight_arc, traced
@@ -101,7 +102,7 @@ def trace_strips(
     axis
         Which of them is the delay, 0 or 1; the other reaches no time.
     prepared
-        From `analysis.prepare`; all sites linear.
+        From `instance.prepare`; all sites linear.
     cells, tolerance
         As for `region.region`, of every strip.
     progress

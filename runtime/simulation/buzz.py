@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import find_peaks
 
-from apc.analysis.analysis import Prepared, prepare
 from apc.analysis.contact_modes import EVERYONE, ContactModes, contact_modes
 from apc.analysis.describing import Predicted, predict
 from apc.analysis.opened import contact_groups
@@ -30,6 +29,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
 from apc.eigen.peers import PeerGroup
 from apc.frame.exchange import build_exchange
+from apc.frame.instance import Prepared, prepare
 from apc.frame.parameters import resolve
 from apc.result import Result
 from apc.simulation.trajectory import Trajectory, simulate
@@ -134,7 +134,7 @@ def buzz(
     system
         The compiled scene, with the numbers to analyse.
     prepared
-        From `analysis.prepare`, of this system with these timings.
+        From `instance.prepare`, of this system with these timings.
     modes
         Its modes of contact, if they are known.
 

@@ -16,12 +16,12 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared
 from apc.analysis.box_proof import TOGETHER, open_questions
 from apc.analysis.cells import Cell, OpenSystem, matrices_over
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.eigen.enclosure import least_radius
+from apc.frame.instance import Prepared
 from apc.frame.names import Range
 from apc.frame.radius import value_of
 
@@ -46,7 +46,7 @@ def none_better(
     Parameters
     ----------
     scenes, prepared
-        The scenes that limit the gains most, and what `analysis.prepare` made of one.
+        The scenes that limit the gains most, and what `instance.prepare` made of one.
     gains, aim
         The gains' ranges, and the place of that which is to be large, or small.
     value, larger

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import prepare
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake
+from apc.frame.instance import prepare
 from apc.result import Result
 from apc.tuning.demands import AGAINST, FELT, Aim, Demands, Felt
 from apc.tuning.limits import Limits

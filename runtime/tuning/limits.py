@@ -26,10 +26,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake
 from apc.eigen.eigenpairs import eigenvalues
+from apc.frame.instance import Prepared
 from apc.frame.overrides import Override, apply
 from apc.hands.frequency_response import COUPLED, feel
 from apc.threads import load_pool
@@ -365,7 +365,7 @@ def felt_in(
     asked
         What is felt.
     prepared
-        From `analysis.prepare`, of this scene with any numbers.
+        From `instance.prepare`, of this scene with any numbers.
 
     Raises
     ------

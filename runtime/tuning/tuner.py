@@ -25,13 +25,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import analyze, near_start, prepare
+from apc.analysis.analysis import analyze, near_start
 from apc.analysis.box_proof import UNDECIDED, BoxProof
 from apc.answer import proved_at
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake
 from apc.compiler.timings import part
 from apc.finite_equations import finite_equations
+from apc.frame.instance import prepare
 from apc.frame.names import Free, Range, value_now
 from apc.frame.overrides import Override, apply
 from apc.hands.passivity import passive_hands

@@ -18,13 +18,14 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from apc.analysis.analysis import Prepared, analyze, hangs_on_heard, near_start, prepare, prepare_at_start
+from apc.analysis.analysis import analyze, near_start, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
 from apc.compiler.words import with_unit
 from apc.finite_equations import finite_equations
 from apc.frame.devices import replaced_hands
+from apc.frame.instance import Prepared, hangs_on_heard, prepare
 from apc.frame.linearize import reaches_start
 from apc.frame.names import Free, find, parameter_of, unit_of, values_by_group
 from apc.hands.passivity import passive_hands

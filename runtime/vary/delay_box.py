@@ -13,10 +13,10 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from fractions import Fraction
 
-from apc.analysis.analysis import prepare
 from apc.analysis.box_proof import UNDECIDED, BoxProof, ChangingDelay
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.frame.instance import prepare
 from apc.frame.names import Free, Range
 from apc.moments.changing_delay import small_gain, unstable_delays
 from apc.moments.unserved import UnservedError

@@ -23,12 +23,13 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from apc.analysis.analysis import Prepared, lifted_groups, prepared_at
+from apc.analysis.analysis import lifted_groups
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.multiples import common_divisor
 from apc.compiler.words import no_more, time_left
 from apc.eigen.peers import states_of
+from apc.frame.instance import Prepared, prepared_at
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import resolve
@@ -99,7 +100,7 @@ def delay_pieces(
     low
         Where to begin.
     prepared
-        From `analysis.prepare`.
+        From `instance.prepare`.
     place
         Where the name was given, for messages.
     high

@@ -17,7 +17,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, lifted_groups, prepare
+from apc.analysis.analysis import lifted_groups
 from apc.compiler.compiled import CompiledSystem, Group, Parameter, group_count
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import ClosedSystem
@@ -27,6 +27,7 @@ from apc.eigen.relative import relative_bounded, relative_coordinates
 from apc.eigen.rigid import RigidModes, find_rigid_modes
 from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange
+from apc.frame.instance import Prepared, prepare
 from apc.frame.names import Free, is_named, parameter_of
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import free_rows, scope_of
@@ -272,7 +273,7 @@ def evaluator(system: CompiledSystem, free: Sequence[Free], *, prepared: Prepare
     free
         The parameters that vary; none of them may reach a time (see `reaches_time`).
     prepared
-        From `analysis.prepare`, of this system with any numbers.
+        From `instance.prepare`, of this system with any numbers.
 
     Raises
     ------
@@ -294,7 +295,7 @@ class Asked:
 
     @classmethod
     def of(cls, system: CompiledSystem, free: Sequence[Free], prepared: Prepared) -> Asked:
-        """Return what is asked of a scene, from `analysis.prepare`, over parameters that vary."""
+        """Return what is asked of a scene, from `instance.prepare`, over parameters that vary."""
         return cls(system, tuple(free), tuple(map(id, prepared.jacobians)), prepared.order, prepared)
 
     @property

@@ -19,10 +19,10 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.ages import aged
+from apc.frame.instance import Prepared
 from apc.frame.names import Free, parameter_of, unit_of
 from apc.frame.overrides import Override, apply
 from apc.hands.passivity import loop_growths, passive_growth
@@ -128,7 +128,7 @@ def growth_at(
     Parameters
     ----------
     system, prepared
-        The compiled scene, and what `analysis.prepare` made of it.
+        The compiled scene, and what `instance.prepare` made of it.
     overrides
         The numbers.
     place

@@ -17,7 +17,7 @@ from functools import cached_property, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Analysis, Prepared, analyze, lifted_groups
+from apc.analysis.analysis import Analysis, analyze, lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Place
 from apc.eigen.closing import ClosedSystem
@@ -25,6 +25,7 @@ from apc.eigen.eigenpairs import eigenvalues
 from apc.eigen.modes import split
 from apc.eigen.rigid import rigid_modes_of
 from apc.eigen.spectrum import DRIFTS, Spectrum, solve_spectrum
+from apc.frame.instance import Prepared
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.vary.batch import BatchEvaluator, Evaluator

@@ -16,11 +16,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, analyze, prepare
+from apc.analysis.analysis import analyze
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Place
 from apc.compiler.timings import part
 from apc.eigen.eigenpairs import eigenvalues as eigenvalues_of
+from apc.frame.instance import Prepared, prepare
 from apc.frame.names import Free, find
 from apc.frame.overrides import Override, apply
 from apc.threads import single_threaded
@@ -93,7 +94,7 @@ def eigenvalues_at(
     values
         Its values, SI.
     prepared
-        From `analysis.prepare`, of this system with any numbers.
+        From `instance.prepare`, of this system with any numbers.
     """
     if reaches_count(system, free) or reaches_time(system, free):
         return _one_by_one(system, free, values, prepared)

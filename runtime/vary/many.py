@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Analysis, Prepared, analyze, near_start, prepare, timed
+from apc.analysis.analysis import Analysis, analyze, near_start
 from apc.analysis.plan import make_plan
 from apc.compiler.compiled import CompiledSystem, Parameter
 from apc.compiler.errors import ApcError, Mistake, Place
@@ -38,7 +38,7 @@ from apc.eigen.spectrum import (
 )
 from apc.finite_equations import finite_equations
 from apc.frame.ages import linear_sites
-from apc.frame.exchange import build_exchange
+from apc.frame.instance import Prepared, instance, prepare
 from apc.frame.names import Free, find, notes_for_all_groups, unit_of
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import Numbers, resolve, scope_of
@@ -346,18 +346,15 @@ def _family(of: Asked, times: tuple[int, ...], given: tuple[Override, ...]) -> _
         with finite_equations(system.origin.topology), np.errstate(all="ignore"):
             timed_system = apply(system, given)
             there = generic(timed_system, free)
-            numbers = resolve(there)
-            shared = timed(there, prepared, numbers)
-            used = {group.kind for group in system.groups}
-            if not all(shared.jacobians[kind].parameters_suffice for kind in used):
+            scene = instance(there, prepared)
+            if not all(site.parameters_suffice for site in scene.sites):
                 return None
-            exchange = build_exchange(there, numbers.timings)
-            plan = make_plan(there, shared.jacobians, shared.schedules, numbers, exchange)
+            plan = make_plan(scene)
             if not plan.loops or len(plan.loops) > MOST_LOOPS or plan.method == "determinant":
                 return None
             if max(loop.states for loop in plan.loops) > MOST_STATES:
                 return None
-            evaluator = batch_evaluator(timed_system, free, plan.groups, exchange)
+            evaluator = batch_evaluator(timed_system, free, plan.groups, scene.exchange)
     except ApcError:
         return None  # each point tells
     rigid = drifts = 0

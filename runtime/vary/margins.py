@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from apc.analysis.analysis import Prepared, analyze, lifted_groups, prepare, prepare_at_start
+from apc.analysis.analysis import analyze, lifted_groups, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.timings import part
@@ -27,6 +27,7 @@ from apc.eigen.peers import states_of
 from apc.eigen.spectrum import DRIFTS, finite
 from apc.finite_equations import finite_equations
 from apc.frame.display_units import Unit
+from apc.frame.instance import Prepared, prepare
 from apc.frame.names import Free, named_times, parameter_of, unit_of, value_now
 from apc.result import Result
 from apc.threads import single_threaded
@@ -100,7 +101,7 @@ def margins(system: CompiledSystem, *, prepared: Prepared | None = None, quick: 
     system
         The compiled scene. One that isn't stable has no margins.
     prepared
-        From `analysis.prepare`, of this system with any numbers.
+        From `instance.prepare`, of this system with any numbers.
     quick
         Look for none in a scene beyond `MOST_IN_PASSING`, and say so.
     """

@@ -17,12 +17,12 @@ from fractions import Fraction
 
 import numpy as np
 
-from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Place
 from apc.compiler.timings import part
 from apc.compiler.words import counted
 from apc.finite_equations import finite_equations
+from apc.frame.instance import Prepared
 from apc.frame.names import Free, named_times, unit_of, value_now
 from apc.frame.overrides import Override
 from apc.moments.network_verdict import Growth, growth
@@ -63,7 +63,7 @@ def network_margins(
     Parameters
     ----------
     system, prepared
-        The compiled scene, and what `analysis.prepare` made of it.
+        The compiled scene, and what `instance.prepare` made of it.
     nominal
         The margins over the nominal network: how far to look from a value of 0.
     quick
@@ -186,7 +186,7 @@ def network_sensitivities(system: CompiledSystem, prepared: Prepared) -> Sensiti
     Parameters
     ----------
     system, prepared
-        The compiled scene, and what `analysis.prepare` made of it.
+        The compiled scene, and what `instance.prepare` made of it.
     """
     with (
         part("sensitivities"),

@@ -20,7 +20,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, lifted_groups, prepare, prepare_at_start
+from apc.analysis.analysis import lifted_groups, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.timings import part
 from apc.compiler.words import counted
@@ -29,6 +29,7 @@ from apc.eigen.modes import split
 from apc.eigen.spectrum import solve_spectrum
 from apc.finite_equations import finite_equations
 from apc.frame.display_units import Unit
+from apc.frame.instance import Prepared, prepare
 from apc.frame.names import Free, parameter_of
 from apc.network.nominal import channel_numbers
 from apc.result import Result
@@ -97,7 +98,7 @@ def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -
     system
         The compiled scene, with the numbers at which to differentiate.
     prepared
-        From `analysis.prepare`, of this system with any numbers.
+        From `instance.prepare`, of this system with any numbers.
 
     Raises
     ------

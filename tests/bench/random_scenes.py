@@ -20,13 +20,14 @@ from pathlib import Path
 
 import flint
 
-from apc.analysis.analysis import Analysis, analyze, prepare
+from apc.analysis.analysis import Analysis, analyze
 from apc.answer import sensitivities_of
 from apc.benchmark.timing import timed
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.components.component_library import Library
 from apc.compiler.errors import ApcError
 from apc.eigen.balls import precision
+from apc.frame.instance import prepare
 from apc.frame.overrides import apply
 from apc.simulation.simulation import ROW
 from apc.threads import single_threaded

@@ -19,9 +19,10 @@ from typing import Any
 import flint
 import numpy as np
 
-from apc.analysis.analysis import Analysis, analyze, prepare
+from apc.analysis.analysis import Analysis, analyze
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.balls import precision
+from apc.frame.instance import prepare
 from apc.frame.names import find, parameter_of
 from apc.frame.overrides import Override, apply
 from apc.vary.sensitivity import Sensitivities, sensitivities

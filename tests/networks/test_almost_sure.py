@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from apc.analysis.analysis import prepare
+from apc.frame.instance import prepare
 from apc.moments.almost_sure import AlmostSure, almost_sure
 from apc.moments.unserved import UnservedError
 from tests.held_scenes import scene, system_of

@@ -107,7 +107,7 @@ def by_critical(system: CompiledSystem, near: float) -> tuple[float, float]:
 
 
 def by_margins(system: CompiledSystem, near: float) -> tuple[float, float]:
-    from apc.analysis.analysis import prepare
+    from apc.frame.instance import prepare
     from apc.vary.margins import Margins
     from apc.vary.over_network import network_margins
 

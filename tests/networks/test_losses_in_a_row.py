@@ -14,8 +14,8 @@ import pytest
 
 import apc
 from apc.__main__ import run
-from apc.analysis.analysis import prepare
 from apc.compiler.errors import ApcError
+from apc.frame.instance import prepare
 from apc.moments.worst import LossesInARow, worst_case
 from tests.held_scenes import frames, growth, scene, system_of
 from tests.topologies import replaced

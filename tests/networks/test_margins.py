@@ -7,9 +7,9 @@ from contextlib import nullcontext
 import pytest
 
 import apc
-from apc.analysis.analysis import prepare
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
+from apc.frame.instance import prepare
 from apc.vary.margins import Margins
 from apc.vary.over_network import network_margins, network_sensitivities
 from tests.bruteforce import Scene

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 import apc
 from apc.__main__ import run
-from apc.analysis.analysis import prepare
 from apc.compiler.compiled import Channel
 from apc.compiler.errors import ApcError
+from apc.frame.instance import prepare
 from apc.moments.traces import trace_radius
 from tests.bruteforce import Scene
 from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, compiled, library, replaced

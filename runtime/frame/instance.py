@@ -1,0 +1,166 @@
+"""A scene with numbers put in: what analyses of it share, and what one of them starts from.
+
+Takes: a `CompiledSystem`.
+Gives: `Prepared`, `prepare`, `prepared_at`, `starting`; `Instance`, `instance`.
+Guarantees: what does not follow from the numbers is built once for all of them.
+Does not: put peers together, or analyse (see `peers`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.frame.ages import at_timings, linear_sites
+from apc.frame.exchange import Exchange, build_exchange
+from apc.frame.jacobians import SiteJacobians
+from apc.frame.linearize import at_start, reaches_start, sends_nothing
+from apc.frame.names import Free
+from apc.frame.parameters import Numbers, resolve
+from apc.frame.schedule import ORDER, Schedule
+from apc.frame.scheduling import build_schedules
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """What analyses of one system with different numbers have in common.
+
+    The Jacobians (one a kind) hold for any numbers; the schedules (one a group) for these timings and this
+    order of coincident events. With `starting` the Jacobians are those where each kind starts (see
+    `starting`).
+    """
+
+    jacobians: tuple[SiteJacobians, ...]
+    schedules: tuple[Schedule, ...]
+    timings: Mapping[str, Fraction]
+    order: tuple[str, ...]
+    starting: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Instance:
+    """A system at its numbers: Jacobians (one a kind), schedules (one a group), parameters, and the links."""
+
+    system: CompiledSystem
+    jacobians: tuple[SiteJacobians, ...]
+    schedules: tuple[Schedule, ...]
+    numbers: Numbers
+    exchange: Exchange
+
+    @property
+    def sites(self) -> tuple[SiteJacobians, ...]:
+        """The Jacobians of each group's kind."""
+        return tuple(self.jacobians[group.kind] for group in self.system.groups)
+
+    @property
+    def affine(self) -> bool:
+        """Whether every group's equations are."""
+        return all(site.affine for site in self.sites)
+
+
+def prepare(system: CompiledSystem) -> Prepared:
+    """Do what analyses with different numbers can share.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    """
+    timings = {timing.name: timing.value for timing in system.timings}
+    return _scheduled(system, linear_sites(system, timings, ORDER), timings, ORDER)
+
+
+def instance(system: CompiledSystem, prepared: Prepared | None = None) -> Instance:
+    """Return a system at the numbers that it has.
+
+    Parameters
+    ----------
+    system
+        The compiled scene, with the numbers to analyse (see `overrides.apply`).
+    prepared
+        From `prepare`, of this system with any numbers; saves building the Jacobians again.
+
+    Raises
+    ------
+    ApcError
+        As `prepared_at`.
+    """
+    numbers = resolve(system)
+    prepared = prepared_at(system, prepared or prepare(system), numbers.timings)
+    exchange = build_exchange(system, numbers.timings)
+    return Instance(system, prepared.jacobians, prepared.schedules, numbers, exchange)
+
+
+def prepared_at(system: CompiledSystem, prepared: Prepared, timings: Mapping[str, Fraction]) -> Prepared:
+    """Return what was prepared for other timings: with their schedules, and with the ages they make.
+
+    Raises
+    ------
+    ApcError
+        E845 where what is heard at these timings decides how a kind moves where it starts.
+    """
+    if timings == prepared.timings:
+        return prepared
+    sites = at_timings(system, prepared.jacobians, timings, prepared.order)
+    if prepared.starting and sites is not prepared.jacobians:
+        result = _where_it_starts(system, sites)
+        if result is None:
+            raise hangs_on_heard(system)
+        sites = result
+    return replace(_scheduled(system, sites, timings, prepared.order), starting=prepared.starting)
+
+
+def starting(system: CompiledSystem, prepared: Prepared, varied: Sequence[Free] = ()) -> Prepared | None:
+    """Return what was prepared with every kind linearized where it starts, as its parameters say.
+
+    None where what is heard at the start decides as well (see `linearize.at_start`), unless that is 0 from
+    every peer, whatever `varied` parameters are.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    prepared
+        From `prepare`, of this system.
+    varied
+        The parameters that will have other values.
+    """
+    result = _where_it_starts(system, prepared.jacobians, varied)
+    return None if result is None else replace(prepared, jacobians=result, starting=True)
+
+
+def _where_it_starts(
+    system: CompiledSystem, sites: tuple[SiteJacobians, ...], varied: Sequence[Free] = ()
+) -> tuple[SiteJacobians, ...] | None:
+    """Return the Jacobians of each kind where it starts, None where one's don't follow from parameters."""
+    used = {group.kind for group in system.groups}
+    silent = False
+    if any(at_start(sites[kind]) is None for kind in used):
+        silent = not any(reaches_start(system, free) for free in varied) and all(
+            sends_nothing(system.kinds[group.kind], rows)
+            for group, rows in zip(system.groups, resolve(system).parameters, strict=True)
+        )
+    at = [at_start(site, silent=silent) if kind in used else site for kind, site in enumerate(sites)]
+    result = tuple(site for site in at if site is not None)
+    return result if len(result) == len(sites) else None
+
+
+def hangs_on_heard(system: CompiledSystem) -> ApcError:
+    """Return the refusal of a delay of a scene whose kinds' parameters don't say how these start."""
+    what = "how the scene moves hangs on what is heard at the start: a delay can't be searched"
+    hint = "apc critical of a stiffness or damping"
+    return ApcError(Mistake("E845", Place(system.origin.topology), what, hint=hint))
+
+
+def _scheduled(
+    system: CompiledSystem,
+    built: tuple[SiteJacobians, ...],
+    timings: Mapping[str, Fraction],
+    order: tuple[str, ...],
+) -> Prepared:
+    """Add the schedules of these timings to the Jacobians."""
+    schedules = build_schedules(system, timings, [site.pattern for site in built], order=order)
+    return Prepared(built, schedules, timings, order)
