@@ -36,10 +36,10 @@ from apc.eigen.spectrum import (
     solve_spectrum,
     up_to,
 )
-from apc.finite_equations import finite_equations
 from apc.frame.ages import linear_sites
 from apc.frame.discretize import TOO_LARGE
 from apc.frame.exchange import Exchange
+from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Instance, Prepared, instance, starting
 from apc.frame.names import Free
 from apc.network.nominal import left_out, unreliable

@@ -15,7 +15,7 @@ import numpy as np
 from apc.analysis.plan import make_plan
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.finite_equations import finite_equations
+from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import instance, prepare
 from apc.frame.jacobians import edge_name
 from apc.result import Result

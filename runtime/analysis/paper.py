@@ -46,8 +46,8 @@ from apc.eigen.peers import PeerGroup
 from apc.eigen.relative import relative_bounded, relative_coordinates, relative_places
 from apc.eigen.rigid import RigidModes, find_rigid_modes, what_stands
 from apc.eigen.spectrum import STABLE, Spectrum, solve_spectrum, up_to
-from apc.finite_equations import finite_equations
 from apc.frame.discretize import UNIT, discretize
+from apc.frame.finite_equations import finite_equations
 from apc.frame.lift import FrameMap
 from apc.frame.radius import RADII, radius_of, rounded, value_of, with_radius
 from apc.frame.schedule import Way

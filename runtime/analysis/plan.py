@@ -99,7 +99,7 @@ def make_plan(instance: Instance, method: str = "auto") -> Plan:
     system, exchange = instance.system, instance.exchange
     refuse_varying(system, instance.jacobians)
     can = method in ("auto", "determinant") and not not_populations(system, instance.jacobians)
-    if can and ((method == "determinant" and _prompt(instance)) or _many(instance)):
+    if can and ((method == "determinant" and _prompt(instance)) or more_differ(instance, FEW_STATES)):
         ways = used_ways(instance.schedules)
         sparse = [way.link for way in ways if not exchange.is_complete(way.link)]
         if not sparse:
@@ -187,16 +187,6 @@ def not_populations(system: CompiledSystem, jacobians: Sequence[SiteJacobians]) 
         if not site.affine:
             return f"{kind.name} is not linear, so that each peer is linearized where it starts"
     return ""
-
-
-def _many(instance: Instance) -> bool:
-    """Say whether so many peers differ that they are not worth an object each."""
-    sizes = [len(site.kind.states) for site in instance.sites]
-    different = map(len, instance.numbers.parameters)
-    if sum(count * size for count, size in zip(different, sizes, strict=True)) <= FEW_STATES:
-        return False
-    # Peers that are all alike are a few systems of one peer's size, however large that is.
-    return more_differ(instance, max(1, FEW_STATES // max(sizes)))
 
 
 def _prompt(instance: Instance) -> bool:

@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.weights import exact_weight
-from apc.finite_equations import at_its_part
 from apc.frame.exact import evaluate_exact
 from apc.frame.exchange import Exchange, check_mean
+from apc.frame.finite_equations import at_its_part
 from apc.frame.instance import Instance
 from apc.frame.jacobians import SiteJacobians, edge_name
 from apc.frame.lift import FrameMap, check_packets, lift
@@ -528,13 +528,18 @@ def _by_start(instance: Instance) -> tuple[PeerGroup, ...]:
     )
 
 
-def more_differ(instance: Instance, count: int) -> bool:
-    """Say whether there are more than `count` peers of different matrices, all affine and without edges."""
-    keys: set[_Key] = set()
+def more_differ(instance: Instance, states: int) -> bool:
+    """Say whether peers of different matrices, all affine and without edges, have more states together."""
+    sizes = [len(site.kind.states) for site in instance.sites]
+    different = map(len, instance.numbers.parameters)
+    if sum(count * size for count, size in zip(different, sizes, strict=True)) <= states:
+        return False
+    # Peers that are all alike are a few systems of one peer's size, however large that is.
+    most, keys = max(1, states // max(sizes)), set[_Key]()
     for place, parameters in enumerate(instance.numbers.parameters):
         for start in range(0, len(parameters), PEEK):
             keys.update(_keys(instance, place, parameters[start : start + PEEK]))
-            if len(keys) > count:  # mostly the first ones tell
+            if len(keys) > most:  # mostly the first ones tell
                 return True
     return False
 

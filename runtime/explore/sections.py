@@ -24,7 +24,7 @@ from apc.compiler.words import in_hertz
 from apc.eigen.spectrum import Mode
 from apc.explore.motion import motion_of
 from apc.explore.sliders import text_of
-from apc.finite_equations import finite_equations
+from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, prepare
 from apc.frame.names import Free, Range, unit_of
 from apc.frame.overrides import Override, apply

@@ -20,7 +20,7 @@ from apc.exports.fmu import Unit, unit_of
 from apc.exports.peer_step import Peer, peer_of, refused, sites_of
 from apc.exports.pushed import pushed
 from apc.exports.scene_text import c_scene, one_peer
-from apc.finite_equations import finite_equations
+from apc.frame.finite_equations import finite_equations
 from apc.loop.peer import number_of
 from apc.result import Result
 from apc.simulation.settings import DEFAULT, Method, parse_method

@@ -39,10 +39,10 @@ from apc.eigen.closing import Loop, close_outside, lay_out_loop
 from apc.eigen.modes import dense_loop
 from apc.eigen.peers import PeerGroup, states_of
 from apc.exports.identifiers import Port
-from apc.finite_equations import finite_equations
 from apc.frame.devices import Device, Push, find_push
 from apc.frame.discretize import TOO_LARGE, discretize
 from apc.frame.exchange import Exchange
+from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, prepare
 from apc.frame.lift import MOST_PACKETS, FrameMap, check_packets, compose, step_durations
 from apc.frame.ports import OUTSIDE, with_cuts, with_holds, with_ports

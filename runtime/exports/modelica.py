@@ -41,9 +41,9 @@ from apc.exports.expressions import (
 from apc.exports.identifiers import identifier as word
 from apc.exports.peer_step import computing, heard_of
 from apc.exports.texts import filled, quoted
-from apc.finite_equations import finite_equations
 from apc.frame.ages import stamped
 from apc.frame.exchange import Exchange, build_exchange, check_mean
+from apc.frame.finite_equations import finite_equations
 from apc.frame.jacobians import jacobians
 from apc.frame.linearize import start_sends
 from apc.frame.parameters import resolve

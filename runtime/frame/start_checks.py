@@ -12,9 +12,9 @@ import numpy as np
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
-from apc.finite_equations import finite_equations
 from apc.frame.ages import linear_sites
 from apc.frame.discretize import TOO_LARGE, refuse_many
+from apc.frame.finite_equations import finite_equations
 from apc.frame.lift import lift
 from apc.frame.linearize import check_start, linearize
 from apc.frame.parameters import resolve

@@ -16,8 +16,8 @@ import numpy as np
 
 from apc.compiler.compiled import CompiledSystem, Link
 from apc.compiler.multiples import common_multiple
-from apc.finite_equations import finite_equations
 from apc.frame.exchange import arcs
+from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, prepare
 from apc.frame.parameters import resolve
 from apc.moments.almost_sure import AlmostSure, almost_sure

@@ -24,8 +24,8 @@ from apc.compiler.timings import part
 from apc.compiler.words import counted
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.spectrum import mode_near
-from apc.finite_equations import finite_equations
 from apc.frame.devices import replaced_hands
+from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, prepare
 from apc.frame.names import Free, Range, notes_for_all_groups
 from apc.frame.overrides import apply

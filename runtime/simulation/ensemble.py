@@ -24,7 +24,7 @@ from apc.analysis import analysis
 from apc.compiler.compiled import LENGTH, CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
-from apc.finite_equations import finite_equations
+from apc.frame.finite_equations import finite_equations
 from apc.memory import refuse_beyond
 from apc.moments.network_verdict import growth, verdict_of
 from apc.network.nominal import unreliable

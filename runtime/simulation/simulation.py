@@ -21,9 +21,9 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
 from apc.compiler.words import no_more
-from apc.finite_equations import finite_equations
 from apc.frame.ages import stamped
 from apc.frame.exchange import Exchange, build_exchange
+from apc.frame.finite_equations import finite_equations
 from apc.frame.jacobians import SiteJacobians, jacobians
 from apc.frame.parameters import Numbers, resolve
 from apc.frame.schedule import Propagate, Schedule

@@ -31,7 +31,7 @@ from apc.answer import proved_at
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake
 from apc.compiler.timings import part
-from apc.finite_equations import finite_equations
+from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import prepare
 from apc.frame.names import Free, Range, value_now
 from apc.frame.overrides import Override, apply

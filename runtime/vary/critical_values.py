@@ -23,8 +23,8 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
 from apc.compiler.words import with_unit
-from apc.finite_equations import finite_equations
 from apc.frame.devices import replaced_hands
+from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, hangs_on_heard, prepare
 from apc.frame.linearize import reaches_start
 from apc.frame.names import Free, find, parameter_of, unit_of, values_by_group

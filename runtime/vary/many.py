@@ -36,8 +36,8 @@ from apc.eigen.spectrum import (
     UNSTABLE,
     judge,
 )
-from apc.finite_equations import finite_equations
 from apc.frame.ages import linear_sites
+from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, instance, prepare
 from apc.frame.names import Free, find, notes_for_all_groups, unit_of
 from apc.frame.overrides import Override, apply

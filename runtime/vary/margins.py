@@ -25,8 +25,8 @@ from apc.compiler.timings import part
 from apc.eigen.modes import arrange
 from apc.eigen.peers import states_of
 from apc.eigen.spectrum import DRIFTS, finite
-from apc.finite_equations import finite_equations
 from apc.frame.display_units import Unit
+from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, prepare
 from apc.frame.names import Free, named_times, parameter_of, unit_of, value_now
 from apc.result import Result

@@ -21,7 +21,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Place
 from apc.compiler.timings import part
 from apc.compiler.words import counted
-from apc.finite_equations import finite_equations
+from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared
 from apc.frame.names import Free, named_times, unit_of, value_now
 from apc.frame.overrides import Override

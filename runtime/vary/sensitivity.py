@@ -27,8 +27,8 @@ from apc.compiler.words import counted
 from apc.eigen.eigenpairs import driving_parts, eigenpairs
 from apc.eigen.modes import split
 from apc.eigen.spectrum import solve_spectrum
-from apc.finite_equations import finite_equations
 from apc.frame.display_units import Unit
+from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, prepare
 from apc.frame.names import Free, parameter_of
 from apc.network.nominal import channel_numbers
