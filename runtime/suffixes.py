@@ -46,12 +46,9 @@ def check_suffix(path: Path, known: Iterable[str], option: str) -> str:
     wanted = names[0] if len(names) == 1 else f"one of {', '.join(names)}"
     what, proposed = f"the suffix of {option.removesuffix('=')}", Path(path.name or "result")
     if path == DASH:  # whoever writes it wants standard output, which takes text
-        hint = (
-            Path("/dev/stdout")
-            if any(text in names for text in TEXTS)
-            else Path("result").with_suffix(names[0])
-        )
-        raise ApcError(Mistake("E878", Place(str(path)), what, wanted, "none", written(option, hint)))
+        as_text = any(text in names for text in TEXTS)
+        instead = Path("/dev/stdout") if as_text else Path("result").with_suffix(names[0])
+        raise ApcError(Mistake("E878", Place(str(path)), what, wanted, "none", written(option, instead)))
     hint = written(option, path.parent / proposed.with_suffix(names[0]))
     raise ApcError(Mistake("E878", Place(str(path)), what, wanted, path.suffix or "none", hint))
 
