@@ -20,10 +20,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis import analysis
 from apc.compiler.compiled import LENGTH, CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
+from apc.frame import instance
 from apc.frame.finite_equations import finite_equations
 from apc.memory import refuse_beyond
 from apc.moments.network_verdict import growth, verdict_of
@@ -217,7 +217,7 @@ def _mean_square(system: CompiledSystem) -> MeanSquare | None:
         return None
     try:
         with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-            prepared = analysis.prepare(system)
+            prepared = instance.prepare(system)
             result = growth(system, prepared)
     except ApcError as error:  # what can't be analysed can be played
         return MeanSquare("", None, None, False, error.mistakes[0].what)

@@ -130,7 +130,7 @@ def _finite(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _growth(system: CompiledSystem, argument: str) -> Quantity:
     """Return the verdict in mean square and what second moments grow by in a frame."""
-    from apc.analysis.analysis import prepare  # the nominal quantities need none of it
+    from apc.frame.instance import prepare  # the nominal quantities need none of it
     from apc.moments.network_verdict import growth, verdict_of
 
     if argument:
