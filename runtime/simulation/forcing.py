@@ -1,17 +1,14 @@
-"""What forces that change with time alone add to a site's motion, exact to rounding.
+"""What forces that change with time alone add to a site's motion, next to exact.
 
 Takes: the `Rates` of a kind, a parameter vector, when intervals begin and how long they last.
 Gives: `SiteForcing`, `site_forcing`, `impulses`.
 Guarantees: an interval is split where a comparison of `time` switches (a step, a corner of a ramp, a row of
-a table), so that what is integrated is smooth; an impulse is right to a few roundings of its terms and of
-the instants.
+a table), so that what is integrated is smooth; an impulse is right to `AGREE` of the largest of its chunk.
 Does not: integrate what depends on the motion.
 
     c = ∫₀ᵀ e^{A u} g(t + T − u) du
 
-by the rule of Gauss and Legendre with 16 nodes, on parts that are halved until the last Legendre coefficients
-of what is integrated are no more than rounding errors (Trefethen, Approximation Theory and Approximation
-Practice, chapter 19).
+by SciPy's adaptive quadrature of vectors (Gauss and Kronrod), all parts of intervals at once.
 """
 
 from __future__ import annotations
@@ -23,31 +20,23 @@ from typing import Any
 
 import casadi
 import numpy as np
-from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.frame.discretize import UNIT, exponential_values
+from apc.frame.discretize import exponential_values
 from apc.frame.exact import ROWS, evaluate_exact
 from apc.frame.jacobians import guards_of, lookups_of
 from apc.simulation.propagate import Rates
+from apc.threads import load_pool
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-TERMS = 16
-NODES, WEIGHTS = legendre.leggauss(TERMS)
-# From values at the nodes to Legendre coefficients (TERMS, nodes).
-TRANSFORM = (legendre.legvander(NODES, TERMS - 1) * WEIGHTS[:, None]).T * (np.arange(TERMS)[:, None] + 0.5)
-# From values at the nodes to that where a part begins.
-BEGINNING = legendre.legvander([-1.0], TERMS - 1)[0] @ TRANSFORM
-# Last coefficients of this size, relative to the whole, may be rounding errors; what they leave out is less.
-AGREE = 64 * UNIT
-MOST_HALVINGS = 48  # what a jump within so small a part of an interval is missed by is far below a rounding
-LOST = 1e-9  # what is left open beyond, of the whole, after so many: a force whose integral has no end
-MOST_HALVED = (
-    2**18
-)  # parts of the intervals of one chunk: some seconds; a jump in an interval takes a hundred
+# A quadrature ends where its error is this part of the largest impulse, or where it has cut its parts into so
+# many pieces; what it leaves out then, of the whole, may be this large: of a jump it is far less.
+AGREE, MOST_PIECES, LOST = 1e-13, 100, 1e-9
+LEAST = float(np.finfo(np.float64).tiny)
+FADING = 4  # doublings of the time within which a motion dies out, from one part of an interval to the next
 MOST_NUMBERS = 2**21  # of the exponentials that are held at once
 
 
@@ -128,82 +117,56 @@ def impulses(site: SiteForcing, starts: Floats, which: Integers) -> Floats:
 
 def _impulses_of_length(site: SiteForcing, duration: float, starts: Floats) -> Floats:
     """Return c of intervals of one length (intervals, n_x)."""
-    total, size = (np.zeros((len(starts), len(site.matrix))) for _ in range(2))
-    most = max(1, MOST_NUMBERS // (TERMS * site.matrix.size))  # parts that are integrated at once
-    work, halved = [(*_parts(site, duration, starts), 0)], 0
-    while work:
-        rows, low, high, halvings = work.pop()
-        if len(rows) > most:
-            work.append((rows[most:], low[most:], high[most:], halvings))
-            rows, low, high = rows[:most], low[:most], high[:most]
-        value, error, terms = _integrated(site, starts[rows] + duration, low, high)
-        np.maximum.at(size, rows, terms)
-        off = (error > AGREE * size[rows]).any(axis=1) & np.isfinite(value).all(axis=1)
-        off &= halvings < MOST_HALVINGS
-        if halvings == MOST_HALVINGS and (error > LOST * size[rows]).any():
-            raise _too_fast(starts, duration)
-        np.add.at(total, rows[~off], value[~off])
-        if off.any():
-            halved += int(off.sum())
-            if halved > MOST_HALVED:
-                raise _too_fast(starts, duration)
-            rows, low, high = rows[off], low[off], high[off]
-            middle = (low + high) / 2
-            ends = np.concatenate([low, middle]), np.concatenate([middle, high])
-            work.append((np.tile(rows, 2), *ends, halvings + 1))
+    total = np.zeros((len(starts), len(site.matrix)))
+    whose, low, high = _parts(site, duration, starts)
+    most = max(1, MOST_NUMBERS // site.matrix.size)  # parts that are integrated at once
+    for first in range(0, len(whose), most):
+        some = slice(first, first + most)
+        value = _integrated(site, starts[whose[some]] + duration, low[some], high[some])
+        np.add.at(total, whose[some], value)
     return total
 
 
 def _parts(site: SiteForcing, duration: float, starts: Floats) -> tuple[Integers, Floats, Floats]:
-    """Return the parts into which breaks cut intervals: whose each is, and from where to where.
+    """Return the parts into which breaks, and what fades, cut intervals: whose each is, from where to where.
 
-    Both are counted in seconds before the interval's end, which stay exact where something dies out at once.
+    Times are in seconds before the interval's end, which stay exact where something dies out at once.
     """
     first = np.searchsorted(site.breaks, starts, side="right")
     many = np.maximum(np.searchsorted(site.breaks, starts + duration) - first, 0)
-    every = np.arange(len(starts))
+    every, size = np.arange(len(starts)), float(np.abs(site.matrix).sum(axis=1).max(initial=0.0))
     cut = np.repeat(every, many)
     place = np.arange(len(cut)) - np.repeat(np.cumsum(many) - many, many) + first[cut]
     left = duration - (site.breaks[place] - starts[cut])
-    whose = np.concatenate([every, every, cut])
-    ends = np.concatenate([np.zeros(len(starts)), np.full(len(starts), duration), left])
+    fading = np.arange(0.0, np.log2(max(size * duration, 1.0)), FADING)  # what dies out fast does so within
+    fixed = np.array([0.0, duration, *2.0**fading / max(size, 1 / duration)])
+    whose = np.concatenate([np.repeat(every, len(fixed)), cut])
+    ends = np.concatenate([np.tile(fixed, len(starts)), left])
     order = np.lexsort((ends, whose))
     ends, whose = ends[order], whose[order]
     inside = (whose[1:] == whose[:-1]) & (ends[1:] > ends[:-1])
     return whose[:-1][inside], ends[:-1][inside], ends[1:][inside]
 
 
-def _integrated(site: SiteForcing, until: Floats, low: Floats, high: Floats) -> tuple[Floats, Floats, Floats]:
-    """Integrate parts of intervals that end at `until`, from `high` to `low` seconds before, all (k,).
-
-    Returns the integrals, what they may be off by, and the sums of their terms' magnitudes (k, n_x).
-    """
+def _integrated(site: SiteForcing, until: Floats, low: Floats, high: Floats) -> Floats:
+    """Integrate parts of intervals that end at `until`, from `high` to `low` seconds before, all (k,)."""
     equal, which = np.unique(np.stack([low, high]), axis=1, return_inverse=True)
-    half, left = (equal[1] - equal[0])[:, None] / 2, _nodes(equal[0], equal[1])
-    at = np.concatenate([left, equal[0][:, None]], axis=1)  # and at a part's begin, which no node sees
-    generators = at[:, :, None, None] * site.matrix
-    steps = exponential_values(generators.reshape(-1, *site.matrix.shape), site.matrix[None, :, :0], 1.0)
-    steps = steps.reshape(*at.shape, *site.matrix.shape)[..., list(site.pushed)][which.reshape(-1)]
-    half = half[which.reshape(-1)]
-    instants = until[:, None] - _nodes(low, high)
-    g = np.moveaxis(_at(site.force, instants), 0, -1)  # (k, nodes, pushed)
-    values = np.einsum("kixq,kiq->kix", steps[:, :-1], g)
-    weighted = np.einsum("i,kixq,kiq->kx", WEIGHTS, np.abs(steps[:, :-1]), np.abs(g))
-    begin = np.einsum("kxq,i,kiq->kx", steps[:, -1], BEGINNING, g)
-    missed = np.abs(np.einsum("ci,kix->kcx", TRANSFORM[-2:], values)).sum(axis=1)
-    missed = np.maximum(missed, np.abs(BEGINNING @ values - begin) / TERMS)
-    # A rounding of the instants moves the force by its slope, which no halving mends.
-    slope = np.einsum("c,kcq->kq", np.arange(TERMS) ** 2.0, np.abs(np.einsum("ci,kiq->kcq", TRANSFORM, g)))
-    rounding = TERMS * UNIT * np.abs(instants[:, :1]) * slope / half
-    rounding = np.einsum(
-        "kxq,kq->kx", np.abs(steps).max(axis=1), np.where(np.isfinite(rounding), rounding, 0)
+    which = which.reshape(-1)
+    nothing = site.matrix[None, :, :0]
+
+    def integrand(share: float) -> Floats:
+        left = equal[0] + (equal[1] - equal[0]) * share
+        steps = exponential_values(left[:, None, None] * site.matrix, nothing, 1.0)
+        g = _at(site.force, np.maximum(until - left[which], 0.0))
+        moved = np.einsum("kxq,qk->kx", steps[..., list(site.pushed)][which], g)
+        return np.asarray((high - low)[:, None] * moved)
+
+    value, error = load_pool("scipy.integrate").quad_vec(
+        integrand, 0, 1, epsabs=LEAST, epsrel=AGREE, norm="max", limit=MOST_PIECES, quadrature="gk15"
     )
-    return half * np.einsum("i,kix->kx", WEIGHTS, values), 2 * half * (missed - rounding), half * weighted
-
-
-def _nodes(low: Floats, high: Floats) -> Floats:
-    """Return the nodes between `low` and `high`, one more axis."""
-    return np.asarray(low[..., None] + (high - low)[..., None] * (NODES + 1) / 2)
+    if error > LOST * np.abs(value).max(initial=0.0):
+        raise _too_fast(until - high, until - low)
+    return np.asarray(value)
 
 
 def _at(function: Any, instants: Floats) -> Floats:
@@ -221,10 +184,9 @@ def _at(function: Any, instants: Floats) -> Floats:
     return np.stack([np.broadcast_to(row, flat.shape) for row in rows]).reshape(shape)
 
 
-def _too_fast(starts: Floats, duration: float) -> ApcError:
-    begin, end = float(starts.min()), float(starts.max() + duration)
+def _too_fast(begin: Floats, end: Floats) -> ApcError:
     what = (
-        f"a force changes too fast: from {begin:.6g} s to {end:.6g} s it would be looked at in more than "
-        f"{MOST_HALVED:,} places"
+        f"a force changes too fast: from {float(begin.min()):.6g} s to {float(end.max()):.6g} s it would be "
+        f"looked at in more than {MOST_PIECES:,} places"
     )
     return ApcError(Mistake("E871", Place("simulation"), what, hint="a lower frequency, or a constant force"))
