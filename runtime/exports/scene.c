@@ -7,7 +7,7 @@
 #include <stdint.h>
 
 typedef int64_t whole;
-${luck}
+% include "luck.c"
 % for link in lucky
 % include "way.h"
 % endfor

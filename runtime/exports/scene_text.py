@@ -35,7 +35,6 @@ from apc.exports.peer_step import (
 from apc.exports.pushed import FORCE_ON
 from apc.network.channel import luck_key
 from apc.network.timetable import Luck, luck_of
-from apc.simulation.machine import luck_text
 from apc.simulation.settings import Method
 from apc.simulation.simulation import Plan
 
@@ -248,7 +247,6 @@ def shared(scene: CScene) -> dict[str, Any]:
         "scene": scene,
         "sites": sites,
         "lucky": [link for link in scene.links if link.luck],
-        "luck": luck_text(),
         "quanta": lambda link: [int(delay / scene.quantum) for delay in link.delays],
         "first": lambda link, numbers: map([item for _, item in link.ways].index, numbers),
     }

@@ -31,8 +31,8 @@ Flags = NDArray[np.bool_]
 
 # Ways from peer to peer: of each some packets are on their way, and so many bytes are kept.
 MOST_WAYS, WAY = 2_000_000, 200
-# Packets on their way on all ways of a link: 2 GiB of places in lists of 31 bits (see `engine.c`). Each
-# takes so many bytes, and so many more where the order of arrival matters.
+# Packets on their way on all ways of a link. Each takes so many bytes, and so many more where the order of
+# arrival matters.
 MOST_PACKETS = 2**29
 PACKET, ORDERED = 4, 8
 
@@ -106,10 +106,6 @@ class Luck:
     def kept(self, route: Route) -> int:
         """Return how many packets of a way may be sent before the first of them is heard, or missed."""
         return route.slots * (self.latest(route) // (route.ticks * self.tick_period) + 3)
-
-    def buckets(self, route: Route) -> int:
-        """Return how many ticks may be before the first to see a packet, from the frame on that sends it."""
-        return self.latest(route) // self.tick_period + 2 * route.ticks + 2
 
     def latest(self, route: Route) -> int:
         """Return the quanta within which a packet of a way has arrived, or is missed."""

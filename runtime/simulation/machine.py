@@ -1,10 +1,9 @@
 """All peers' frames in machine code: the kernels as loops over peers, and the engine that plays them.
 
-Takes: a `Population`, the laws of its unreliable links.
-Gives: `library_of`, `Library`, `Machine`; `program_text`, the C text; `straight_lines`, `luck_text`,
-`DISTRIBUTIONS`.
-Guarantees: the numbers of `stepwise` to a few roundings of the sums, and the same packets; the text depends
-on what a peer does in a frame, not on how many peers there are or on their numbers.
+Takes: a `Population`, the packets of its unreliable links.
+Gives: `library_of`, `Library`, `Machine`; `program_text`, the C text; `straight_lines`.
+Guarantees: the numbers of `stepwise` to a few roundings of the sums; the text depends on what a peer does in
+a frame, not on how many peers there are or on their numbers.
 Does not: compile (see `native`), or play kernels that are not straight code, such as solvers.
 
 C, and not numba or LLVM: its compiler is of the machine, where these would be further packages to install.
@@ -14,7 +13,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,11 +23,9 @@ from numpy.typing import NDArray
 
 from apc.compiler.interpolation import table_of
 from apc.compiler.plain import PlainFunction, straight
-from apc.network.channel import luck_key
-from apc.network.timetable import START, Luck
 from apc.simulation.hearing import Arrived, Complete, Deliver, Look, Operation, Source, Weighed
 from apc.simulation.native import native
-from apc.simulation.population import Played, Population
+from apc.simulation.population import Memory, Played, Population, Told
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -39,7 +36,6 @@ MOST_OPERATIONS = 20_000
 MANY = 32  # peers of a member from which on their loop is put into lanes
 KINDS = ("complete", "weighed", "deliver", "look", "move", "work")
 OPERATORS = {"sum": 0, "mean": 0, "max": 1, "min": 2}
-DISTRIBUTIONS = {"uniform": 0, "normal": 1, "pareto": 2}
 
 HEAD = """\
 #include <math.h>
@@ -124,19 +120,15 @@ def _fields(*columns: tuple[str, str]) -> np.dtype[Any]:
 
 WHOLE, NUMBER, ADDRESS = "i8", "f8", "u8"
 ROUTE = _fields(
-    ("ways slots ticks phase period first_tick tick_period kept buckets newest zero channels", WHOLE),
-    ("distribution traced stride", WHOLE),
-    ("p r one_minus_h one_minus_k bad_share jitter quantum", NUMBER),
-    ("trace delays nominal senders receivers columns keys held effective gap bad", ADDRESS),
-    ("heads queue when places arrived waits key0 key1", ADDRESS),
-    ("heard", WHOLE),
+    ("ways slots ticks zero channels", WHOLE),
+    ("columns keys held effective seen missing", ADDRESS),
 )
 MEMBER = _fields(
     ("count column recorded sites own impulse_rows", WHOLE), ("carry heard constants impulses site", ADDRESS)
 )
 OPERATION = _fields(("kind a b c d e f g", WHOLE), ("x y z", NUMBER), ("p q u v r", ADDRESS))
 PLAN = _fields(
-    ("frames_kept keys peers operations routes marks width parts frame", WHOLE),
+    ("frames_kept keys peers operations marks width parts frame", WHOLE),
     ("packets operation route member", ADDRESS),
 )
 
@@ -156,13 +148,8 @@ def program_text(kernels: Sequence[tuple[PlainFunction, int]], looks: Sequence[P
     parts += [_look(place, look) for place, look in enumerate(looks)]
     parts.append(_table("kernels", "kernel", PARAMETERS.format(own="int own, "), len(kernels)))
     parts.append(_table("looks", "look", LOOKED, len(looks)))
-    parts += [luck_text(), Path(__file__).with_name("engine.c").read_text(encoding="utf-8")]
+    parts.append(Path(__file__).with_name("engine.c").read_text(encoding="utf-8"))
     return "\n".join(parts)
-
-
-def luck_text() -> str:
-    """Return the C text of the luck of packets."""
-    return Path(__file__).with_name("luck.c").read_text(encoding="utf-8")
 
 
 def _table(name: str, each: str, parameters: str, count: int) -> str:
@@ -304,39 +291,33 @@ def _is_worth_it(function: Any) -> bool:
     return bool(function.n_instructions() + rows <= MOST_OPERATIONS)
 
 
-class Machine:
-    """The memory of all peers, and the library that plays them."""
+class Machine(Memory):
+    """The memory of all peers, and the library that plays them in it."""
 
-    def __init__(self, library: Library, population: Population, lucks: Sequence[Luck], seed: int) -> None:
-        """Lay out the memory.
+    def __init__(
+        self, library: Library, population: Population, timetable: Callable[[int], Told] | None
+    ) -> None:
+        """Lay out what the library reads.
 
         Parameters
         ----------
         library
             The population's.
-        population
-            All peers.
-        lucks
-            What chance does on each of its routes.
-        seed
-            The experiment's.
+        population, timetable
+            As of `Memory`.
         """
-        self.population, self.seed = population, seed
+        super().__init__(population, timetable)
         self._play = library.loaded.play
         self._play.argtypes = [ctypes.c_void_p, *[ctypes.c_int64] * 2, *[ctypes.c_void_p] * 2]
         self._kept: list[NDArray[Any]] = []  # arrays whose addresses the library knows
-        self._start: list[tuple[NDArray[Any], NDArray[Any]]] = []  # what changes, and its beginning
         hearing, members = population.hearing, population.members
-        self.packets = self._changing(np.repeat(hearing.start[None], hearing.ring, axis=0))
-        self.held = [self._changing(start) for start in hearing.held]
-        self.carries = [self._changing(member.each(member.carry).T) for member in members]
         heights = [max(segment.kernel.numel_in("heard") for segment in m.program.segments) for m in members]
         self.heard = [
             self._own(np.zeros((height, member.count)))
             for height, member in zip(heights, members, strict=True)
         ]
         self.members = self._own(np.array([self._member(g) for g in range(len(members))], MEMBER))
-        self.routes = self._own(np.array([self._route(i, luck) for i, luck in enumerate(lucks)], ROUTE))
+        self.routes = self._own(np.array([self._route(i) for i in range(len(hearing.routes))], ROUTE))
         operations = [
             self._operation("work", g, population.parts.index(part), member.program.layout.work.start + row)
             for g, member in enumerate(members)
@@ -352,7 +333,6 @@ class Machine:
             keys=len(hearing.keys),
             peers=hearing.start.shape[1],
             operations=len(operations),
-            routes=len(lucks),
             marks=population.marks,
             width=population.width,
             parts=len(population.parts),
@@ -363,15 +343,6 @@ class Machine:
             member=self.members,
         )
         self.rows = self.work = np.empty((0, 0))  # of the last call
-        self.begin(0)
-
-    def begin(self, run: int) -> None:
-        """Go back to time 0 (see `Player`)."""
-        for array, value in self._start:
-            array[...] = value
-        for place, route in enumerate(self.population.hearing.routes):
-            self.routes["key0"][place], self.routes["key1"][place] = luck_key(route.link, self.seed, run)
-        self.routes["heard"] = 0
 
     def play(self, first: int, count: int, pushes: Sequence[Floats | None]) -> Played:
         """Play the frames from number `first` on (see `Player`)."""
@@ -379,20 +350,18 @@ class Machine:
         for g, impulses in enumerate(pushes):
             if impulses is not None:
                 self.members["impulses"][g] = impulses.ctypes.data
+        seen = self.seen_until(first + count)
+        missing = [np.ascontiguousarray(route.missing) for route in seen]
+        for place, route in enumerate(seen):
+            self.routes["seen"][place] = route.packets.ctypes.data
+            self.routes["missing"][place] = missing[place].ctypes.data
         if len(self.work) != count:
             self.rows = np.empty((count * population.marks, population.width))
             self.work = np.empty((count, len(population.parts)))
         self.work[:] = 0.0
         addresses = self.rows.ctypes.data, self.work.ctypes.data
-        failed = self._play(self.plan.ctypes.data, first, count, *addresses)
-        assert not failed, "a packet is later than the latest can be"
+        self._play(self.plan.ctypes.data, first, count, *addresses)
         return Played(self.rows, self.work, count)
-
-    def in_range(self) -> bool:
-        """Say whether all that moves is still a number (see `Player`)."""
-        members = zip(self.carries, self.population.members, strict=True)
-        moving = (carry[: member.program.layout.work.start] for carry, member in members)
-        return all(bool(np.isfinite(array).all()) for array in (self.packets, *moving))
 
     # ---- the layout
 
@@ -404,11 +373,6 @@ class Machine:
     def _whole(self, array: Any) -> Integers:
         """Keep an array of whole numbers."""
         return self._own(np.asarray(array, np.int64))
-
-    def _changing(self, start: NDArray[Any]) -> NDArray[Any]:
-        """Return an array that begins every run as it is given."""
-        self._start.append((self._own(np.array(start)), start))
-        return self._start[-1][0]
 
     def _member(self, g: int) -> Any:
         member = self.population.members[g]
@@ -427,54 +391,20 @@ class Machine:
             site=self._whole(member.rows),
         )
 
-    def _route(self, place: int, luck: Luck) -> Any:
-        hearing, law = self.population.hearing, luck.law
-        route, ways = hearing.routes[place], len(hearing.routes[place].pairs)
-        kept, buckets = luck.kept(route), luck.buckets(route)
-        stride = ways + min(ways, buckets)  # a packet of each way, and where each run of them begins
-        trace = np.zeros(0) if law.trace is None else law.trace
-        ordered = 0 if luck.newest else ways  # the order of arrival matters to those
+    def _route(self, place: int) -> Any:
+        hearing = self.population.hearing
+        route, keys = hearing.routes[place], hearing.channels[place]
         return _set(
             np.zeros(1, ROUTE)[0],
-            ways=ways,
+            ways=len(route.pairs),
             slots=route.slots,
             ticks=route.ticks,
-            phase=luck.phase,
-            period=luck.period,
-            first_tick=luck.tick_phase,
-            tick_period=luck.tick_period,
-            kept=kept,
-            buckets=buckets,
-            newest=int(luck.newest),
             zero=int(route.zero),
-            channels=len(hearing.channels[place]),
-            distribution=DISTRIBUTIONS[law.distribution],
-            traced=len(trace),
-            p=law.p,
-            r=law.r,
-            one_minus_h=law.one_minus_h,
-            one_minus_k=law.one_minus_k,
-            bad_share=law.bad,
-            jitter=law.jitter,
-            quantum=float(luck.quantum),
-            trace=self._own(trace),
-            delays=self._own(luck.delays),
-            nominal=self._own(luck.nominal),
-            senders=self._own(route.pairs[:, 0]),
-            receivers=self._own(route.pairs[:, 1]),
-            columns=self._own(hearing.column_of[route.pairs[:, 0]].astype(np.int32)),
-            keys=self._own(hearing.channels[place]),
+            channels=len(keys),
+            columns=self._own(hearing.column_of[route.pairs[:, 0]]),
+            keys=self._own(keys),
             held=self.held[place],
-            effective=self._changing(np.full(ways, START, np.int64)),
-            gap=self._changing(np.full(ways, START, np.int64)),
-            bad=self._changing(np.zeros(ways, np.int8)),
-            heads=self._changing(np.full(buckets, -1, np.int32)),
-            stride=stride,
-            queue=self._own(np.empty((kept, stride), np.int32)),
-            when=self._own(np.empty(ways, np.int32)),
-            places=self._own(np.zeros(buckets, np.int32)),
-            arrived=self._changing(np.full(ordered, -1, np.int64)),
-            waits=self._own(np.empty((kept, ordered), np.int64)),
+            effective=self.effective[place],
         )
 
     def _operation(self, kind: str, *whole: int, **fields: Any) -> Any:

@@ -1,8 +1,8 @@
 """All peers of a scene over one frame: each one's program, and what they hear of each other.
 
 Takes: a `CompiledSystem`, who hears whom, and the members, with their programs.
-Gives: `Population`, `build_population`; `Played`, `Player`; `exchanges_within`, `instants_within`,
-`refuse_unheard_of`.
+Gives: `Population`, `build_population`; `Played`, `Player`; `Memory`, `Told`; `exchanges_within`,
+`instants_within`, `refuse_unheard_of`.
 Guarantees: what many peers have in common is kept once.
 Does not: play it (see `stepwise`, `machine`).
 
@@ -11,7 +11,7 @@ A member is a group of the scene, or those of its peers that are recorded, or th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Protocol
@@ -23,7 +23,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.exchange import Exchange
 from apc.frame.schedule import Propagate, Schedule, Tick
-from apc.network.timetable import Route
+from apc.network.timetable import START, Route, Seen
 from apc.simulation.hearing import Hearing, hearing_of
 from apc.simulation.program import Member, timed_events
 
@@ -60,6 +60,13 @@ class Played:
     frames: int
 
 
+class Told(Protocol):
+    """What says which packets the ticks of each route see, as a `Timetable` does; time only goes forward."""
+
+    def take(self, until: int) -> tuple[Seen, ...]:
+        """Return what each route's ticks see, from where the last call ended to before `until`, in quanta."""
+
+
 class Player(Protocol):
     """Plays a population, frame after frame; the runs of one seed differ in their packets."""
 
@@ -74,6 +81,45 @@ class Player(Protocol):
 
     def in_range(self) -> bool:
         """Say whether all that moves, recorded or not, is still a number; its work may not be."""
+
+
+class Memory:
+    """What all peers remember from frame to frame, in arrays that stay where they are.
+
+    `packets` (ring, keys, peers) are those of the last frames; `carries` are of each member (rows, peers);
+    `held` and `effective` are of each route, as of `Hearing`, and the number of the packet in effect.
+    """
+
+    def __init__(self, population: Population, timetable: Callable[[int], Told] | None) -> None:
+        """Make it, at time 0 of the first run; `timetable` gives the packets of a run, None without any."""
+        hearing, self.population, self.timetable = population.hearing, population, timetable
+        self.packets = np.empty((hearing.ring, *hearing.start.shape))
+        self.carries = [np.empty((member.carry.shape[1], member.count)) for member in population.members]
+        self.held = [np.empty(start.shape) for start in hearing.held]
+        self.effective = [np.empty(len(route.pairs), np.int64) for route in hearing.routes]
+        self.begin(0)
+
+    def begin(self, run: int) -> None:
+        """Go back to time 0 (see `Player`)."""
+        hearing, members = self.population.hearing, self.population.members
+        self.table = None if self.timetable is None else self.timetable(run)
+        self.packets[:] = hearing.start
+        for array, start in zip(self.held, hearing.held, strict=True):
+            array[:] = start
+        for numbers in self.effective:
+            numbers[:] = START
+        for carry, member in zip(self.carries, members, strict=True):
+            carry[:] = member.each(member.carry).T
+
+    def seen_until(self, until: int) -> tuple[Seen, ...]:
+        """Return what the ticks see in the frames before number `until`, from the last that was asked for."""
+        return self.table.take(until * self.population.frame) if self.table else ()
+
+    def in_range(self) -> bool:
+        """Say whether all that moves is still a number (see `Player`)."""
+        members = zip(self.carries, self.population.members, strict=True)
+        moving = (carry[: member.program.layout.work.start] for carry, member in members)
+        return all(bool(np.isfinite(array).all()) for array in (self.packets, *moving))
 
 
 def exchanges_within(schedules: Sequence[Schedule]) -> tuple[int, ...]:

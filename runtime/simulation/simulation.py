@@ -124,11 +124,12 @@ class Simulation:
 
     def player(self) -> Player:
         """Return what plays it, with memory of its own."""
-        if self.library is not None:
-            return Machine(self.library, self.population, self.lucks, self.seed)
         routes = self.population.hearing.routes
         timetable = partial(Timetable, routes, self.lucks, seed=self.seed)
-        return Stepwise(self.population, (lambda run: timetable(run=run)) if routes else None)
+        packets = (lambda run: timetable(run=run)) if routes else None
+        if self.library is not None:
+            return Machine(self.library, self.population, packets)
+        return Stepwise(self.population, packets)
 
 
 @part("prepare")

@@ -1,7 +1,7 @@
 """All peers' frames one by one: CasADi's virtual machine moves the peers, NumPy what they hear.
 
 Takes: a `Population`, the packets of its unreliable links.
-Gives: `Stepwise`, `Told`.
+Gives: `Stepwise`.
 Guarantees: any kernel can be played, solvers too; a frame that can't be is told, and those before are kept.
 Does not: run fast: where there is a compiler and every kernel is straight code, see `machine`.
 """
@@ -11,14 +11,14 @@ from __future__ import annotations
 import contextlib
 import io
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.network.timetable import START, Seen
+from apc.network.timetable import Seen
 from apc.simulation.hearing import Arrived, Complete, Deliver, Look, Operation, Source, Weighed
-from apc.simulation.population import Played, Population
+from apc.simulation.population import Memory, Played, Population, Told
 from apc.simulation.program import Member, Segment, seconds_at
 
 Floats = NDArray[np.float64]
@@ -28,15 +28,8 @@ Flags = NDArray[np.bool_]
 JOINS = {"max": np.fmax, "min": np.fmin}
 
 
-class Told(Protocol):
-    """What says which packets the ticks of each route see, as a `Timetable` does; time only goes forward."""
-
-    def take(self, until: int) -> tuple[Seen, ...]:
-        """Return what each route's ticks see, from where the last call ended to before `until`, in quanta."""
-
-
-class Stepwise:
-    """The memory of all peers, and what moves them in it, one run at a time."""
+class Stepwise(Memory):
+    """What moves all peers in their memory, one run at a time."""
 
     def __init__(
         self,
@@ -44,18 +37,16 @@ class Stepwise:
         timetable: Callable[[int], Told] | None,
         moving: Sequence[int] | None = None,
     ) -> None:
-        """Make the memory.
+        """Make it ready.
 
         Parameters
         ----------
-        population
-            All peers.
-        timetable
-            Gives the packets of a run; None if every link is reliable.
+        population, timetable
+            As of `Memory`.
         moving
             The members that are moved, all if not given: those who play the others bring their packets.
         """
-        self.population, self.timetable = population, timetable
+        super().__init__(population, timetable)
         self.moving = tuple(range(len(population.members)) if moving is None else moving)
         self.segments = [[_Moving(m, segment) for segment in m.program.segments] for m in population.members]
         # Of each member the rows of its carry that are the work done, and which parts these are.
@@ -64,16 +55,6 @@ class Stepwise:
             (layout.work, np.array([population.parts.index(part) for part in layout.parts], np.int64))
             for layout in layouts
         ]
-        self.begin(0)
-
-    def begin(self, run: int) -> None:
-        """Go back to time 0 (see `Player`)."""
-        hearing = self.population.hearing
-        self.table = None if self.timetable is None else self.timetable(run)
-        self.packets = np.repeat(hearing.start[None], hearing.ring, axis=0)
-        self.carries = [member.each(member.carry).T for member in self.population.members]
-        self.held = [start.copy() for start in hearing.held]
-        self.effective = [np.full(len(route.pairs), START, np.int64) for route in hearing.routes]
 
     def play(self, first: int, count: int, pushes: Sequence[Floats | None]) -> Played:
         """Play the frames from number `first` on (see `Player`)."""
@@ -81,7 +62,7 @@ class Stepwise:
         rows = np.full((count * marks, population.width), np.nan)
         work = np.zeros((count, len(population.parts)))
         routes = population.hearing.routes
-        taken = self.table.take((first + count) * population.frame) if self.table else ()
+        taken = self.seen_until(first + count)
         # Where a solver gives up CasADi prints its arguments, and then the ones that it was called from.
         with contextlib.redirect_stderr(io.StringIO()), np.errstate(all="ignore"):
             for n in range(count):
@@ -100,11 +81,6 @@ class Stepwise:
                 except RuntimeError:
                     return Played(rows, work, n)
         return Played(rows, work, count)
-
-    def in_range(self) -> bool:
-        """Say whether all that moves is still a number (see `Player`)."""
-        moving = (carry[: done.start] for carry, (done, _) in zip(self.carries, self.work, strict=True))
-        return all(bool(np.isfinite(array).all()) for array in (self.packets, *moving))
 
     def _segment(
         self,
@@ -130,7 +106,7 @@ class Stepwise:
             impulses = np.empty((0, member.count))
             if push is not None:
                 impulses = push[segment.first_impulse :][: moving.impulses, member.rows]
-            self.carries[g], sent, signals = moving.move(self.carries[g], heard[g], impulses, number)
+            self.carries[g][:], sent, signals = moving.move(self.carries[g], heard[g], impulses, number)
             columns = slice(int(hearing.first[g]), int(hearing.first[g + 1]))
             for row, values in zip(segment.sent, sent, strict=True):
                 packets[hearing.sent[g][row], columns] = values
@@ -229,4 +205,4 @@ class _Moving:
         if self._buffer.ret():
             raise RuntimeError("a solver gave up")
         after, sent, rows = self._out
-        return after.copy(), sent, rows
+        return after, sent, rows
