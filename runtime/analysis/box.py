@@ -9,14 +9,10 @@ Does not: prove anything (see `box_proof`).
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from apc.analysis.analysis import lifted_groups
 from apc.compiler.compiled import CompiledSystem, Formula, Group, Parameter
@@ -27,7 +23,7 @@ from apc.compiler.plain import RULES
 from apc.compiler.words import with_unit
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.modes import split
-from apc.eigen.peers import PeerGroup, Runs
+from apc.eigen.peers import PeerGroup
 from apc.eigen.ratios import NotRational, Ratio, Ratios, open_site
 from apc.frame.display_units import Unit
 from apc.frame.exchange import Exchange
@@ -187,15 +183,13 @@ def open_systems(
 class OpenSites:
     """A scene's peers where they are alike only if they are alike all over a box.
 
-    `at` is the scene there, `sites` the matrices of each group by its name, over `Fraction` and `Ratio`, and
-    `vectors` its parameters.
+    `at` is the scene there, `sites` the matrices of each group by its name, over `Fraction` and `Ratio`.
     """
 
     at: CompiledSystem
     groups: tuple[PeerGroup, ...]
     exchange: Exchange
     sites: Mapping[str, LinearSite]
-    vectors: Mapping[str, list[Any]]
 
 
 def open_sites(
@@ -234,32 +228,10 @@ def open_sites(
     ]
     at = apply(system, point)
     groups, exchange = lifted(at)
-    members = [_members(group, exchange.starts) for group in groups]
-    apart = all(len({_reach(opened[place]) for place in member}) == 1 for member in members)
-    assert apart, "peers of different groups are alike at a generic place of the box"
-    vectors = {
-        group.name: _open_vector(group, opened[member[0]])
-        for group, member in zip(groups, members, strict=True)
+    sites = {
+        group.name: _open_site(group, opened[exchange.group_of(group.peers[0])], system) for group in groups
     }
-    sites = {group.name: _open_site(group, vectors[group.name], system) for group in groups}
-    return OpenSites(at, groups, exchange, sites, vectors)
-
-
-def _members(group: PeerGroup, starts: NDArray[np.int64]) -> list[int]:
-    """Return the scene's groups, of which `starts` are the first peers, that peers of a group are of."""
-    if isinstance(group.peers, Runs):
-        ends = [(run.start, run.stop) for run in group.peers.ranges if len(run)]
-        return [
-            place
-            for place, (first, last) in enumerate(itertools.pairwise(starts.tolist()))
-            if any(start < last and stop > first for start, stop in ends)
-        ]
-    return [int(place) for place in np.unique(np.searchsorted(starts, group.peers, side="right") - 1)]
-
-
-def _reach(values: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
-    """Return what of a group's parameters is open, in a form that can be compared."""
-    return tuple((name, f"{item.top}/{item.bottom}") for name, item in sorted(values.items()))
+    return OpenSites(at, groups, exchange, sites)
 
 
 def _opened(system: CompiledSystem, group: Group, ranges: Sequence[Range], field: Ratios) -> dict[str, Ratio]:
@@ -312,15 +284,11 @@ _RULES: dict[str, Callable[..., Any]] = {
 }
 
 
-def _open_vector(group: PeerGroup, opened: Mapping[str, Ratio]) -> list[Any]:
-    """Return a group's parameters, some of them open."""
+def _open_site(group: PeerGroup, opened: Mapping[str, Ratio], system: CompiledSystem) -> LinearSite:
+    """Return a site's matrices, some of its parameters open."""
     kind = group.jacobians.kind
     numbers = exact_numbers(kind, group.parameters)
-    return [opened.get(name, value) for name, value in zip(kind.parameters, numbers, strict=True)]
-
-
-def _open_site(group: PeerGroup, vector: Sequence[Any], system: CompiledSystem) -> LinearSite:
-    """Return a site's matrices over the open parameters."""
+    vector = [opened.get(name, value) for name, value in zip(kind.parameters, numbers, strict=True)]
     try:
         return open_site(group.jacobians, vector)
     except NotRational as reason:

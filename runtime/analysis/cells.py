@@ -53,26 +53,21 @@ DOUBLINGS = 40
 Polynomial = Sequence[tuple[tuple[int, ...], tuple[float, float]]]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Written:
-    """A matrix over the parameters: numbers with their radii (2, n, m), and what quotient an entry is."""
-
-    still: Floats
-    moving: Mapping[tuple[int, ...], int]
+# A quotient of polynomials: numerator and denominator, none where that is 1.
+Quotient = tuple[Polynomial, Polynomial | None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OpenFrames:
     """Sites over the open parameters of a box, ready to be lifted over cells.
 
-    `written` are the sites in floats, `quotients` the numerators and denominators in these, none where this
-    is 1.
+    `quotients` are their entries that depend on these, by their texts, `texts` those of each by its `id`.
     """
 
     sites: tuple[LinearSite, ...]
     schedules: tuple[Schedule, ...]
-    written: tuple[LinearSite, ...]
-    quotients: tuple[tuple[Polynomial, Polynomial | None], ...]
+    texts: Mapping[int, str]
+    quotients: Mapping[str, Quotient]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,28 +130,18 @@ def open_frames(sites: Sequence[LinearSite], schedules: Sequence[Schedule]) -> O
     sites, schedules
         Their matrices, over `Fraction` and `Ratio`, and what happens in their frames.
     """
-    known: dict[str, int] = {}
-    quotients: list[tuple[Polynomial, Polynomial | None]] = []
+    ratios: list[Ratio] = []
 
-    def place_of(ratio: Ratio) -> int:
-        text = f"{ratio.top}/{ratio.bottom}"
-        if text not in known:
-            known[text] = len(quotients)
-            quotients.append(_quotient(ratio))
-        return known[text]
+    def collect(entries: Matrix) -> Matrix:
+        ratios.extend(entry for entry in entries.flat if isinstance(entry, Ratio))
+        return entries
 
-    def written(entries: Matrix) -> Matrix:
-        still, moving = np.zeros((2, *entries.shape)), {}
-        for place, entry in np.ndenumerate(entries):
-            if isinstance(entry, Ratio):
-                moving[place] = place_of(entry)
-            elif entry:
-                still[(slice(2), *place)] = _bounded(Fraction(entry))
-        return np.array(_Written(still, moving), dtype=object)
-
-    alike = {id(site): every_matrix(site, written) for site in sites}
-    written_sites = tuple(alike[id(site)] for site in sites)
-    return OpenFrames(tuple(sites), tuple(schedules), written_sites, tuple(quotients))
+    for site in {id(site): site for site in sites}.values():
+        every_matrix(site, collect)
+    texts = {id(ratio): f"{ratio.top}/{ratio.bottom}" for ratio in ratios}
+    different = {texts[id(ratio)]: ratio for ratio in ratios}
+    quotients = {text: _quotient(ratio) for text, ratio in different.items()}
+    return OpenFrames(tuple(sites), tuple(schedules), texts, quotients)
 
 
 def contracted(matrix: Matrix) -> Contraction:
@@ -300,19 +285,22 @@ def frames_over(asked: OpenFrames, cells: Sequence[Cell]) -> list[FrameMap]:
     parameters = _parameters(cells, wide=wide)
     count = len(parameters) if wide else 0
     numbers = taylor(count)
-    values = [_value(quotient, parameters, numbers) for quotient in asked.quotients]
+    values = {
+        text: _value(quotient, parameters, numbers)[..., 0, 0] for text, quotient in asked.quotients.items()
+    }
 
-    def over(written: Matrix) -> Matrix:
-        item: _Written = written.item()
-        result = np.empty((len(cells), 2 + count, *item.still.shape[1:]))
-        result[:] = within(item.still, count)
-        for (row, column), place in item.moving.items():
-            result[..., row, column] = values[place][..., 0, 0]
+    def over(entries: Matrix) -> Matrix:
+        result = np.zeros((len(cells), 2 + count, *entries.shape))
+        for (row, column), entry in np.ndenumerate(entries):
+            if isinstance(entry, Ratio):
+                result[..., row, column] = values[asked.texts[id(entry)]]
+            elif entry:
+                result[:, :2, row, column] = _bounded(Fraction(entry))
         return result
 
     known: dict[tuple[int, int], FrameMap] = {}
     maps = []
-    for site, schedule in zip(asked.written, asked.schedules, strict=True):
+    for site, schedule in zip(asked.sites, asked.schedules, strict=True):
         key = id(site), id(schedule)
         if key not in known:
             linear_site = every_matrix(site, over)
@@ -347,7 +335,7 @@ def _bounded(number: Fraction) -> tuple[float, float]:
         return np.inf, np.inf
 
 
-def _quotient(ratio: Ratio) -> tuple[Polynomial, Polynomial | None]:
+def _quotient(ratio: Ratio) -> Quotient:
     """Return a quotient as numerator and denominator, none where it is 1."""
     over = _fraction(ratio.bottom.leading_coefficient())
     top, bottom = (
@@ -364,9 +352,7 @@ def _fraction(number: Any) -> Fraction:
     return Fraction(int(number.p), int(number.q))
 
 
-def _value(
-    quotient: tuple[Polynomial, Polynomial | None], parameters: Sequence[Matrix], numbers: Arithmetic
-) -> Matrix:
+def _value(quotient: Quotient, parameters: Sequence[Matrix], numbers: Arithmetic) -> Matrix:
     """Return a quotient over cells (k, 2 + m, 1, 1)."""
     top = _polynomial(quotient[0], parameters, numbers)
     if quotient[1] is None:
