@@ -158,7 +158,7 @@ def answer(
         notes = (*notes, compared.not_repeated)
     moved = sensitivities_of(system, prepared, analysis)
     nominal = _margins(system, prepared, analysis, wanted=margins)
-    buzz, no_buzz = _buzz(system, prepared, modes) if with_buzz else (None, "")
+    buzz, no_buzz = _buzz(system, prepared) if with_buzz else (None, "")
     return Answer(
         analysis=replace(analysis, notes=(*analysis.notes, *notes)),
         network=_over_network(system, prepared, analysis, nominal, certify=certify, wanted=margins),
@@ -208,12 +208,12 @@ def _switching(system: CompiledSystem, prepared: Prepared, modes: ContactModes) 
     return switching(system, modes, prepared=prepared)
 
 
-def _buzz(system: CompiledSystem, prepared: Prepared, modes: ContactModes | None) -> tuple[Buzz | None, str]:
+def _buzz(system: CompiledSystem, prepared: Prepared) -> tuple[Buzz | None, str]:
     """Return the buzz of contacts, or why there is none; imported here, as few analyses ask for it."""
     from apc.simulation.buzz import buzz
 
     try:
-        return buzz(system, prepared=prepared, modes=modes), ""
+        return buzz(system, prepared=prepared), ""
     except ApcError as error:
         return None, error.mistakes[0].reason
 

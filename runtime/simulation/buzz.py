@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import find_peaks
 
-from apc.analysis.contact_modes import EVERYONE, ContactModes, contact_modes
 from apc.analysis.describing import Predicted, predict
 from apc.analysis.opened import contact_groups
 from apc.analysis.pushes import Push
@@ -36,9 +35,9 @@ from apc.simulation.trajectory import Trajectory, simulate
 
 Floats = NDArray[np.float64]
 
-# How long is played: so many times as the swing with contacts closed takes to grow or shrink by e, within
-# these seconds; and the part of it, at the end, that is measured.
-GROWTHS, SHORTEST, LONGEST, MEASURED = 40, 8.0, 80.0, 4
+# How long is played, in seconds, unless peers are too many for more than the least; and the part of it, at
+# the end, that is measured.
+SHORTEST, LONGEST, MEASURED = 8, 80, 4
 
 # Below this share of the time nothing touches; from this far on, relatively, frequencies are far apart.
 TOUCHED, APART = 1e-3, 0.2
@@ -124,9 +123,7 @@ class _Measured:
 
 
 @part("buzz")
-def buzz(
-    system: CompiledSystem, *, prepared: Prepared | None = None, modes: ContactModes | None = None
-) -> Buzz:
+def buzz(system: CompiledSystem, *, prepared: Prepared | None = None) -> Buzz:
     """Predict the buzz of a scene's one-sided contacts, and play it.
 
     Parameters
@@ -135,16 +132,13 @@ def buzz(
         The compiled scene, with the numbers to analyse.
     prepared
         From `instance.prepare`, of this system with these timings.
-    modes
-        Its modes of contact, if they are known.
 
     Raises
     ------
     ApcError
         E864 no contact that pushes from tick to tick and never pulls; and those of `trajectory.simulate`.
     """
-    prepared = prepared or prepare(system)
-    groups = contact_groups(system, prepared)
+    groups = contact_groups(system, prepared or prepare(system))
     if isinstance(groups, str):
         raise _refused(system, groups)
     if not any(pushes for _, pushes in groups):
@@ -155,7 +149,7 @@ def buzz(
                 raise _refused(system, f"{push.part} pulls, too, or is limited")
     measured = _contacts(system, groups)
     predicted = predict(system, groups)
-    seconds = _seconds(system, prepared, modes)
+    seconds = _seconds(system)
     names = [item.name for item in measured] + [state for item in measured for state in item.states]
     played = simulate(system, duration=seconds, signals=tuple(dict.fromkeys(names)))
     result = _compare(system.name, predicted, played, measured)
@@ -164,19 +158,14 @@ def buzz(
     return replace(result, notes=(*result.notes, BY_CHANCE))
 
 
-def _seconds(system: CompiledSystem, prepared: Prepared, modes: ContactModes | None) -> Fraction:
+def _seconds(system: CompiledSystem) -> Fraction:
     """Return how long to play: until the swing has come to what it is, if that can be waited for."""
-    modes = modes or contact_modes(system, prepared=prepared)
-    radius = next((mode.spectral_radius for mode in modes.modes if mode.name == EVERYONE), 1.0)
-    frame = float(prepared.schedules[0].frame_s)
-    rate = abs(math.log(radius)) / frame if 0 < radius < math.inf else 0.0
-    wanted = min(max(GROWTHS / rate if rate else math.inf, SHORTEST), LONGEST)
     timings = {timing.name: timing.value for timing in system.timings}
-    tick = min(float(timings[clock.period]) for clock in system.clocks)
-    most = MOST_PLAYED * tick / system.peers
+    tick = min(timings[clock.period] for clock in system.clocks)
+    most = math.floor(MOST_PLAYED * tick / system.peers)
     if most < SHORTEST:
-        raise _refused(system, f"{system.peers:,} peers are too many to play for {SHORTEST:g} s")
-    return Fraction(math.floor(min(wanted, most)))
+        raise _refused(system, f"{system.peers:,} peers are too many to play for {SHORTEST} s")
+    return Fraction(min(most, LONGEST))
 
 
 def _refused(system: CompiledSystem, why: str) -> ApcError:

@@ -2,8 +2,7 @@
 
 Takes: a `Kind` and parameter vectors.
 Gives: `Rates`, `rates`, `transition_rows`, `perturbed`; `exact_rates`; `nonlinear_rows`.
-Guarantees: no step size; every entry of a transition is right to the last digit but one, of many different
-sites to some tens of roundings of the largest.
+Guarantees: no step size; every entry of a transition is right to the last digit but one.
 Does not: integrate what is not linear (see `flow`), or know what changes with time alone (see `forcing`).
 
     dx/dt = A x + B u + g(t)        x(t + T) = E x(t) + F u + c,  u held
@@ -23,15 +22,10 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import Kind
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.interpolation import jacobian
-from apc.frame.discretize import UNIT, discretize, exponential_rows
+from apc.frame.discretize import discretize
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import guards_of, structural_pattern
 from apc.frame.parameters import exact_numbers
-
-# Different sites whose transitions are computed one by one, exactly, in half a millisecond each.
-MOST_EXACT = 100
-# The largest part of a transition that one of many may be off by: some tens of roundings.
-CLOSE = 1e-14
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -152,9 +146,8 @@ def exact_rates(rates_of: Rates, parameters: Floats) -> NDArray[Any]:
 def transition_rows(rates_of: Rates, vectors: Floats, durations: Sequence[Fraction]) -> tuple[Floats, ...]:
     """Return what many sites do in every duration, [E F c] (sites, n_x, n_x + n_u + 1) each.
 
-    Sites that differ in nothing the continuous equations read share a transition. More than `MOST_EXACT`
-    different ones are stepped in floats, all at once, but for those whose bound says that this is less exact
-    than `CLOSE`.
+    Sites that differ in nothing the continuous equations read share a transition: each takes half a
+    millisecond.
 
     Parameters
     ----------
@@ -174,18 +167,9 @@ def transition_rows(rates_of: Rates, vectors: Floats, durations: Sequence[Fracti
     flat = np.asarray(rates_of.matrices.map(len(vectors))(vectors.T), np.float64).T
     one_column_at_least = np.hstack([flat, np.zeros((len(flat), 1))])
     _, first, which = np.unique(one_column_at_least, axis=0, return_index=True, return_inverse=True)
-    exactly = np.ones(len(first), np.bool_)
     result = [np.empty((len(first), n_x, width)) for _ in durations]
-    if len(first) > MOST_EXACT:
-        whole = flat[first].reshape(len(first), width, n_x).swapaxes(1, 2)
-        exactly[:] = False
-        for matrix, duration in zip(result, durations, strict=True):
-            step = exponential_rows(whole[:, :, :n_x], whole[:, :, n_x:], float(duration))
-            matrix[:] = step.matrix
-            error, size = step.roundings * UNIT * step.size, np.abs(matrix)
-            exactly |= ~(error <= CLOSE * size.max(axis=(1, 2), keepdims=True)).all(axis=(1, 2))
-    for place in np.flatnonzero(exactly).tolist():
-        whole = exact_rates(rates_of, vectors[first[place]])
+    for place, row in enumerate(first.tolist()):
+        whole = exact_rates(rates_of, vectors[row])
         for matrix, step in zip(result, discretize(whole[:, :n_x], whole[:, n_x:], durations), strict=True):
             matrix[place] = step.matrix
     return tuple(matrix[which.reshape(-1)] for matrix in result)

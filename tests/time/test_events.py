@@ -15,7 +15,6 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.pipeline import compile_topology
 from apc.frame.overrides import apply, parse_override
 from apc.simulation.native import compiler
-from apc.simulation.propagate import MOST_EXACT
 from apc.simulation.rows_in_time import blocks
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare
@@ -160,8 +159,8 @@ def test_what_diverges_is_kept_while_it_is_finite() -> None:
 
 
 def test_many_different_peers_move_as_each_by_itself() -> None:
-    """Masses over nine decades: where a motion dies out at once, floats are not enough, and are not used."""
-    masses = np.geomspace(1e-6, 1e3, 3 * MOST_EXACT)
+    """Masses over nine decades: where a motion dies out at once, floats would not be enough."""
+    masses = np.geomspace(1e-6, 1e3, 300)
     listed = ", ".join(f"{float(mass)!r} kg" for mass in masses)
     own = f"{{count: {len(masses)}, set: {{device.v: 1 m/s, device.mass: [{listed}]}}}}"
     text = replaced(ONE_MASS, ("{count: 1}", own)) + "clocks: {haptic: 7 ms}\n"
