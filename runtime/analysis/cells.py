@@ -29,12 +29,12 @@ from apc.eigen.matrix_norms import balance, norms
 from apc.eigen.ratios import Ratio
 from apc.eigen.relative import Relative, relative, relative_coordinates, with_doubt
 from apc.eigen.rigid import RigidModes
-from apc.frame.discretize import UNIT
+from apc.frame.discretize import exponential
 from apc.frame.lift import FrameMap, compose, step_durations
-from apc.frame.radius import Arithmetic, radius_of, value_of
+from apc.frame.radius import UNIT, Arithmetic, radius_of, value_of
 from apc.frame.schedule import Schedule
 from apc.frame.site import LinearSite, every_matrix
-from apc.frame.taylor import reciprocal, step_over, taylor, within
+from apc.frame.taylor import reciprocal, taylor, within
 
 Floats = NDArray[np.float64]
 Truths = NDArray[np.bool_]
@@ -305,7 +305,7 @@ def frames_over(asked: OpenFrames, cells: Sequence[Cell]) -> list[FrameMap]:
         if key not in known:
             linear_site = every_matrix(site, over)
             steps = {
-                number: step_over(linear_site.a, linear_site.b, float(number * schedule.quantum))
+                number: exponential(linear_site.a, linear_site.b, float(number * schedule.quantum), numbers)
                 for number in step_durations(schedule)
             }
             known[key] = compose(linear_site, schedule, steps, numbers=numbers)

@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 
 from apc.analysis.opened import Matrix, OpenLoop
 from apc.eigen.dissipation import least_real, proves_positive
-from apc.frame.discretize import UNIT
-from apc.frame.radius import RADII, radius_of, value_of
+from apc.frame.radius import RADII, UNIT, radius_of, value_of
 
 Floats = NDArray[np.float64]
 

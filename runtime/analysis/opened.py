@@ -34,7 +34,7 @@ from apc.eigen.modes import loops_at_right_angles
 from apc.eigen.peers import PeerGroup, peer_groups
 from apc.eigen.relative import relative_coordinates, relative_rows, with_doubt
 from apc.eigen.rigid import find_rigid_modes
-from apc.frame.discretize import UNIT, discretize
+from apc.frame.discretize import discretize
 from apc.frame.exchange import build_exchange
 from apc.frame.instance import Prepared, instance
 from apc.frame.lift import FrameMap, compose, step_durations, with_roundings
@@ -197,10 +197,6 @@ def _cut_open(group: PeerGroup, pushes: Sequence[Push]) -> Opened:
     schedule, bare = group.schedule, with_gain(group, pushes, Fraction(0))
     steps = step_durations(schedule)
     result = discretize(bare.exact.a, bare.exact.b, [step * schedule.quantum for step in steps])
-    off = {
-        step: with_radius(item.matrix, item.roundings * UNIT * item.size)
-        for step, item in zip(steps, result, strict=True)
-    }
     ticks: list[tuple[str, int]] = []
     slopes = []
     for push in pushes:
@@ -208,7 +204,7 @@ def _cut_open(group: PeerGroup, pushes: Sequence[Push]) -> Opened:
         ticks += [(push.part, index) for index in range(count)]
         slopes += [group.exact.ticks[push.partition].x[push.output]] * count
     wide, whole = with_cuts(group.site, schedule, [(push.partition, push.output) for push in pushes])
-    wide_map = compose(with_roundings(wide), whole, off, numbers=RADII)
+    wide_map = compose(with_roundings(wide), whole, dict(zip(steps, result, strict=True)), numbers=RADII)
     followed = np.array(slopes, dtype=object).reshape(len(ticks), len(bare.exact.a))
     plain = not any(push.slopes[push.states :].any() for push in pushes)
     jumps = next((push.part for push in pushes if push.sector), "")

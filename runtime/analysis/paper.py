@@ -46,7 +46,7 @@ from apc.eigen.peers import PeerGroup
 from apc.eigen.relative import relative_bounded, relative_coordinates, relative_places
 from apc.eigen.rigid import RigidModes, find_rigid_modes, what_stands
 from apc.eigen.spectrum import STABLE, Spectrum, solve_spectrum, up_to
-from apc.frame.discretize import UNIT, discretize
+from apc.frame.discretize import discretize
 from apc.frame.finite_equations import finite_equations
 from apc.frame.lift import FrameMap
 from apc.frame.radius import RADII, radius_of, rounded, value_of, with_radius
@@ -319,8 +319,8 @@ def _open_loop(system: CompiledSystem, whole: ClosedSystem) -> _OpenLoop:
         heard=tuple(heard.values()),
         ab=side_by_side(np.hstack([site.site.a, site.site.b]) for site in sites),
         step=with_radius(
-            side_by_side(step.matrix for step in steps),
-            side_by_side(step.roundings * UNIT * step.size for step in steps),
+            side_by_side(value_of(step) for step in steps),
+            side_by_side(radius_of(step) for step in steps),
         ),
     )
 

@@ -31,9 +31,9 @@ from apc.compiler.compiled import Column, CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.words import with_unit
 from apc.distribution import versions
-from apc.frame.discretize import UNIT
 from apc.frame.jacobians import jacobians
 from apc.frame.parameters import resolve
+from apc.frame.radius import UNIT
 from apc.result import Result
 from apc.simulation.flow import state_scales
 from apc.simulation.rows_in_time import blocks

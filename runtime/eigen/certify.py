@@ -28,7 +28,7 @@ from apc.eigen.eigenpairs import components
 from apc.eigen.enclosure import discs
 from apc.eigen.relative import independent_places
 from apc.eigen.rigid import RigidModes, find_rigid_modes
-from apc.frame.discretize import UNIT
+from apc.frame.radius import UNIT
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]

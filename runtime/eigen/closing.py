@@ -23,9 +23,8 @@ from numpy.typing import NDArray
 
 from apc.eigen.graph_modes import Surd
 from apc.eigen.peers import PeerGroup, states_of
-from apc.frame.discretize import UNIT
 from apc.frame.lift import FrameMap
-from apc.frame.radius import FLOATS, RADII, Arithmetic, common_shape, radius_of, value_of
+from apc.frame.radius import FLOATS, RADII, UNIT, Arithmetic, common_shape, radius_of, value_of
 from apc.frame.schedule import Schedule, Way
 
 Floats = NDArray[np.float64]

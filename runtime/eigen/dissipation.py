@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.frame.discretize import UNIT
-from apc.frame.radius import RADII, radius_of, value_of
+from apc.frame.radius import RADII, UNIT, radius_of, value_of
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from apc.eigen.eigenpairs import Eigenpairs, components, eigenpairs, inverses
 from apc.eigen.matrix_norms import PRODUCT_ROUNDINGS, balance, norms
-from apc.frame.discretize import UNIT
+from apc.frame.radius import UNIT
 from apc.threads import load_pool
 
 Floats = NDArray[np.float64]

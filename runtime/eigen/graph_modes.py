@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import Graph
 from apc.compiler.weights import exact_weight, sum_weights
 from apc.eigen.null_space import null_space
-from apc.frame.discretize import UNIT
 from apc.frame.exchange import arcs
+from apc.frame.radius import UNIT
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.frame.discretize import UNIT
+from apc.frame.radius import UNIT
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]  # float64 or complex128

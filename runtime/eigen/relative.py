@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.matrix_norms import PRODUCT_ROUNDINGS
-from apc.frame.discretize import UNIT
-from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, with_radius
+from apc.frame.radius import FLOATS, RADII, UNIT, Arithmetic, radius_of, value_of, with_radius
 from apc.threads import load_pool
 
 Floats = NDArray[np.float64]

@@ -28,7 +28,7 @@ from apc.eigen.enclosure import SMALL, WIDE, Enclosure, descending, discs, enclo
 from apc.eigen.relative import Relative, relative_bounded, relative_coordinates
 from apc.eigen.rigid import RigidModes, find_rigid_modes, rigid_modes_of
 from apc.frame.course import turns
-from apc.frame.discretize import UNIT
+from apc.frame.radius import UNIT
 from apc.frame.schedule import Propagate
 from apc.frame.site import every_matrix
 from apc.later import Later

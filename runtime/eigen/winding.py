@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.matrix_norms import PRODUCT_ROUNDINGS
-from apc.frame.discretize import UNIT
+from apc.frame.radius import UNIT
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]

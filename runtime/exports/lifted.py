@@ -46,7 +46,7 @@ from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, prepare
 from apc.frame.lift import MOST_PACKETS, FrameMap, check_packets, compose, step_durations
 from apc.frame.ports import OUTSIDE, with_cuts, with_holds, with_ports
-from apc.frame.radius import FLOATS, RADII, Arithmetic
+from apc.frame.radius import FLOATS, RADII, Arithmetic, value_of
 from apc.frame.schedule import Heard, Schedule, Tick, Value
 from apc.frame.site import LinearSite
 from apc.memory import refuse_beyond
@@ -145,7 +145,7 @@ def steps_in_floats(
     for place, push in enumerate(forces):
         columns[list(push.velocities), place] = push.inverses
     steps = discretize(group.exact.a, np.concatenate([group.exact.b, columns], axis=1), durations)
-    return [step.matrix for step in steps]
+    return [value_of(step) for step in steps]
 
 
 IN_FLOATS = Numbers(

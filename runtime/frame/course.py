@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.frame.discretize import exponential_values
+from apc.frame.discretize import exponential
 from apc.frame.lift import follow
 from apc.frame.radius import FLOATS
 from apc.frame.schedule import Propagate, Schedule, Value
@@ -157,7 +157,7 @@ def _courses(
     below = np.eye(n)[n_x:]
     steps, fine = {}, {}
     for duration, number in points.items():
-        step = exponential_values(site.a, site.b, float(duration * schedule.quantum) / number)
+        step = exponential(site.a, site.b, float(duration * schedule.quantum) / number)
         power = np.concatenate([step, np.broadcast_to(below, (len(step), *below.shape))], axis=1)
         fine[duration], steps[duration] = _followed(power, np.minimum(states, n_x - 1), number)
     one_site = _of_one(site)

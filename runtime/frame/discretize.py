@@ -1,8 +1,7 @@
 """What a linear system does in a while: the exact matrix exponential, inputs held.
 
 Takes: the matrices of dx/dt = A x + B u, exact, or of many sites at once in floats.
-Gives: `Step`, `discretize`, `moved_together`, `refuse_many`; in floats, `exponential`, `exponential_rows`,
-`step_rows`, `exponential_values`; `step_balls`.
+Gives: `discretize`, `moved_together`, `refuse_many`; `exponential`, in any numbers; `step_balls`.
 Guarantees: every entry of `discretize` is right to the last digit but one, proved by ball arithmetic, whether
 a mode dies out in a nanosecond or never; where many states move together and it is off by no more than
 composing it rounds, it is had in floats. Every step comes with a bound.
@@ -18,9 +17,7 @@ precision loses log₂(bT/m) bits where the mass is tiny. Arb's exponential (Joh
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
@@ -28,13 +25,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.frame.radius import FLOATS, RADII, UNIT, Arithmetic, radius_of, rounded, value_of, with_radius
 from apc.threads import load_pool
 
 Floats = NDArray[np.float64]
-Matrix = NDArray[Any]  # float64 or complex128
+Matrix = NDArray[Any]
 Integers = NDArray[np.int64]
-
-UNIT = float(np.finfo(np.float64).eps) / 2  # the unit roundoff of double precision
 
 # Bits tried in turn. A mode that dies out within T at rate a needs about 53 + 2·log₂(aT) of them.
 PRECISIONS = (128, 256, 512, 1024, 2048)
@@ -54,21 +50,13 @@ DOUBTFUL = 1e4
 # Inputs beside fewer states: each is a row more of the exponential.
 FEWEST_INPUTS = 8
 
-# Steps of sites that are remembered, and of how many entries in all, A's and B's for each duration.
-KEPT, FEW_ENTRIES = 128, 1 << 14
-
 # Rounding errors charged to every coefficient a site's functions give, in units of UNIT: CasADi evaluates
 # short polynomials of the parameters, a few roundings an entry.
 COEFFICIENT_ROUNDINGS = 8
 
-# With ‖X‖ ≤ 1/2 the Taylor series of φ₁ is right to 2^−64 after so many terms: (1/2)^17/17! is less than
-# 2^−64, with all that follows.
-TERMS = 16
-LEFT_OUT = 2.0**-64
-
-# What a number below the range of floats may be off by when it is rounded to zero, in units of UNIT.
-UNDERFLOW = float(np.finfo(np.float64).tiny) / UNIT
-
+# With ‖X‖ ≤ 1/2 the Taylor series of φ₁ is cut off after so many terms. The factor I + X/18 + … by which the
+# last is off, with all that follows, differs from I by less than this. No more squarings are of use.
+TERMS, LAST, MOST_SQUARINGS = 16, 2.0**-5, 64
 
 TOO_LARGE = (
     "one frame of this scene leaves the range of floating point numbers: "
@@ -76,20 +64,8 @@ TOO_LARGE = (
 )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Step:
-    """[F G] of one duration (n_x, n_x + n_u), or of many sites (k, …); real or complex.
-
-    The true entries lie within `roundings` · UNIT · `size` of `matrix`.
-    """
-
-    matrix: NDArray[Any]
-    size: Floats
-    roundings: float = 1.0
-
-
-def discretize(a: NDArray[Any], b: NDArray[Any], durations: Sequence[Fraction]) -> tuple[Step, ...]:
-    """Return the step of every duration.
+def discretize(a: Matrix, b: Matrix, durations: Sequence[Fraction]) -> tuple[Matrix, ...]:
+    """Return [F G] of every duration, with its radii (…, 2, n_x, n_x + n_u).
 
     Parameters
     ----------
@@ -105,37 +81,18 @@ def discretize(a: NDArray[Any], b: NDArray[Any], durations: Sequence[Fraction]) 
         E806 an entry of the exponential is too large for a float: something grows without measure within T;
         E812 too many states, or too many that move together.
     """
-    if a.ndim > 2:
-        return tuple(step_rows(a, b, float(duration)) for duration in durations)
-    if len(durations) * (a.size + b.size) > FEW_ENTRIES:
-        return _discretized(a, b, durations)
-    entries = (*a.ravel().tolist(), *b.ravel().tolist())
-    return _known_steps(entries, a.shape, b.shape, tuple(durations))
-
-
-@functools.lru_cache(maxsize=KEPT)
-def _known_steps(
-    entries: tuple[Any, ...], of_a: tuple[int, int], of_b: tuple[int, int], durations: tuple[Fraction, ...]
-) -> tuple[Step, ...]:
-    """Return `discretize` of few entries, row by row: what only couplers and links change is remembered."""
-    whole = np.array([*entries, None])[:-1]  # of objects, also where there are no entries
-    split = of_a[0] * of_a[1]
-    return _discretized(whole[:split].reshape(of_a), whole[split:].reshape(of_b), durations)
-
-
-def _discretized(a: NDArray[Any], b: NDArray[Any], durations: Sequence[Fraction]) -> tuple[Step, ...]:
-    """Return `discretize`, computed."""
-    n_x = len(a)
-    matrices = np.zeros((len(durations), n_x, n_x + b.shape[1]))
-    sizes = np.full(matrices.shape, UNDERFLOW)
-    roundings = 1.0
-    for states, inputs in _pieces(a, b):
-        places = np.ix_(states, np.concatenate([states, n_x + inputs]))
-        steps = _steps(a[np.ix_(states, states)], b[np.ix_(states, inputs)], durations)
-        for matrix, size, step in zip(matrices, sizes, steps, strict=True):
-            matrix[places], size[places] = step.matrix, step.size
-            roundings = max(roundings, step.roundings)
-    return tuple(Step(*pair, roundings) for pair in zip(matrices, sizes, strict=True))
+    *many, n_x, n_u = b.shape
+    steps = np.zeros((len(durations), *many, 2, n_x, n_x + n_u))
+    radius_of(steps)[...] = np.finfo(np.float64).tiny
+    sites = tuple(range(len(many)))
+    filled = (np.asarray(matrix.astype(np.bool_).any(axis=sites)) for matrix in (a, b))
+    for states, inputs in _pieces(*filled):
+        moved, pushed = a[..., states[:, None], states], b[..., states[:, None], inputs]
+        exponentiate = _in_floats if many else _steps
+        places = states[:, None], np.concatenate([states, n_x + inputs])
+        for step, piece in zip(steps, exponentiate(moved, pushed, durations), strict=True):
+            step[..., *places] = piece
+    return tuple(steps)
 
 
 def refuse_many(states: int, place: Place) -> None:
@@ -145,7 +102,7 @@ def refuse_many(states: int, place: Place) -> None:
         raise ApcError(Mistake("E812", place, what, hint="smaller arrays, as count: 100"))
 
 
-def _pieces(a: NDArray[Any], b: NDArray[Any]) -> Iterator[tuple[Integers, Integers]]:
+def _pieces(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> Iterator[tuple[Integers, Integers]]:
     """Yield states that move together with a few of the inputs that move them, until all are had.
 
     What moves by itself has an exponential of its own, and so has each input's column of G: an array of a
@@ -158,13 +115,21 @@ def _pieces(a: NDArray[Any], b: NDArray[Any]) -> Iterator[tuple[Integers, Intege
     """
     refuse_many(len(a), Place("the scene"))
     for states in moved_together(a):
-        inputs = np.flatnonzero(b[states].astype(np.bool_).any(axis=0))
+        inputs = np.flatnonzero(b[states].any(axis=0))
         step = max(len(states), FEWEST_INPUTS)
         for begin in range(0, max(len(inputs), 1), step):
             yield states, inputs[begin : begin + step]
 
 
-def _steps(a: NDArray[Any], b: NDArray[Any], durations: Sequence[Fraction]) -> list[Step]:
+def _in_floats(a: Floats, b: Floats, durations: Sequence[Fraction]) -> Iterator[Matrix]:
+    """Yield the steps of many sites; what all of them have in common is exponentiated once."""
+    some = slice(1 if all((values == values[:1]).all() for values in (a, b)) else len(a))
+    a, b = (rounded(values[some], COEFFICIENT_ROUNDINGS) for values in (a, b))
+    for duration in durations:
+        yield exponential(a, b, float(duration), RADII)
+
+
+def _steps(a: Matrix, b: Matrix, durations: Sequence[Fraction]) -> list[Matrix]:
     """Return the steps of states that move together: in floats where they are many, else in balls.
 
     Raises
@@ -173,7 +138,7 @@ def _steps(a: NDArray[Any], b: NDArray[Any], durations: Sequence[Fraction]) -> l
         E806 as `discretize`; E812 too many for balls where floats say too little.
     """
     if len(a) > FEW_TOGETHER:
-        steps = _balanced_steps(_floats(a), _floats(b), durations)
+        steps = _balanced_steps(a.astype(np.float64), b.astype(np.float64), durations)
         if steps is not None:
             return steps
         if len(a) > MOST_TOGETHER:
@@ -187,184 +152,65 @@ def _steps(a: NDArray[Any], b: NDArray[Any], durations: Sequence[Fraction]) -> l
     return [_step(generator * _rational(duration), len(a)) for duration in durations]
 
 
-def _balanced_steps(a: Floats, b: Floats, durations: Sequence[Fraction]) -> list[Step] | None:
-    """Return the steps in floats; None where one may be off by much more than composing it rounds."""
-    allowed = 2.0 if len(a) <= MOST_TOGETHER else DOUBTFUL
-    steps = []
-    for duration in durations:
-        with np.errstate(all="ignore"):
-            step, units = exponential(a, b, float(duration), rounded=3)
-            matrix, size = step.matrix, step.size
-            largest = np.abs(matrix).max()
-            if not size.max() <= allowed * largest < np.inf:
-                return None
-            steps.append(Step(units * matrix, units * size + UNDERFLOW, step.roundings))
-    return steps
-
-
-def exponential(
-    a: Floats, b: Floats, seconds: float, *, rounded: int = 2 * COEFFICIENT_ROUNDINGS
-) -> tuple[Step, Floats]:
-    """Return [F G] of one site as `exponential_rows`, in units of its own, and what these are of it (n_x, n).
-
-    Parameters
-    ----------
-    a, b
-        A (n_x, n_x) and B (n_x, n_u).
-    seconds, rounded
-        As for `exponential_rows`.
+def _balanced_steps(a: Floats, b: Floats, durations: Sequence[Fraction]) -> list[Matrix] | None:
+    """Return the steps in floats; None where one may be off by much more than composing it rounds.
 
     Notes
     -----
     In units in which the rows of a large A are as large as its columns, powers of 2 of those given, its
     exponential takes the fewest squarings, and the largest of it says how far any of it may be off.
     """
-    units = np.ones(len(a))
-    if len(a) > FEW_TOGETHER:
-        a, (units, _) = load_pool("scipy.linalg").matrix_balance(a, permute=False, separate=True)
-    step = exponential_rows(a[None], b[None] / units[:, None], seconds, rounded=rounded)
+    allowed = 2.0 if len(a) <= MOST_TOGETHER else DOUBTFUL
+    a, (units, _) = load_pool("scipy.linalg").matrix_balance(a, permute=False, separate=True)
     whole = units[:, None] / np.concatenate([units, np.ones(b.shape[1])])
-    return Step(step.matrix[0], step.size[0], step.roundings), whole
+    a, b = rounded(a), rounded(b / units[:, None])
+    steps = []
+    for duration in durations:
+        with np.errstate(all="ignore"):
+            step = exponential(a, b, float(duration), RADII)
+            size = np.abs(value_of(step)).max()
+            if not radius_of(step).max() <= allowed * step.shape[-1] * UNIT * size < np.inf:
+                return None
+            steps.append(whole * step)
+    return steps
 
 
-def step_rows(a: Floats, b: Floats, seconds: float) -> Step:
-    """Return `exponential_rows` of many sites, states that move together in any of them by themselves.
-
-    What all sites have in common, as copies of one object have, is exponentiated once; and how fast one
-    object's motion dies out does not make the series of another's longer.
-
-    Parameters
-    ----------
-    a, b
-        A (k, n_x, n_x) and B (k, n_x, n_u).
-    seconds
-        T.
-    """
-    sites, n_x, n_u = b.shape
-    matrix = np.zeros((sites, n_x, n_x + n_u))
-    size, roundings = np.full(matrix.shape, UNDERFLOW), 1.0
-    for states, inputs in _pieces(np.asarray(a.any(axis=0)), np.asarray(b.any(axis=0))):
-        own, pushed = a[:, states[:, None], states], b[:, states[:, None], inputs]
-        some = slice(1 if all((values == values[:1]).all() for values in (own, pushed)) else sites)
-        step = exponential_rows(own[some], pushed[some], seconds)
-        places = slice(None), states[:, None], np.concatenate([states, n_x + inputs])
-        matrix[places], size[places] = step.matrix, step.size
-        roundings = max(roundings, step.roundings)
-    return Step(matrix, size, roundings)
-
-
-def exponential_rows(
-    a: Matrix, b: Matrix, seconds: float, *, rounded: int = 2 * COEFFICIENT_ROUNDINGS
-) -> Step:
-    """Return exp of many generators by scaling and squaring, x(t + T) = F x(t) + G u.
+def exponential(a: Matrix, b: Matrix, seconds: float | Matrix, numbers: Arithmetic = FLOATS) -> Matrix:
+    """Return [F G] (…, n_x, n_x + n_u) of matrices of any numbers, x(t + T) = F x(t) + G u.
 
     Parameters
     ----------
     a, b
-        A (k, n_x, n_x) and B (k, n_x, n_u), float64 or complex128.
+        A (…, n_x, n_x) and B (…, n_x, n_u), in `numbers`.
     seconds
-        T.
-    rounded
-        How many roundings each entry of A T and B T may be off by, those of T and of the product included.
-
-    Returns
-    -------
-    The steps of all of them, [F G] (k, n_x, n_x + n_u).
+        T, a float that is off by one rounding; in floats one for each matrix, too.
+    numbers
+        What the matrices are of: floats, real or complex, with their radii, or over cells.
 
     Notes
     -----
-    With X = A T/2^s, ‖X‖ ≤ 1/2, and Y = φ₁(X) by Horner's rule, F = I + X Y and G = Y B T/2^s; then
-    s times F ← F², G ← F G + G. A sum rounds as often as it has terms that are not zero, n of them. X^j has
-    then been rounded less than j (n + 4) times, and G's X^j B (j + 1)(n + 4) times; over all j these make
-    n + 4 roundings of |X| e^|X| and of e^|X| |B|, and F one more where I is added. What the series leaves out
-    is less than 2^−64 of the largest, which counts where more states stand in a row than it has terms.
+    By scaling and squaring: with X = A T/2^s, ‖X‖ ≤ 1/2, and Y = φ₁(X) by Horner's rule, E = F − I = X Y and
+    G = Y B T/2^s; then s times E ← 2 E + E² and G ← 2 G + E G. What is slow beside what is fast so keeps the
+    digits that 1 would take from it with each squaring. What the series leaves out is as if its last factor,
+    I + X/18 + …, were off by less than `LAST` where states move one another.
     """
-    n_x, n_u = b.shape[-2:]
-    x, g, steps = _squared_steps(a, b, seconds)
-    step = next(steps)
-    size = np.abs(x)
-    large = _phi(size)
-    terms = max(np.count_nonzero(x, axis=-1).max(initial=0), np.count_nonzero(g, axis=-2).max(initial=0))
-    charge = float(terms + 6 + rounded)
-    grown, pushed = np.eye(n_x) + size @ large, np.abs(g)
-    error = (charge * UNIT) * np.concatenate([size @ grown, grown @ pushed], axis=-1)
-    error[..., :n_x] += UNIT * np.abs(step[..., :n_x])
-    if n_x > TERMS:
-        error[..., :n_x] += LEFT_OUT
-        error[..., n_x:] += LEFT_OUT * pushed.sum(axis=-2, keepdims=True)
-    for following in steps:
-        whole, off = _whole(step), np.concatenate([error, np.zeros((*b.shape[:-2], n_u, n_x + n_u))], axis=-2)
-        size = np.abs(whole)
-        terms = int(np.count_nonzero(whole, axis=-1).max(initial=0))
-        large = size[..., :n_x, :]
-        error = (large + error) @ off + (error + (terms + 2) * UNIT * large) @ size
-        step = following
-    # Composing a step rounds it as often as it is wide: one that is off by so much is no larger for it.
-    charge = max(charge, float(n_x + n_u))
-    return Step(step, np.maximum(np.abs(step), error / (charge * UNIT)), charge)
-
-
-def exponential_values(a: Matrix, b: Matrix, seconds: float) -> Matrix:
-    """Return the matrices of `exponential_rows` without their errors, which are most of its work.
-
-    Notes
-    -----
-    From E = F − I, E ← 2 E + E²: what is slow beside what is fast keeps the digits that 1 would take from it,
-    once more with each squaring.
-    """
-    x, g, squarings = _scaled(a, b, seconds)
-    phi = _phi(x)
-    grown = np.concatenate([x @ phi, phi @ g], axis=-1)
-    n_x = a.shape[-1]
+    n_x, n_u = a.shape[-1], b.shape[-1]
+    norm = float((numbers.size(a) * seconds).sum(axis=-2).real.max(initial=0.0))
+    if not norm < 2.0**MOST_SQUARINGS:
+        return np.full((*a.shape[:-1], n_x + n_u), np.nan)
+    squarings = max(0, int(np.ceil(np.log2(2 * norm)))) if norm else 0
+    part = seconds * 2.0**-squarings
+    x, g = numbers.scaled(a, part), numbers.scaled(b, part)
+    unit = np.eye(n_x)
+    moved = x.any(axis=tuple(range(x.ndim - 2))) if n_x < TERMS else np.ones((n_x, n_x))
+    reached = np.linalg.matrix_power(unit + moved, TERMS) > 0
+    exact, phi = numbers.exact(unit), numbers.bounded(unit, LAST * reached)
+    for term in range(TERMS, 0, -1):
+        phi = numbers.add(exact, numbers.scaled(numbers.multiply(x, phi), 1 / (term + 1)))
+    grown = np.concatenate([numbers.multiply(x, phi), numbers.multiply(phi, g)], axis=-1)
     for _ in range(squarings):
-        grown = 2 * grown + grown[..., :n_x] @ grown
-    diagonal = np.arange(n_x)
-    grown[..., diagonal, diagonal] += 1
-    return np.asarray(grown)
-
-
-def _squared_steps(a: Matrix, b: Matrix, seconds: float) -> tuple[Matrix, Matrix, Iterator[Matrix]]:
-    """Return X and B T/2^s of `exponential_rows`, and what gives each [F G] in turn."""
-    x, g, squarings = _scaled(a, b, seconds)
-
-    def steps() -> Iterator[Matrix]:
-        phi = _phi(x)
-        step = np.concatenate([np.eye(a.shape[-1]) + x @ phi, phi @ g], axis=-1)
-        yield step
-        for _ in range(squarings):
-            step = step @ _whole(step)
-            yield step
-
-    return x, g, steps()
-
-
-def _scaled(a: Matrix, b: Matrix, seconds: float) -> tuple[Matrix, Matrix, int]:
-    """Return X and B T/2^s, and s."""
-    x = a * seconds
-    norm = float(np.abs(x).sum(axis=-2).max(initial=0.0))
-    squarings = max(0, int(np.ceil(np.log2(2 * norm)))) if 0 < norm < np.inf else 0
-    scale = 2.0**-squarings
-    return x * scale, b * (seconds * scale), squarings
-
-
-def _whole(step: Matrix) -> Matrix:
-    """Return [F G; 0 I] of [F G]."""
-    n_x, n = step.shape[-2:]
-    below = np.broadcast_to(np.eye(n)[n_x:], (*step.shape[:-2], n - n_x, n))
-    return np.concatenate([step, below], axis=-2)
-
-
-def _phi(x: Matrix) -> Matrix:
-    """Return φ₁(X) = I + X/2! + X²/3! + … up to a power."""
-    diagonal = np.arange(x.shape[-1])
-    values = x / (TERMS + 1)
-    for term in range(TERMS - 1, -1, -1):
-        # In place: a sum with a matrix of mostly zeros takes as long as a product.
-        values[..., diagonal, diagonal] += 1
-        if term:
-            values = x @ values
-            values /= term + 1
-    return np.asarray(values)
+        grown = numbers.add(2 * grown, numbers.multiply(grown[..., :n_x], grown))
+    return numbers.add(grown, numbers.exact(np.eye(n_x, n_x + n_u)))
 
 
 def moved_together(a: NDArray[Any]) -> Iterator[Integers]:
@@ -419,14 +265,6 @@ def _generator(a: NDArray[Any], b: NDArray[Any]) -> Any:
     return flint.fmpq_mat(n_x + n_u, n_x + n_u, [value for row in rows for value in row])
 
 
-def _floats(matrix: NDArray[Any]) -> Floats:
-    """Return a matrix of which most is zero in floats."""
-    values = np.zeros(matrix.shape)
-    filled = matrix.astype(np.bool_)
-    values[filled] = [float(value) for value in matrix[filled]]
-    return values
-
-
 def _rational(value: Any) -> Any:
     import flint
 
@@ -434,7 +272,7 @@ def _rational(value: Any) -> Any:
     return flint.fmpq(exact.numerator, exact.denominator)
 
 
-def _step(scaled: Any, n_x: int) -> Step:
+def _step(scaled: Any, n_x: int) -> Matrix:
     """Exponentiate in rising precision until every ball is small."""
     import flint
 
@@ -448,7 +286,7 @@ def _step(scaled: Any, n_x: int) -> Step:
             radius = np.array([[float(ball.rad()) for ball in row] for row in balls]).reshape(n_x, width)
             largest = float(np.abs(middle).max(initial=1.0))
             if np.isfinite(largest) and radius.max(initial=0.0) <= RADIUS * largest:
-                return Step(middle, np.abs(middle) + radius / UNIT + UNDERFLOW)
+                return with_radius(middle, UNIT * np.abs(middle) + radius + np.finfo(np.float64).tiny)
     finally:
         flint.ctx.prec = precision
     raise ApcError(Mistake("E806", Place("the scene"), TOO_LARGE))

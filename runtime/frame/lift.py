@@ -1,7 +1,7 @@
 """One frame of one site as one linear map.
 
 Takes: a `LinearSite` and its `Schedule`; or the matrices of many sites at once, with a leading axis (k).
-Gives: `FrameMap`, `compose`; `lift`, `composed_bounded`; `follow`, event by event.
+Gives: `FrameMap`, `compose`; `lift`, `with_roundings`; `follow`, event by event.
 Guarantees: `compose` and `follow` take numbers of any kind. `lift` propagates the continuous part by its
 exact exponential; every matrix comes with a bound on its rounding error, entry by entry.
 Does not: know who the others are (see `modes`).
@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import Kind
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.frame.discretize import COEFFICIENT_ROUNDINGS, UNIT, Step, discretize
-from apc.frame.radius import FLOATS, RADII, Arithmetic, common_shape, with_radius
+from apc.frame.discretize import COEFFICIENT_ROUNDINGS, discretize
+from apc.frame.radius import FLOATS, RADII, Arithmetic, common_shape, rounded
 from apc.frame.schedule import HELD, Act, Event, Propagate, Repeats, Schedule, Send, Tick, Value, shifted
 from apc.frame.site import LinearSite, every_matrix
 
@@ -85,7 +85,7 @@ def lift(
     durations = step_durations(schedule)
     exact = site if exact is None else exact
     steps = discretize(exact.a, exact.b, [duration * schedule.quantum for duration in durations])
-    return composed_bounded(site, schedule, dict(zip(durations, steps, strict=True)))
+    return compose(with_roundings(site), schedule, dict(zip(durations, steps, strict=True)), numbers=RADII)
 
 
 def check_packets(schedule: Schedule) -> None:
@@ -102,25 +102,9 @@ def step_durations(schedule: Schedule) -> list[int]:
     return sorted({event.duration for event in schedule.events if isinstance(event, Propagate)})
 
 
-def composed_bounded(site: LinearSite, schedule: Schedule, steps: Mapping[int, Step]) -> FrameMap:
-    """Return the composed frame of one site or many, its matrices with their radii.
-
-    Parameters
-    ----------
-    site, schedule, steps
-        The matrices in floats, what happens in a frame, the exponentials by duration in quanta.
-    """
-    off = {
-        duration: with_radius(step.matrix, step.roundings * UNIT * step.size)
-        for duration, step in steps.items()
-    }
-    return compose(with_roundings(site), schedule, off, numbers=RADII)
-
-
 def with_roundings(site: LinearSite) -> LinearSite:
     """Return a site's matrices with their radii, those of what CasADi rounds."""
-    charge = COEFFICIENT_ROUNDINGS * UNIT
-    return every_matrix(site, lambda matrix: with_radius(matrix, charge * np.abs(matrix)))
+    return every_matrix(site, lambda matrix: rounded(matrix, COEFFICIENT_ROUNDINGS))
 
 
 def compose(

@@ -1,8 +1,8 @@
 """What the kernel computes with: floats, or floats that carry their radius.
 
 Takes: matrices of floats, real or complex, and bounds on what their entries are off by.
-Gives: `Arithmetic`, `FLOATS`, `RADII`; `with_radius`, `rounded`, `value_of`, `radius_of`, `slopes_of`,
-`spread_of`; `solve`; `common_shape`.
+Gives: `UNIT`; `Arithmetic`, `FLOATS`, `RADII`; `with_radius`, `rounded`, `value_of`, `radius_of`,
+`slopes_of`, `spread_of`; `solve`; `common_shape`.
 Guarantees: a sum or product in `RADII` holds that of all matrices within the radii of its operands, its own
 rounding and that of the radius included.
 Does not: carry rational numbers or balls of many digits (see `balls`); charge what underflows, less
@@ -25,9 +25,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.frame.discretize import UNIT
-
 Matrix = NDArray[Any]
+
+UNIT = float(np.finfo(np.float64).eps) / 2  # the unit roundoff of double precision
 
 # What a bound is larger than the least, relatively, so that rounding leaves no doubt of it.
 SPARED = 1e-3
@@ -41,7 +41,8 @@ class Arithmetic:
     """How matrices of a kind of number are multiplied, added, subtracted and solved, and others written.
 
     `exact` writes what is exact, `bounded` what may be off by so much. `solve` gives X of M X = R, None where
-    it can't be said, or where nobody asks it of such numbers; `vanishes` says that a matrix is zero.
+    it can't be said, or where nobody asks it of such numbers; `vanishes` says that a matrix is zero. `scaled`
+    multiplies by a number that is off by one rounding, `size` is the largest that magnitudes can be.
     """
 
     multiply: Callable[[Matrix, Matrix], Matrix]
@@ -51,6 +52,8 @@ class Arithmetic:
     solve: Callable[[Matrix, Matrix], Matrix | None] = lambda matrix, right: None
     vanishes: Callable[[Matrix], bool] = lambda matrix: not matrix.any()
     bounded: Callable[[Matrix, Matrix], Matrix] = lambda value, off: value
+    scaled: Callable[[Matrix, float | Matrix], Matrix] = lambda matrix, factor: matrix * factor
+    size: Callable[[Matrix], Matrix] = np.abs
 
 
 def common_shape(*shapes: tuple[int, ...]) -> tuple[int, ...]:
@@ -66,9 +69,9 @@ def with_radius(value: Matrix, radius: Matrix) -> Matrix:
     return values
 
 
-def rounded(value: Matrix) -> Matrix:
-    """Return matrices (…, n, m) of which each entry was rounded once, with their radii."""
-    return with_radius(value, UNIT * np.abs(value))
+def rounded(value: Matrix, times: int = 1) -> Matrix:
+    """Return matrices (…, n, m) of which each entry was rounded once or so many times, with their radii."""
+    return with_radius(value, times * UNIT * np.abs(value))
 
 
 def value_of(matrix: Matrix) -> Matrix:
@@ -196,6 +199,15 @@ def _most(matrix: Matrix) -> Matrix:
     return np.asarray(result * (1 + matrix.shape[-3] * UNIT))
 
 
+def _scaled(matrix: Matrix, factor: float | Matrix) -> Matrix:
+    """Return matrices with their radii, or over cells, times a number that is off by one rounding."""
+    values = matrix * factor
+    off = radius_of(values)
+    off += 2 * UNIT * (np.abs(value_of(values)) + spread_of(values))
+    off *= 1 + (values.shape[-3] + 4) * UNIT
+    return values
+
+
 def _solve_floats(matrix: Matrix, right: Matrix) -> Matrix | None:
     try:
         return np.asarray(np.linalg.solve(matrix, right))
@@ -211,4 +223,6 @@ RADII = Arithmetic(
     _exact,
     solve,
     bounded=with_radius,
+    scaled=_scaled,
+    size=_most,
 )

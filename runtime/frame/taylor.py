@@ -1,7 +1,7 @@
 """What the kernel computes with over many cells at once: floats with slopes, and a radius for all the rest.
 
 Takes: values of matrices at the middle of a cell of parameters, and how they change towards its sides.
-Gives: `taylor`; `within`, `hull`, `corners`; `reciprocal`, `step_over`.
+Gives: `taylor`; `within`, `hull`, `corners`; `reciprocal`.
 Guarantees: a sum, product, quotient or exponential holds that of all numbers its operands hold, at every
 point of the cell; rounding is charged. What can't be bounded is infinite or NaN.
 Does not: follow what is of the second order (it goes into the radius); charge what underflows, less than
@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.frame.discretize import LEFT_OUT, TERMS, UNIT
 from apc.frame.radius import (
     RADII,
+    UNIT,
     Arithmetic,
     radius_of,
     slopes_of,
@@ -36,10 +36,6 @@ from apc.frame.radius import (
 )
 
 Matrix = NDArray[Any]
-
-# Series of φ₁ are taken of matrices of at most this norm, see `discretize`; more squarings than so many are
-# of no use to anybody.
-SHORT, MOST_SQUARINGS = 0.5, 64
 
 
 @lru_cache(maxsize=16)
@@ -120,46 +116,4 @@ def reciprocal(number: Matrix) -> Matrix:
     off = radius_of(number) + spread * np.where(apart > 0, spread / apart, np.inf)
     off = off / np.square(value) + 8 * UNIT * (1 / value + spread_of(values))
     radius_of(values)[...] = off * (1 + 64 * UNIT)
-    return values
-
-
-def step_over(a: Matrix, b: Matrix, seconds: float) -> Matrix:
-    """Return [F G] (…, 2 + m, n_x, n_x + n_u) over cells, x(t + T) = F x(t) + G u.
-
-    Parameters
-    ----------
-    a, b
-        A (…, 2 + m, n_x, n_x) and B (…, 2 + m, n_x, n_u) over the cells.
-    seconds
-        T, a float that is off by one rounding.
-
-    Notes
-    -----
-    By scaling and squaring, as `discretize.exponential_rows`.
-    """
-    numbers = taylor(a.shape[-3] - 2)
-    n_x, n_u = a.shape[-1], b.shape[-1]
-    size = (np.abs(value_of(a)) + radius_of(a) + spread_of(a)).sum(axis=-2).max(initial=0.0) * seconds
-    if not size < SHORT * 2.0**MOST_SQUARINGS:
-        return np.full((*a.shape[:-1], n_x + n_u), np.nan)
-    squarings = max(0, int(np.ceil(np.log2(max(size, SHORT) / SHORT) + 1e-9)))
-    x, g = (_scaled(values, seconds * 2.0**-squarings) for values in (a, b))
-    unit = numbers.exact(np.eye(n_x))
-    phi = unit
-    for term in range(TERMS, 0, -1):
-        phi = numbers.add(unit, _scaled(numbers.multiply(x, phi), 1 / (term + 1)))
-    radius_of(phi)[...] += LEFT_OUT
-    step = np.concatenate([numbers.add(numbers.multiply(x, phi), unit), numbers.multiply(phi, g)], axis=-1)
-    below = numbers.exact(np.eye(n_x + n_u)[n_x:])
-    below = np.broadcast_to(below, (*step.shape[:-2], *below.shape[-2:]))
-    for _ in range(squarings):
-        step = numbers.multiply(step, np.concatenate([step, below], axis=-2))
-    return step
-
-
-def _scaled(matrix: Matrix, factor: float) -> Matrix:
-    """Return matrices over cells times a number that is off by one rounding."""
-    values = matrix * factor
-    radius_of(values)[...] += 2 * UNIT * (np.abs(value_of(values)) + spread_of(values))
-    radius_of(values)[...] *= 1 + (values.shape[-3] + 4) * UNIT
     return values

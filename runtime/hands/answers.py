@@ -29,11 +29,10 @@ from apc.eigen.modes import arrange, dense_loop
 from apc.eigen.peers import MOST_STATES, PeerGroup
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.devices import OWN_MASS, Device, coupled_directly, find_device, find_devices
-from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange
 from apc.frame.instance import Prepared
 from apc.frame.parameters import resolve
-from apc.frame.radius import RADII, with_radius
+from apc.frame.radius import RADII, UNIT, with_radius
 from apc.hands.asked import Port
 from apc.hands.response import Pushed, open_site, pushed_loop, spectra
 

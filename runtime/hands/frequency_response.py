@@ -22,9 +22,9 @@ from apc.analysis.analysis import near_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
-from apc.frame.discretize import UNIT
 from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, prepare
+from apc.frame.radius import UNIT
 from apc.hands.answers import AROUND, Responses, Weights, held_names, responses
 from apc.hands.asked import Port, check_frequencies, find_port, next_peer, ticks_in
 from apc.hands.system_norms import Peak, noise_variance, sampled_data_peak, tick_peak

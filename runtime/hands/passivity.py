@@ -25,10 +25,9 @@ from apc.compiler.timings import part
 from apc.eigen.dissipation import least_real, proves_positive
 from apc.eigen.modes import split
 from apc.frame.devices import clamped, directions_of, replaced_hands, without_hands
-from apc.frame.discretize import UNIT
 from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, prepare
-from apc.frame.radius import RADII, radius_of, solve, value_of, with_radius
+from apc.frame.radius import RADII, UNIT, radius_of, solve, value_of, with_radius
 from apc.hands.port import PortLoop, port_loops
 from apc.moments.network_verdict import Growth
 from apc.network.nominal import left_out

@@ -36,11 +36,10 @@ from apc.eigen.peers import MOST_STATES, PeerGroup, states_of
 from apc.eigen.relative import relative_coordinates, relative_rows, with_doubt
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.devices import Device, coupled_directly, find_device, no_device
-from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange
 from apc.frame.instance import Prepared
 from apc.frame.ports import Ports, with_holds, with_ports
-from apc.frame.radius import RADII, radius_of, solve, value_of, with_radius
+from apc.frame.radius import RADII, UNIT, radius_of, solve, value_of, with_radius
 from apc.frame.schedule import Act, Propagate, Schedule, Send, Tick
 from apc.frame.site import LinearSite
 

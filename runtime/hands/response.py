@@ -28,10 +28,10 @@ from numpy.typing import NDArray
 from apc.eigen.closing import Loop, close_loop
 from apc.eigen.peers import PeerGroup
 from apc.frame.devices import Device
-from apc.frame.discretize import COEFFICIENT_ROUNDINGS, UNIT, Step, discretize, exponential_rows
-from apc.frame.lift import check_packets, composed_bounded, step_durations
+from apc.frame.discretize import COEFFICIENT_ROUNDINGS, discretize, exponential
+from apc.frame.lift import check_packets, compose, step_durations, with_roundings
 from apc.frame.ports import Ports, with_holds, with_ports
-from apc.frame.radius import RADII, solve, value_of, with_radius
+from apc.frame.radius import RADII, UNIT, rounded, solve, value_of, with_radius
 from apc.frame.schedule import Propagate, Schedule
 
 Floats = NDArray[np.float64]
@@ -107,9 +107,10 @@ def open_site(group: PeerGroup, device: Device | None) -> tuple[PeerGroup, Site]
     check_packets(full)
     durations = step_durations(full)
     steps = discretize(group.exact.a, group.exact.b, [duration * full.quantum for duration in durations])
-    kicked = [_with_kicks(step, n_x) for step in steps]
-    lifted = composed_bounded(site, full, dict(zip(durations, kicked, strict=True)))
-    charge = COEFFICIENT_ROUNDINGS * UNIT
+    # At the end of a step each of some more holds adds its value to a state.
+    kick = RADII.exact(np.eye(n_x, n_x + 1))
+    kicked = [np.concatenate([step, kick], axis=-1) for step in steps]
+    lifted = compose(with_roundings(site), full, dict(zip(durations, kicked, strict=True)), numbers=RADII)
     push = np.zeros((2, n_x))
     if device is not None:
         push[0, device.velocity] = float(device.inverse)
@@ -118,8 +119,8 @@ def open_site(group: PeerGroup, device: Device | None) -> tuple[PeerGroup, Site]
     return peer_group, Site(
         group=group,
         device=device,
-        a=with_radius(group.site.a, charge * np.abs(group.site.a)),
-        b=with_radius(group.site.b, charge * np.abs(group.site.b)),
+        a=rounded(group.site.a, COEFFICIENT_ROUNDINGS),
+        b=rounded(group.site.b, COEFFICIENT_ROUNDINGS),
         push=push,
         seconds=tuple(second * schedule.quantum for second in seconds),
         starts=tuple(number * schedule.quantum for number in at),
@@ -136,13 +137,6 @@ def _intervals(schedule: Schedule) -> tuple[list[int], list[int]]:
             lasting.append(event.duration)
             now += event.duration
     return at, lasting
-
-
-def _with_kicks(step: Step, n_x: int) -> Step:
-    """Return a step at whose end each of some more holds adds its value to a state."""
-    matrix = np.concatenate([step.matrix, np.eye(n_x, n_x + 1)], axis=1)
-    size = np.concatenate([step.size, np.zeros((n_x, n_x + 1))], axis=1)
-    return Step(matrix, size, step.roundings)
 
 
 def pushed_loop(loop: Loop, sites: Mapping[int, Site]) -> Pushed:
@@ -263,7 +257,7 @@ def _kick(site: Site, seconds: Fraction, s: Complex) -> Matrix:
         term *= size / terms
         terms += 1
     n, step = len(site.states), force_lanes(site, time, terms)
-    lanes = with_radius(step.matrix[0, :n, n:], step.roundings * UNIT * step.size[0, :n, n:])
+    lanes = step[:, :n, n:]
     powers = ((s * time)[:, None] ** np.arange(terms))[..., None]
     doubt = (3 * np.arange(terms)[:, None] + 4) * UNIT * np.abs(powers)
     values = RADII.multiply(lanes, with_radius(powers, doubt))
@@ -272,7 +266,7 @@ def _kick(site: Site, seconds: Fraction, s: Complex) -> Matrix:
     return values
 
 
-def force_lanes(site: Site, seconds: float, count: int) -> Step:
+def force_lanes(site: Site, seconds: float, count: int) -> Matrix:
     """Return what forces σ^i/i!, σ from 0 to 1 over an interval, make of the states as it ends.
 
     Parameters
@@ -282,16 +276,20 @@ def force_lanes(site: Site, seconds: float, count: int) -> Step:
     count
         How many: γ_i is column n_x + i of the first n_x rows, i < count.
 
+    Returns
+    -------
+    The exponential of all, with its radii (2, n_x + count, n_x + count).
+
     Notes
     -----
     A lane that starts at σ^i/i! feeds the push: x' = A x + b ω₀, ω_i' = ω_{i+1}, the interval being 1.
     """
     n = len(site.states)
-    generator = np.zeros((1, n + count, n + count))
-    generator[0, :n, :n] = value_of(site.a) * seconds
-    generator[0, :n, n] = site.push[0] * seconds
+    generator = np.zeros((2, n + count, n + count))
+    generator[:, :n, :n] = RADII.scaled(site.a, seconds)
+    generator[:, :n, n : n + 1] = RADII.scaled(site.push[..., None], seconds)
     generator[0, range(n, n + count - 1), range(n + 1, n + count)] = 1.0
-    return exponential_rows(generator, np.zeros((1, n + count, 0)), 1.0)
+    return exponential(generator, np.zeros((2, n + count, 0)), 1.0, RADII)
 
 
 def _steady(matrix: Matrix, at: Matrix, driven: Matrix) -> Matrix:

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from apc.eigen.dissipation import gains_at, peak_gain
 from apc.eigen.relative import relative, relative_coordinates, relative_rows, with_doubt
-from apc.frame.discretize import UNIT, exponential_values
-from apc.frame.radius import RADII, radius_of, value_of, with_radius
+from apc.frame.discretize import exponential
+from apc.frame.radius import RADII, UNIT, radius_of, value_of
 from apc.hands.response import Pushed, Site, force_lanes
 from apc.moments.gains import around, stein
 
@@ -148,7 +148,7 @@ def _peak(
 def _lanes(site: Site, seconds: float, count: int) -> Floats:
     """Return γ_i (n_x, count) of an interval, σ^i/i! in units of it."""
     n = len(site.states)
-    return np.asarray(force_lanes(site, seconds, count).matrix[0, :n, n:])
+    return np.asarray(value_of(force_lanes(site, seconds, count))[:n, n:])
 
 
 def _within(site: Site, seconds: float, at: Floats, row: int, forces: Floats) -> tuple[Floats, Floats]:
@@ -156,7 +156,7 @@ def _within(site: Site, seconds: float, at: Floats, row: int, forces: Floats) ->
     n, count = len(site.states), len(at)
     seen, pushed = [], []
     for share in at.tolist():
-        step = exponential_values(value_of(site.a)[None], value_of(site.b)[None], seconds * share)[0]
+        step = exponential(value_of(site.a), value_of(site.b), seconds * share)
         seen.append(step[row])
         # σ^i/i! up to a share of the interval: in units of that share, so many powers of it smaller.
         lanes = _lanes(site, seconds * share, count) * share ** np.arange(count)
@@ -213,8 +213,7 @@ def noise_variance(
             if sensors:
                 inputs[0, loop.kicks[site][place, -1], drawn] = 1.0
             else:
-                step = force_lanes(own, float(seconds), 1)
-                lanes = with_radius(step.matrix, step.roundings * UNIT * step.size)[0]
+                lanes = force_lanes(own, float(seconds), 1)
                 inputs[:, loop.kicks[site][place, :-1], drawn] = lanes[:, : len(own.states), -1]
         inputs *= variance**0.5
         inputs[1] += 4 * UNIT * np.abs(inputs[0])

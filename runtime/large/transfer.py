@@ -26,9 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.matrix_norms import balance, norms
-from apc.frame.discretize import UNIT
 from apc.frame.lift import FrameMap
-from apc.frame.radius import RADII, Matrix, radius_of, solve, value_of, with_radius
+from apc.frame.radius import RADII, UNIT, Matrix, radius_of, solve, value_of, with_radius
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

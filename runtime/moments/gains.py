@@ -25,8 +25,7 @@ from apc.eigen.dissipation import is_positive
 from apc.eigen.enclosure import enclose_eigenvalues
 from apc.eigen.matrix_norms import balance
 from apc.eigen.relative import Relative
-from apc.frame.discretize import UNIT
-from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, with_radius
+from apc.frame.radius import FLOATS, RADII, UNIT, Arithmetic, radius_of, value_of, with_radius
 from apc.frame.taylor import arithmetic_of, corners, entrywise, hull, over_as_many
 from apc.moments.unserved import UnservedError
 from apc.threads import load_pool

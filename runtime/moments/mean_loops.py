@@ -30,9 +30,9 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import Feedback, Loop, StateLayout, bounded_weight, close
 from apc.eigen.peers import PeerGroup
 from apc.eigen.relative import Relative, relative_coordinates, relative_rows, with_doubt
-from apc.frame.discretize import TOO_LARGE, UNIT
+from apc.frame.discretize import TOO_LARGE
 from apc.frame.lift import FrameMap
-from apc.frame.radius import radius_of, value_of
+from apc.frame.radius import UNIT, radius_of, value_of
 from apc.frame.schedule import Selected, Sent, Way
 from apc.frame.taylor import arithmetic_of, entrywise, hull, over_as_many
 from apc.moments.packet_memory import Memory

@@ -33,12 +33,12 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
 from apc.eigen.closing import Loop, without_packets
 from apc.eigen.rigid import stays_rigid
-from apc.frame.discretize import UNIT
 from apc.frame.instance import Prepared, prepare
 from apc.frame.lift import FrameMap
 from apc.frame.names import Range
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import resolve
+from apc.frame.radius import UNIT
 from apc.frame.taylor import hull, within
 from apc.moments.crowd import Classes, build_hearing, classes_of, moments_of, peer_classes, remembered_of
 from apc.moments.gains import below_1

@@ -30,8 +30,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.closing import Coupling, Loop
 from apc.eigen.relative import relative_coordinates, relative_rows, with_doubt
-from apc.frame.discretize import UNIT
-from apc.frame.radius import RADII
+from apc.frame.radius import RADII, UNIT
 from apc.frame.schedule import Selected, Way
 from apc.frame.taylor import entrywise
 from apc.moments.crowd import Hearing, own_value, peer_classes, remembered_of, standing_motions

@@ -39,9 +39,8 @@ from apc.eigen.dissipation import peak_gain, proves_gain
 from apc.eigen.enclosure import enclose_eigenvalues
 from apc.eigen.modes import loops_at_right_angles
 from apc.eigen.peers import PeerGroup
-from apc.frame.discretize import UNIT
 from apc.frame.instance import Prepared, prepare
-from apc.frame.radius import RADII, radius_of, value_of
+from apc.frame.radius import RADII, UNIT, radius_of, value_of
 from apc.frame.schedule import Way
 from apc.moments.held import Ear, HeldLoop, ears_of, held_loop, held_scene, lossy_rows
 from apc.moments.unserved import UnservedError

@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.frame.discretize import UNIT
+from apc.frame.radius import UNIT
 from apc.regions.boundary_points import (
     MOST_STEPS,
     MOST_TRIES,

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.frame.discretize import exponential_values
+from apc.frame.discretize import exponential
 from apc.frame.exact import ROWS, evaluate_exact
 from apc.frame.jacobians import guards_of, lookups_of
 from apc.simulation.propagate import Rates
@@ -156,7 +156,7 @@ def _integrated(site: SiteForcing, until: Floats, low: Floats, high: Floats) -> 
 
     def integrand(share: float) -> Floats:
         left = equal[0] + (equal[1] - equal[0]) * share
-        steps = exponential_values(left[:, None, None] * site.matrix, nothing, 1.0)
+        steps = exponential(left[:, None, None] * site.matrix, nothing, 1.0)
         g = _at(site.force, np.maximum(until - left[which], 0.0))
         moved = np.einsum("kxq,qk->kx", steps[..., list(site.pushed)][which], g)
         return np.asarray((high - low)[:, None] * moved)

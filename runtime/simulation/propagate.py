@@ -26,6 +26,7 @@ from apc.frame.discretize import discretize
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import guards_of, structural_pattern
 from apc.frame.parameters import exact_numbers
+from apc.frame.radius import value_of
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -171,7 +172,7 @@ def transition_rows(rates_of: Rates, vectors: Floats, durations: Sequence[Fracti
     for place, row in enumerate(first.tolist()):
         whole = exact_rates(rates_of, vectors[row])
         for matrix, step in zip(result, discretize(whole[:, :n_x], whole[:, n_x:], durations), strict=True):
-            matrix[place] = step.matrix
+            matrix[place] = value_of(step)
     return tuple(matrix[which.reshape(-1)] for matrix in result)
 
 

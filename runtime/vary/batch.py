@@ -29,14 +29,14 @@ from apc.eigen.modes import split
 from apc.eigen.peers import PeerGroup
 from apc.eigen.relative import relative, with_doubt
 from apc.eigen.rigid import find_rigid_modes
-from apc.frame.discretize import Step, exponential_rows, exponential_values
+from apc.frame.discretize import exponential
 from apc.frame.exchange import Exchange
 from apc.frame.jacobians import SiteJacobians
-from apc.frame.lift import FrameMap, compose, composed_bounded, lift
+from apc.frame.lift import FrameMap, compose, lift, with_roundings
 from apc.frame.linearize import linearize, linearize_exact, linearize_rows, of_rows, site_of
 from apc.frame.names import Free, value_now
 from apc.frame.parameters import free_rows
-from apc.frame.radius import RADII, radius_of, value_of
+from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of
 from apc.frame.schedule import Propagate
 from apc.frame.site import LinearSite, every_matrix
 from apc.vary.wiring import (
@@ -160,7 +160,7 @@ class BatchEvaluator:
     wirings: tuple[Wiring, ...]
     durations: Mapping[int, tuple[float, float]]
     tangents: Mapping[str, Any]  # casadi.Function by the kind's name
-    fixed: Mapping[tuple[int, int], Mapping[int, Step]]  # exponentials that nothing free reaches
+    fixed: Mapping[tuple[int, int], Mapping[int, Matrices]]  # exponentials that nothing free reaches
 
     @property
     def closed(self) -> tuple[ClosedSystem, ...]:
@@ -286,9 +286,10 @@ class BatchEvaluator:
     def _lift_bounded(self, group: PeerGroup, vectors: Floats) -> tuple[LinearSite, FrameMap]:
         rows = linearize_rows(group.jacobians, vectors)
         site, steps, lost = self._placed(group, site_of(group.jacobians, rows))
-        steps = steps or self.steps(site, np.zeros((1, 1)), exponential_rows)
+        bounded = with_roundings(site)
+        steps = steps or self.steps(bounded, np.zeros((1, 1)), RADII)
         with np.errstate(all="ignore"):
-            frame = composed_bounded(site, group.schedule, steps)
+            frame = compose(bounded, group.schedule, steps, numbers=RADII)
         _lose(frame, lost)
         return site, frame
 
@@ -299,8 +300,8 @@ class BatchEvaluator:
         else:
             linear_site = every_matrix(group.site, lambda block: np.array(block[None]))
         site, fixed, lost = self._placed(group, linear_site)
-        steps = {quanta: step.matrix for quanta, step in fixed.items()}
-        steps = steps or self.steps(site, values, exponential_values)
+        steps = {quanta: value_of(step) for quanta, step in fixed.items()}
+        steps = steps or self.steps(site, values, FLOATS)
         with np.errstate(all="ignore"):
             frame = compose(site, group.schedule, steps)
         _lose(frame, lost)
@@ -308,7 +309,7 @@ class BatchEvaluator:
 
     def _placed(
         self, group: PeerGroup, site: LinearSite
-    ) -> tuple[LinearSite, Mapping[int, Step], NDArray[np.bool_]]:
+    ) -> tuple[LinearSite, Mapping[int, Matrices], NDArray[np.bool_]]:
         """Return a group's sites, their exponentials if nothing free reaches these, and which have none."""
         beyond = is_beyond(site.a, site.b)
         if site_key(group) in self.fixed:
@@ -316,21 +317,19 @@ class BatchEvaluator:
         site.a[beyond], site.b[beyond] = 0.0, 0.0  # they would spoil the others' exponentials
         return site, {}, beyond
 
-    def steps(
-        self, site: LinearSite, values: Matrices, exponential: Callable[[Matrices, Matrices, float], T]
-    ) -> dict[int, T]:
+    def steps(self, site: LinearSite, values: Matrices, numbers: Arithmetic) -> dict[int, Matrices]:
         """Return the exponentials of every step, one for all points where A, B and the time stay."""
         a, b = _shared(site.a, site.b)
         steps = {}
         for quanta, (constant, slope) in self.durations.items():
-            seconds = np.full((1, 1, 1), constant)
+            seconds: float | Matrices = constant
             if slope:
                 seconds = constant + slope * values[:, 0, None, None]
                 # What is left of a step that vanishes is rounding, which would upset the eigenvectors.
                 gone = np.abs(seconds) < VANISHING * abs(constant)
                 seconds = np.where(gone, seconds - seconds.real, seconds)
             with np.errstate(all="ignore"):
-                steps[quanta] = exponential(a * seconds, b * seconds, 1.0)
+                steps[quanta] = exponential(a, b, seconds, numbers)
         return steps
 
     def rows(self, built: SiteJacobians, vectors: Matrices) -> Matrices:
@@ -416,11 +415,11 @@ def _generic(count: int) -> tuple[Floats, Floats]:
     return 0.5 + np.mod(GENERIC_POINT * places, 1.0)[None], 0.5 + np.mod(GENERIC_RATIO * places, 1.0)[None]
 
 
-def _fixed(evaluator: BatchEvaluator) -> dict[tuple[int, int], Mapping[int, Step]]:
+def _fixed(evaluator: BatchEvaluator) -> dict[tuple[int, int], Mapping[int, Matrices]]:
     """Return the exponentials of the groups whose A and B no free parameter moves, at a meaningless point."""
     if evaluator.timed:
         return {}
-    result: dict[tuple[int, int], Mapping[int, Step]] = {}
+    result: dict[tuple[int, int], Mapping[int, Matrices]] = {}
     point, along = _generic(len(evaluator.free))
     for group in evaluator.groups:
         if site_key(group) in result:
@@ -428,7 +427,8 @@ def _fixed(evaluator: BatchEvaluator) -> dict[tuple[int, int], Mapping[int, Step
         vectors = evaluator.vectors(group, point + (STEP * 1j) * along)
         site = site_of(group.jacobians, evaluator.rows(group.jacobians, vectors))
         if not (np.iscomplexobj(site.a) and (site.a.imag.any() or site.b.imag.any())):
-            result[site_key(group)] = evaluator.steps(site, point, exponential_rows)
+            real = with_roundings(every_matrix(site, np.real))
+            result[site_key(group)] = evaluator.steps(real, point, RADII)
     return result
 
 

@@ -25,12 +25,12 @@ from apc.eigen.modes import split
 from apc.eigen.peers import PeerGroup, states_of
 from apc.eigen.relative import relative_bounded, relative_coordinates
 from apc.eigen.rigid import RigidModes, find_rigid_modes
-from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange
 from apc.frame.instance import Prepared, prepare
 from apc.frame.names import Free, is_named, parameter_of
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import free_rows, scope_of
+from apc.frame.radius import UNIT
 from apc.vary.batch import BatchEvaluator, Evaluator, batch_evaluator
 from apc.vary.wiring import wire
 

@@ -20,7 +20,7 @@ from apc.eigen.enclosure import SMALL, enclose_stack
 from apc.eigen.relative import relative_bounded
 from apc.eigen.spectrum import LEAST_SHARE, STRAIGHT
 from apc.frame.course import turns
-from apc.frame.discretize import UNIT
+from apc.frame.radius import UNIT
 from apc.vary.batch import BatchEvaluator, Bounded
 from apc.vary.wiring import Wiring
 
