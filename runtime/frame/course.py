@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.frame.discretize import exponential
-from apc.frame.lift import follow
+from apc.frame.lift import follow, followed
 from apc.frame.radius import FLOATS
 from apc.frame.schedule import Propagate, Schedule, Value
 from apc.frame.site import LinearSite, every_matrix, matrices_of
@@ -56,10 +56,8 @@ FADED = 1e-14
 ROUNDED = np.pi * 2.0**-40
 HALF_TURN_BACK = ROUNDED - np.pi
 
-# A step between points is as far from straight as an eighth of its second difference, or four times that if
-# this changes along it; and what passes 0 nearer than this, relative to its size, may pass it on either side
-# for the rounding of its vector.
-BENT, NEAR_ZERO = 0.5, 1e-6
+# What is real passes 0 along a line but for so much.
+NEAR_ZERO = 1e-6
 
 
 def turns(
@@ -103,7 +101,7 @@ def turns(
             some = left[first : first + chunk]
             mine = every_matrix(site, partial(_some_of, some))
             course = _courses(mine, schedule, points, start[some], heard[some], states[some])
-            angle, known = followed_closely(course, values[some], again=doubled > 0)
+            angle, known = followed_closely(course, values[some])
             known |= states[some] >= len(site.kind.states)
             result[some[known]] = _of_eigenvalue(angle[known], values[some[known]])
             agreed[first : first + chunk] = known
@@ -189,19 +187,16 @@ def _courses(
         numbers=replace(FLOATS, multiply=multiply),
         watch=watch,
     )
-    while True:
-        try:
-            next(course)
-        except StopIteration as end:
-            last = end.value.reshape(-1, 2, count)[states, :, np.arange(count)]
-            path = np.concatenate([*parts, last[None]])
-            for mode in np.flatnonzero(states >= n_x):
-                item = schedule.carried[states[mode] - n_x]
-                ticks = [replace(item, index=item.index + i) for i in range(schedule.ticks[item.partition])]
-                courses = [computed[tick].reshape(2, count)[:, mode] for tick in ticks if tick in computed]
-                path[:, mode] = last[mode]
-                path[: len(courses), mode] = courses
-            return np.asarray(path[..., 0] + 1j * path[..., 1])
+    end, _ = followed(course)
+    last = end.reshape(-1, 2, count)[states, :, np.arange(count)]
+    path = np.concatenate([*parts, last[None]])
+    for mode in np.flatnonzero(states >= n_x):
+        item = schedule.carried[states[mode] - n_x]
+        ticks = [replace(item, index=item.index + i) for i in range(schedule.ticks[item.partition])]
+        values = [computed[tick].reshape(2, count)[:, mode] for tick in ticks if tick in computed]
+        path[:, mode] = last[mode]
+        path[: len(values), mode] = values
+    return np.asarray(path[..., 0] + 1j * path[..., 1])
 
 
 def _power_of_two(least: float, doubled: int) -> int:
@@ -235,46 +230,17 @@ def _followed(power: Floats, states: Integers, number: int) -> tuple[Floats, Flo
     return rows[which], power
 
 
-def followed_closely(
-    course: Floats | Complexes, values: Complexes, *, again: bool = True
-) -> tuple[Floats, NDArray[np.bool_]]:
+def followed_closely(course: Complexes, values: Complexes) -> tuple[Floats, NDArray[np.bool_]]:
     """Return by how much modes' courses (points, k) turn (k,), in radians, and of which that is known (k,).
 
-    Where points are far apart, it is known if half of them tell the same and no step goes so near 0 that its
-    side isn't sure; not tried unless `again`.
+    From point to point they turn by little, or a mode that is real changes its sign, which is half a turn.
     """
-    phases = _phases(course)
-    angle, widest = _turned(phases)
-    known = widest < CLOSE
-    far = np.flatnonzero(~known)
-    if again and len(far):
-        some = phases[:, far]
-        known[far] = np.abs(angle[far] - _turned(some[::2])[0]) < OFF
-        known[far] &= _on_one_side(course[:, far], some, values[far].imag == 0)
-    return angle, known
+    angles = _angles(_phases(course))
+    signs = (values.imag == 0) & (np.pi - np.abs(angles) <= NEAR_ZERO)
+    return angles.sum(axis=0), np.asarray(((np.abs(angles) < CLOSE) | signs).all(axis=0))
 
 
-def _on_one_side(
-    course: Floats | Complexes, phases: NDArray[Any], real: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
-    """Say of which courses (points, k) no wide step may pass 0 on either side.
-
-    A step is straight but for its bend. A mode that is real changes its sign, along a line through 0, and one
-    that nearly is passes 0 on a side that rounding may choose.
-    """
-    start, end = course[:-1], course[1:]
-    with np.errstate(all="ignore"):
-        scale = np.maximum(np.abs(start), np.abs(end))
-        a, b = start / scale, end / scale
-        distance = np.abs((a.conj() * b).imag) / np.abs(b - a)
-        bend = np.abs(np.diff(course, 2, axis=0))
-        bend = np.maximum(np.pad(bend, ((1, 0), (0, 0))), np.pad(bend, ((0, 1), (0, 0)))) / scale
-        turned = np.abs(np.angle(phases[1:] * phases[:-1].conj()))
-        sure = (turned < CLOSE) | (distance > BENT * bend + NEAR_ZERO)
-    return np.asarray((sure | (np.pi - turned <= np.where(real, NEAR_ZERO, ROUNDED))).all(axis=0))
-
-
-def _phases(course: Floats | Complexes) -> NDArray[Any]:
+def _phases(course: Complexes) -> NDArray[Any]:
     """Return the directions of courses (points, k), of unit length; where one stays at 0, NaN."""
     size = np.abs(course)
     with np.errstate(invalid="ignore"):
@@ -286,17 +252,15 @@ def _phases(course: Floats | Complexes) -> NDArray[Any]:
     return phases
 
 
-def _turned(phases: NDArray[Any]) -> tuple[Floats, Floats]:
-    """Return by how much directions (points, k) turn about 0, in radians, and the widest angle of a step.
+def _angles(phases: NDArray[Any]) -> Floats:
+    """Return by how much directions (points, k) turn about 0 from each to the next, in radians.
 
     A change of sign is half a turn forwards, whatever the sign of the zero beside it; a course that stays at
     0 has no angle.
     """
     turned = phases[1:] * phases[:-1].conj()
     angles = np.arctan2(turned.imag, turned.real)
-    if (angles <= HALF_TURN_BACK).any():
-        angles = np.where(angles <= HALF_TURN_BACK, angles + 2 * np.pi, angles)
-    return angles.sum(axis=0), np.abs(angles).max(axis=0, initial=0.0)
+    return np.where(angles <= HALF_TURN_BACK, angles + 2 * np.pi, angles)
 
 
 def _directions(phases: NDArray[Any], size: Floats) -> NDArray[Any]:

@@ -1,7 +1,7 @@
 """One frame of one site as one linear map.
 
 Takes: a `LinearSite` and its `Schedule`; or the matrices of many sites at once, with a leading axis (k).
-Gives: `FrameMap`, `compose`; `lift`, `with_roundings`; `follow`, event by event.
+Gives: `FrameMap`, `compose`; `lift`, `with_roundings`; `follow`, event by event, `followed`.
 Guarantees: `compose` and `follow` take numbers of any kind. `lift` propagates the continuous part by its
 exact exponential; every matrix comes with a bound on its rounding error, entry by entry.
 Does not: know who the others are (see `modes`).
@@ -16,7 +16,7 @@ sent.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.discretize import COEFFICIENT_ROUNDINGS, discretize
 from apc.frame.radius import FLOATS, RADII, Arithmetic, common_shape, rounded
 from apc.frame.schedule import HELD, Act, Event, Propagate, Repeats, Schedule, Send, Tick, Value, shifted
-from apc.frame.site import LinearSite, every_matrix
+from apc.frame.site import LinearSite, every_matrix, matrices_of
 
 Matrix = NDArray[Any]
 
@@ -129,23 +129,24 @@ def compose(
     """
     n_z = len(site.kind.states) + len(schedule.carried)
     unit = numbers.exact(np.eye(n_z + len(schedule.heard)))
-    playing = _Playing.of(site, steps, unit.dtype, numbers.multiply)
-    at = playing.begin(schedule, unit[..., :n_z, :])
-    sent: dict[int, Matrix] = {}
-
-    def hear(row: int) -> Matrix:
-        return unit[..., n_z + row, :]
-
-    again = schedule.repeats
-    if again is None:
-        sent.update(playing.play(schedule.events, at, hear))
-    else:
-        sent.update(playing.play(schedule.events[: again.first], at, hear))
-        _play_again(playing, schedule, again, at, numbers, None)
-        sent.update(playing.play(schedule.events[again.end :], at, hear))
-    z = playing.end(schedule, at)
+    many = common_shape(*(matrix.shape[:-2] for matrix in (unit, *matrices_of(site), *steps.values())))
+    start = np.broadcast_to(unit[..., :n_z, :], (*many, n_z, unit.shape[-1]))
+    z, sent = followed(
+        follow(site, schedule, steps, start, lambda row: unit[..., n_z + row, :], numbers=numbers)
+    )
     s = _over(z[..., :0, :], [sent[row] for row in range(len(schedule.sent))])
     return FrameMap(z[..., :n_z], z[..., n_z:], s[..., :n_z], s[..., n_z:])
+
+
+def followed(course: Generator[tuple[int, Matrix], None, Matrix]) -> tuple[Matrix, dict[int, Matrix]]:
+    """Return z⁺ and the rows of s that a site sends, of a course (see `follow`) that never waits."""
+    sent: dict[int, Matrix] = {}
+    while True:
+        try:
+            row, value = next(course)
+        except StopIteration as end:
+            return end.value, sent
+        sent[row] = value
 
 
 def _play_again(
@@ -154,7 +155,7 @@ def _play_again(
     again: Repeats,
     at: _Moment,
     numbers: Arithmetic,
-    received: Matrix | None,
+    received: Matrix,
 ) -> None:
     """Play events that come again and again: once, over what they need, and that as often as they come.
 
@@ -167,7 +168,7 @@ def _play_again(
     numbers
         What all is of.
     received
-        What is heard (n_r, columns); without it, the last columns, one a packet.
+        What is heard (n_r, columns).
 
     Notes
     -----
@@ -211,12 +212,7 @@ def _play_again(
 
     y = _over(at.moving[..., :n_x, :], [row_of(at, value, 0) for value in needed])
     whole = _often(step, again.count, after)
-    values = numbers.multiply(whole[..., :n], y)
-    if received is None:
-        heard = values.shape[-1] - n_r
-        values[..., heard:] = numbers.add(values[..., heard:], whole[..., n:])
-    else:
-        values = numbers.add(values, numbers.multiply(whole[..., n:], received))
+    values = numbers.add(numbers.multiply(whole[..., :n], y), numbers.multiply(whole[..., n:], received))
     at.moving[..., :n_x, :] = values[..., :n_x, :]
     for place, value in enumerate(again.entering, n_x):
         if value.partition == HELD:
@@ -280,7 +276,11 @@ def follow(
     -------
     z⁺ (n_z, columns).
     """
-    playing = replace(_Playing.of(site, steps, start.dtype, numbers.multiply, watch), many=start.shape[:-2])
+    sends = [_beside(send.x, send.u) for send in site.sends]
+    ticks = [_beside(tick.x, tick.u, tick.m, tick.r) for tick in site.ticks]
+    number = np.result_type(start.dtype, site.a, *steps.values(), *sends, *ticks)
+    holds, many = site.b.shape[-1], start.shape[:-2]
+    playing = _Playing(site.kind, sends, ticks, steps, holds, many, number, numbers.multiply, watch)
     at = playing.begin(schedule, start)
     again = schedule.repeats if watch is None else None
     if again is None:
@@ -323,24 +323,6 @@ class _Playing:
     number: Any
     multiply: Callable[[Matrix, Matrix], Matrix]
     watch: Watch | None
-
-    @classmethod
-    def of(
-        cls,
-        site: LinearSite,
-        steps: Mapping[int, Matrix],
-        number: Any,
-        multiply: Callable[[Matrix, Matrix], Matrix],
-        watch: Watch | None = None,
-    ) -> _Playing:
-        sends = [_beside(send.x, send.u) for send in site.sends]
-        ticks = [_beside(tick.x, tick.u, tick.m, tick.r) for tick in site.ticks]
-        parts = (site.a, *steps.values(), *sends, *ticks)
-        many = common_shape(*(part.shape[:-2] for part in parts))
-        return cls(
-            *(site.kind, sends, ticks, steps, site.b.shape[-1], many),
-            *(np.result_type(number, *parts), multiply, watch),
-        )
 
     @property
     def states(self) -> int:

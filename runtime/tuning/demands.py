@@ -30,9 +30,7 @@ from apc.vary.evaluator import reaches_count
 from apc.vary.growth import MEAN_SQUARE, NOMINAL, PASSIVE, criterion_of, refuse_time
 
 PLACE = Place("tune")
-FREE, AIM, SUBJECT, OVER, AGAINST = (
-    Place(f"--{text}") for text in ("free", "maximize", "subject", "over", "against")
-)
+FREE, SUBJECT, OVER, AGAINST = (Place(f"--{text}") for text in ("free", "subject", "over", "against"))
 
 # What may be minimized beside a gain.
 RADIUS, SETTLING = "spectral_radius", "settling_time"
@@ -83,7 +81,7 @@ class Aim:
     That is the spectral radius, or the time after which none is left but for 2 %: the same gains. Columns are
     the gains and, where there are `terms`, a level that the weighted sum of these is to stay on the good side
     of: (weight, the place of a gain or what is felt), in SI, with the largest value of all scenarios. `level`
-    is the range it is looked for in; `fixed` is what it is where that is known, `scale` how large it is.
+    is the range it is looked for in, `scale` how large it is.
     """
 
     label: str
@@ -92,7 +90,6 @@ class Aim:
     unit: str
     terms: tuple[tuple[float, int | Felt], ...] = ()
     level: Range | None = None
-    fixed: float | None = None
     scale: float = 1.0
 
 
@@ -124,17 +121,6 @@ class Demands:
     def measured(self) -> tuple[Felt, ...]:
         """All that has to be known of what hands feel: the demands, then the terms of the aim."""
         return (*self.felt, *(felt for _, felt in self.aim.terms if isinstance(felt, Felt)))
-
-    def at_frequency(self, frequency_hz: float) -> Demands:
-        """Return the same with what is largest over all frequencies at one of them."""
-
-        def there(felt: Felt) -> Felt:
-            return replace(felt, frequency_hz=frequency_hz) if felt.name == HINF else felt
-
-        terms = tuple(
-            (weight, there(felt) if isinstance(felt, Felt) else felt) for weight, felt in self.aim.terms
-        )
-        return replace(self, felt=tuple(map(there, self.felt)), aim=replace(self.aim, terms=terms))
 
     @property
     def over(self) -> tuple[Range, ...]:

@@ -43,6 +43,9 @@ FINE, ROUGH, ROUGHER = 1e-14, 1e-9, 1e-7
 # as far beyond them limits say nothing of where they are; and how far at last.
 SHORTER, NEAREST = 0.25, 1e-3
 
+# Steps of a descent at most.
+STEPS = 200
+
 # More than any aim is worth.
 HUGE = 1e9
 
@@ -54,10 +57,6 @@ SMALLEST = 1e-3
 
 # What a limit that binds may be off by; what is left open of the conditions of an optimum.
 BINDS, OPEN = 1e-6, 1e-8
-
-# Points beside an optimum, how far from it they lie, and how often one that is better is followed.
-BESIDE, SPREADS, AGAIN = 256, (0.1, 0.01, 1e-3), 4
-SLOW_BESIDE = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +86,7 @@ class Search:
     """A search for the best gains in some scenarios.
 
     The gain, or level, in `column` is to be large (`sign` 1) or small (−1); without a column the largest
-    limit is to be as small as can be. A descent takes so many `steps` at most.
+    limit is to be as small as can be.
     Inside, ranges are 0 to 1; t stands for the largest limit, where that is the aim.
     """
 
@@ -95,7 +94,6 @@ class Search:
     scenarios: Sequence[Scenario]
     column: int | None
     sign: float = 1.0
-    steps: int = 200
 
     @cached_property
     def _low(self) -> Floats:
@@ -138,10 +136,6 @@ class Search:
         """Return what there is at shares of the ranges, as if it were the best."""
         return self._optimum(start, self._remembered({}), 0.0)
 
-    def rough(self, start: Floats) -> Optimum:
-        """Return where one descent from shares of the ranges ends."""
-        return self._descended(start)
-
     def start(self, present: Floats, every: Sequence[Scenario], than: Optimum | None = None) -> list[Floats]:
         """Return where to go downhill from, shares of the ranges: the best of points spread evenly.
 
@@ -178,14 +172,7 @@ class Search:
         if not self.limits.demands.aim.level:
             return points
         gains = self.gains(points)
-        sums = np.array(
-            [
-                self.limits.sums(
-                    scenario.setting, np.hstack([gains, np.tile(scenario.point, (len(gains), 1))])
-                )
-                for scenario in scenarios
-            ]
-        )
+        sums = self.limits.sums(scenarios, gains)
         level = sums.min(axis=0) if self.sign > 0 else sums.max(axis=0)
         shares = (level - self._low[-1]) / self._width[-1] - OPEN * self.sign
         return np.column_stack([points[:, :-1], np.nan_to_num(shares, nan=-self.sign * FAR)])
@@ -217,25 +204,7 @@ class Search:
 
     def best(self, starts: Sequence[Floats]) -> Optimum:
         """Return the best that descents from starts (shares of the ranges) find."""
-        optimums = [self._descended(start) for start in starts]
-        chosen = min(optimums, key=self._rank)
-        count = SLOW_BESIDE if self.limits.slow else BESIDE
-        cloud = _even(count, len(self._low)) - 0.5
-        looked = 0
-        for _ in range(AGAIN):
-            around = [np.clip(self.shares(chosen) + 2 * size * cloud, *self._ends) for size in SPREADS]
-            points = np.vstack(around)
-            worst = self._worst(points)
-            looked += len(points)
-            merit = np.where(worst <= max(chosen.worst, 0.0), self._merit(points, worst), np.inf)
-            place = int(np.argmin(merit))
-            if not merit[place] < self._own_merit(chosen) - OPEN:
-                break
-            again = self._descended(points[place])
-            if self._rank(again) >= self._rank(chosen):
-                break
-            chosen = again
-        return replace(chosen, looked=looked)
+        return min(map(self.descended, starts), key=self._rank)
 
     def shares(self, optimum: Optimum) -> Floats:
         """Return the gains of an optimum as shares of their ranges."""
@@ -249,8 +218,8 @@ class Search:
         met = self.column is None or optimum.worst <= BINDS
         return not met, self._own_merit(optimum) if met else optimum.worst
 
-    def _descended(self, start: Floats) -> Optimum:
-        """Return where a descent ends."""
+    def descended(self, start: Floats) -> Optimum:
+        """Return where a descent from shares of the ranges ends."""
         optimize = load_pool("scipy.optimize")
         known: dict[bytes, Rows] = {}
         rows_of = self._remembered(known)
@@ -277,12 +246,12 @@ class Search:
                     method="SLSQP",
                     bounds=[*near, *[(None, None)] * spare],
                     constraints=[{"type": "ineq", "fun": left, "jac": moves}],
-                    options={"ftol": self._near, "maxiter": self.steps},
+                    options={"ftol": self._near, "maxiter": STEPS},
                 )
                 rough = np.clip(np.nan_to_num(ended.x[:size], nan=0.5), *self._ends)
                 for end in self._ends:
                     rough = np.where(np.abs(rough - end) < OPEN, end, rough)
-                optimum = self._polished(rough, rows_of)
+                optimum = self._optimum(rough, rows_of, 0.0)
                 (unmet, value), known_rank = self._rank(optimum), self._rank(best)
                 far = (unmet, value + max(OPEN, self._near)) < known_rank
                 if (unmet, value) < known_rank:
@@ -293,7 +262,7 @@ class Search:
         except TimeUp:
             seen = [self._optimum(np.frombuffer(key), rows_of, 0.0) for key in known]
             best = min(best, *seen, key=self._rank)
-        return best
+        return replace(best, looked=len(known))
 
     def _remembered(self, known: dict[bytes, Rows]) -> Callable[[Floats], Rows]:
         """Return what gives the limits at shares (m,), once each; it raises `TimeUp`, but of the first."""
@@ -307,41 +276,6 @@ class Search:
             return known[key]
 
         return rows_of
-
-    def _polished(self, rough: Floats, rows_of: Callable[[Floats], Rows]) -> Optimum:
-        """Return the root of the conditions of an optimum beside a rough one, or that itself."""
-        here = rows_of(rough)
-        before = self._optimum(rough, rows_of, 0.0)
-        inner = self._inner(rough)
-        active = np.flatnonzero(before.multipliers > 0).tolist()
-        spare = self.column is None
-        if self.limits.slow or not len(active) or len(active) > inner.sum() + spare:
-            return before
-
-        def unpacked(y: Floats) -> tuple[Floats, Floats]:
-            shares = rough.copy()
-            shares[inner] = y[: inner.sum()]
-            return shares, y[inner.sum() :]
-
-        def conditions(y: Floats) -> Floats:
-            shares, rest = unpacked(y)
-            rows = rows_of(shares)
-            same = [_same(rows, here, number) for number in active]
-            values, slopes = rows.values[same], rows.slopes[same]
-            weights = rest[:-1] if spare else rest
-            along = self._aim() + weights @ slopes
-            last = [weights.sum() - 1] if spare else []
-            return np.concatenate([along[inner], values - (rest[-1] if spare else 0.0), last])
-
-        begin = np.concatenate([rough[inner], before.multipliers[active], [before.worst] if spare else []])
-        root = load_pool("scipy.optimize").root(conditions, begin, tol=1e-14)
-        shares, rest = unpacked(root.x)
-        near = np.abs(shares - rough).max() <= SPREADS[1] and (shares == np.clip(shares, *self._ends)).all()
-        weights = rest[:-1] if spare else rest
-        if not (near and np.abs(root.fun).max() <= OPEN and (weights >= 0).all()):
-            return before
-        after = self._optimum(shares, rows_of, abs(self._value(shares, rows_of) - before.value))
-        return after if after.worst <= max(before.worst, BINDS) else before
 
     def _aim(self) -> Floats:
         """Return how what is to be small follows the shares (m,)."""
@@ -378,12 +312,6 @@ class Search:
         if self.limits.slow and self.column is not None:
             error = max(error, 10 * self._near * float(self._width[self.column]))
         return Optimum(tuple(self.scenarios), self.gains(shares), value, error, worst, rows, multipliers, 0)
-
-
-def _same(rows: Rows, here: Rows, number: int) -> int:
-    """Return the row that goes on a mode of another point: of its block, the nearest eigenvalue."""
-    own = np.flatnonzero(rows.block == here.block[number])
-    return int(own[np.argmin(np.abs(rows.eigenvalue[own] - here.eigenvalue[number]))])
 
 
 def _even(count: int, size: int) -> Floats:

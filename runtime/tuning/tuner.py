@@ -51,8 +51,8 @@ Floats = NDArray[np.float64]
 # Significant digits that a person types.
 DIGITS = 4
 
-# How much of the room beside them rounding may take of gains.
-ROOM = 0.5
+# How much worse than the least a limit may be for rounding, as a share of it.
+NEARLY = 1e-4
 
 # How far gains go back from the best until they are proved, as shares of the best; where there is a box, they
 # begin farther back: cells beside a limit are small, and there are very many.
@@ -61,9 +61,6 @@ BACK_IN_BOX = (5e-3, 1e-2)
 
 # How far a level is kept from what it bounds, of its size: far more than rounding, less than what is shown.
 SLACK = 1e-5
-
-# Steps on the way to where there is most room: any room does.
-STEPS = 12
 
 # What is said where only stability is proved.
 SLOWER = "stable is proved; how fast motions die out, or what is felt, is only looked at scenario by scenario"
@@ -243,14 +240,7 @@ class _Work:
         """Find where the aim's level is looked for: from the best that is known on."""
         search = Search(self.limits, self.scenarios, None)
         points = np.vstack([self.present, search.gains(search.even)])
-        sums = np.array(
-            [
-                self.limits.sums(
-                    scenario.setting, np.hstack([points, np.tile(scenario.point, (len(points), 1))])
-                )
-                for scenario in self.scenarios
-            ]
-        )
+        sums = self.limits.sums(self.scenarios, points)
         known = sums[np.isfinite(sums)]
         if not len(known):
             what = f"nothing is known of {self.demands.aim.label} with any gains that were looked at"
@@ -308,8 +298,6 @@ class _Work:
             search = Search(self.limits, self.scenarios, column, sign)
             if not starts:
                 starts = begun = search.start(self.present, self.every)
-                for start in starts:
-                    self.limits.heard(self.scenarios, search.gains(start))
             optimum = search.best(starts)
             self.looked += optimum.looked
             bound = optimum.rows.scenario[optimum.multipliers > 0]
@@ -317,7 +305,7 @@ class _Work:
                 self.scenarios = [scenario for place, scenario in enumerate(self.scenarios) if place in bound]
             level = max(optimum.worst, 0.0 if column is not None else -math.inf)
             starts = [search.shares(optimum)]
-            if self._added(optimum.gains, level) or self.limits.heard(self.scenarios, optimum.gains):
+            if self._added(optimum.gains, level):
                 if not self.late:
                     continue
                 return search.at(begun[0]) if begun else optimum
@@ -347,44 +335,50 @@ class _Work:
     def _settled(self, optimum: Optimum) -> tuple[list[Fraction], list[Proved], Scenario | None]:
         """Return gains as they are typed, what is proved of them, and a scenario that they don't bear."""
         column = self.demands.aim.column
-        shares = [0.0] if column is None else BACK if self._unproved or not self.demands.over else BACK_IN_BOX
-        if not optimum.multipliers.any():  # the end of a range, which leaves room
-            shares = [0.0, *shares]
-        place, middle = 0, None
+        shares = BACK if self._unproved or not self.demands.over else BACK_IN_BOX
+        if column is None:
+            shares = (0.0,)
+        elif not optimum.multipliers.any():  # the end of a range, which leaves room
+            shares = (0.0, *shares)
+        left = list(shares)
         while True:
-            gains = [_decimal(value, DIGITS) for value in optimum.gains.tolist()]
-            if column is not None:
-                gains[column] = self._back(float(optimum.gains[column]), shares[place])
-                if column < len(self.demands.free):
-                    interval = self.demands.free[column]
-                    gains[column] = min(max(gains[column], interval.low), interval.high)
-            if column is None or len(gains) > 1:
-                middle = self._middle(gains, column, optimum) if middle is None else middle
-                gains = self._typed(gains, column, middle)
-            if self.demands.aim.level:
-                gains[-1] = self._worth(gains)
+            gains = self._typed(optimum, left[0])
             point = np.array([float(gain) for gain in gains])
             if column is not None and not self.late and self._added(point, -ABOVE):
-                middle = None
                 continue
             held = column is None or float(self.limits.worst(self.every, point[None]).max()) < 0
-            last = self.late or place + 1 == len(shares)
+            last = self.late or len(left) == 1
             if held or last:
                 proofs, failed = self._proofs(gains, whole=last)
                 proved = self._unproved or all(proof.proof.stable for proof in proofs)
                 if failed is not None or last or proved:
                     return gains, proofs, failed
-            place += 1
+            del left[0]
+
+    def _typed(self, optimum: Optimum, share: float) -> list[Fraction]:
+        """Return gains to as few digits as bear the scenarios, what is best of them less a share of it."""
+        aim, free = self.demands.aim, self.demands.free
+        best = self.limits.worst(self.scenarios, optimum.gains[None]).max()
+        room = 0.0 if aim.column is not None else best + NEARLY * abs(best)
+        gains: list[Fraction] = []
+        for digits in range(DIGITS if self.late else 1, DIGITS + 1):
+            gains = [_decimal(value, digits) for value in optimum.gains.tolist()]
+            if aim.column is not None:
+                gains[aim.column] = self._back(float(optimum.gains[aim.column]), share)
+            pairs = zip(gains, free, strict=False)
+            gains[: len(free)] = [min(max(gain, interval.low), interval.high) for gain, interval in pairs]
+            point = np.array([[float(gain) for gain in gains]])
+            if self.limits.worst(self.scenarios, point).max() <= room:
+                break
+        if aim.level:
+            gains[-1] = self._worth(gains)
+        return gains
 
     def _worth(self, gains: Sequence[Fraction]) -> Fraction:
         """Return the level that an aim keeps with gains in every scenario, rounded to where it is kept."""
         point = np.array([float(gain) for gain in gains])
-        sums = [
-            self.limits.sums(scenario.setting, np.append(point, scenario.point)[None])[0]
-            for scenario in self.every
-        ]
-        larger = self.demands.aim.larger
-        worst = float(min(sums) if larger else max(sums))
+        larger, sums = self.demands.aim.larger, self.limits.sums(self.every, point[None])
+        worst = float(sums.min() if larger else sums.max())
         if not math.isfinite(worst):
             return gains[-1]
         margin = (-1 if larger else 1) * SLACK * self.demands.aim.scale
@@ -395,52 +389,6 @@ class _Work:
         larger = self.demands.aim.larger
         moved = value * (1 - share if larger == (value > 0) else 1 + share)
         return _decimal(moved, DIGITS, ROUND_FLOOR if larger else ROUND_CEILING)
-
-    def _rest(self, gains: Sequence[Fraction], column: int | None) -> Limits:
-        """Return the limits of all other gains, the number in a column being as it is."""
-        free, aim = self.demands.free, self.demands.aim
-        if column is None:
-            return self.limits
-        if aim.level:
-            fixed_level = replace(aim, level=None, fixed=float(gains[column]))
-            return replace(self.limits, demands=replace(self.demands, aim=fixed_level), samples={})
-        others = tuple(interval for place, interval in enumerate(free) if place != column)
-        fixed = apply(self.system, [Override(free[column].free, gains[column])])
-        demands, heard = replace(self.demands, free=others), self.limits.frequencies
-        return Limits(fixed, self.limits.prepared, demands, self.until, frequencies=heard)
-
-    def _middle(self, gains: Sequence[Fraction], column: int | None, optimum: Optimum) -> Floats:
-        """Return the other gains where there is most room beside the one in a column."""
-        if column is None:
-            return optimum.gains
-        if self.late:  # where no time is left to see if other scenarios bear the middle
-            return np.delete(optimum.gains, column)
-        search = Search(self._rest(gains, column), self.scenarios, None, steps=STEPS)
-        begin = replace(optimum, gains=np.delete(optimum.gains, column))
-        return search.rough(search.shares(begin)).gains
-
-    def _typed(self, gains: list[Fraction], column: int | None, middle: Floats) -> list[Fraction]:
-        """Return gains of which all but one are their middle to as few digits as leave room."""
-        rest = self._rest(gains, column)
-        ranges = rest.demands.free
-        digits = range(DIGITS if self.late else 1, DIGITS + 1)
-        listed = [
-            [
-                min(max(_decimal(value, count), interval.low), interval.high)
-                for value, interval in zip(middle, ranges, strict=True)
-            ]
-            for count in digits
-        ]
-        points = np.array([*listed, middle], dtype=np.float64)
-        worst = rest.worst(self.scenarios, points).max(axis=1)
-        room = (
-            worst[-1] + (1 - ROOM) * abs(worst[-1])
-            if column is not None
-            else worst[-1] + 1e-4 * abs(worst[-1])
-        )
-        fits = np.flatnonzero(worst[:-1] <= room)
-        others = iter(listed[int(fits[0]) if len(fits) else -1])
-        return [gain if place == column else next(others) for place, gain in enumerate(gains)]
 
     def _proofs(self, gains: Sequence[Fraction], *, whole: bool) -> tuple[list[Proved], Scenario | None]:
         """Return what is proved of gains with each number of peers, those first that limit them most.
@@ -664,8 +612,9 @@ class _Work:
                 for interval, value in zip(self.demands.box, scenario.point, strict=True)
             ]
             shape, frequency = self._mode(optimum, scenario, complex(rows.eigenvalue[place]))
-            if not math.isnan(rows.frequency_hz[place]):
-                frequency = float(rows.frequency_hz[place])
+            if math.isnan(frequency) and any(felt.name == HINF for felt in self.demands.measured):
+                point = np.append(optimum.gains, scenario.point)[None]
+                frequency = self.limits.peak_hz(scenario.setting, point)
             bindings.append(Binding(tuple(where), shape, frequency, tuple(buys)))
         return bindings
 
