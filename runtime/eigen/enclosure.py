@@ -11,8 +11,8 @@ Gershgorin's discs of D⁻¹(T + G)D, whatever the positive diagonal D. Discs th
 eigenvalues as there are of them.
 
 A queue that runs empty is nearly a Jordan block at zero, whose vectors are hardly several. Where it leaves
-the spectral radius uncertain, X takes an orthonormal basis of what small eigenvalues span, or all, in the
-place of their vectors; T is Schur's triangular form there, and D makes what is above its diagonal small.
+the spectral radius uncertain, X takes an orthonormal basis of what small eigenvalues span in the place of
+their vectors; T is Schur's triangular form there, and D makes what is above its diagonal small.
 """
 
 from __future__ import annotations
@@ -34,12 +34,11 @@ Complexes = NDArray[np.complex128]
 Truths = NDArray[np.bool_]
 Matrix = NDArray[Any]  # float64 or complex128
 
-# Eigenvalues smaller than this decide nothing (e-folding in a fifth of a frame) and are often one defective
-# cluster at zero, which is taken together.
+# Eigenvalues smaller than this decide nothing: e-folding in a fifth of a frame.
 SMALL = 1e-2
 
-# Where floats scatter clusters at zero to: below these eigenvalues are taken together, one after the other.
-CLUSTERS = SMALL, 0.3
+# Floats scatter defective clusters at zero as far as this: below it eigenvalues are taken together.
+CLUSTER = 0.3
 
 # How much larger than the largest of a cluster's discs must be those of a scaling that all can have.
 FARTHER = 1.25
@@ -81,12 +80,14 @@ def enclose_eigenvalues(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Encl
     values, errors = np.zeros(n, dtype=np.complex128), np.zeros(n)
     right, left = np.zeros((2, n, n), dtype=np.complex128)
     low = high = 0.0
-    for part in components(~(np.abs(matrix) + error == 0)) if n else []:
-        square = np.ix_(part, part)
-        pairs, bounds = enclose_stack(matrix[square][None], error[square][None])
-        values[part], errors[part] = pairs.values[0], bounds.errors[0]
-        right[square], left[square] = pairs.right[0], pairs.left[0]
-        low, high = float(np.maximum(low, bounds.low[0])), float(np.maximum(high, bounds.high[0]))
+    parts = components(~(np.abs(matrix) + error == 0)) if n else []
+    for size in {len(part) for part in parts}:  # all of a size at once
+        places = np.array([part for part in parts if len(part) == size])
+        square = places[:, :, None], places[:, None]
+        pairs, bounds = enclose_stack(matrix[square], error[square])
+        values[places], errors[places] = pairs.values, bounds.errors
+        right[square], left[square] = pairs.right, pairs.left
+        low, high = float(np.maximum(low, bounds.low.max())), float(np.maximum(high, bounds.high.max()))
     order = descending(values)
     return Eigenpairs(values, right, left).at(order), Enclosure(low, high, errors[order])
 
@@ -128,7 +129,7 @@ def _enclose_split(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure
     pairs = pairs.at(descending(pairs.values)[0])
     sizes = np.abs(pairs.values[0])
     low, high, errors = 0.0, np.inf, np.full(len(sizes), np.inf)
-    for limit in (0.0, *CLUSTERS, np.inf):
+    for limit in (0.0, CLUSTER):
         if high - low <= SHARP * max(low, 1.0):
             break
         form, basis, small = load_pool("scipy.linalg").schur(
