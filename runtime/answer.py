@@ -22,9 +22,9 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.spectrum import UNSTABLE
 from apc.frame.instance import Prepared, prepare
 from apc.result import Result
-from apc.vary.margins import NOT_STABLE, Margins
+from apc.vary.margins import NOT_STABLE, Margins, network_margins
 from apc.vary.margins import margins as margins_of
-from apc.vary.sensitivity import Sensitivities, sensitivities, varied
+from apc.vary.sensitivity import Sensitivities, network_sensitivities, sensitivities, varied
 
 if TYPE_CHECKING:
     from apc.analysis.box_proof import BoxProof
@@ -188,7 +188,6 @@ def _over_network(
     if all(link.channel is None for link in system.links):
         return None
     from apc.moments.network_verdict import judge_network
-    from apc.vary.over_network import network_margins, network_sensitivities
 
     verdict = judge_network(system, prepared, certify=certify)
     if verdict is None:

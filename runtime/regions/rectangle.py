@@ -1,6 +1,6 @@
 """Frame matrices over a rectangle of two parameters, as points of the unit square.
 
-Takes: an `Evaluator` of two free parameters and their ranges.
+Takes: a `MatrixSource` of two free parameters and their ranges.
 Gives: `Rectangle`, `rectangle_of`; `DirectFamily`, `family_over`.
 Guarantees: every point is computed anew; errors are bounds at points inside the rectangle. States that drive
 each other are a system of their own: peers that hear each other one way only share nearly equal eigenvalues,
@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.eigenpairs import components, driving_parts
+from apc.eigen.eigenpairs import driving_parts
 from apc.frame.names import Range
 from apc.vary.batch import MatrixSource
 from apc.vary.leading import Part
@@ -56,16 +56,14 @@ def rectangle_of(x: Range, y: Range) -> Rectangle:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DirectFamily:
-    """A `Family` that asks the evaluator for every point.
+    """Matrices over a rectangle: the evaluator is asked for every point.
 
-    `parts` are its systems, `states` how many states each of the evaluator's has; without parts they are
-    those of the points asked for.
+    `parts` are its systems, `errors` bound those of their matrices (n, n).
     """
 
     evaluator: MatrixSource
     rectangle: Rectangle
     parts: tuple[Part, ...]
-    states: tuple[int, ...]
     errors: tuple[Floats, ...]
 
     @property
@@ -76,14 +74,7 @@ class DirectFamily:
     def matrices(self, points: Floats) -> tuple[Floats, ...]:
         """Return each system's matrices (k, n, n) at points (k, 2)."""
         whole = self.evaluator.matrices(self.rectangle.values(points))
-        if self.parts:
-            return tuple(self._part(part, whole[part.system]) for part in self.parts)
-        driving = [components((values != 0).any(axis=0)) for values in whole]
-        return tuple(
-            values[:, states[:, None], states]
-            for values, parts in zip(whole, driving, strict=True)
-            for states in parts
-        )
+        return tuple(_of_part(part, whole[part.system]) for part in self.parts)
 
     def slopes(self, system: int, points: Floats) -> tuple[Floats, Floats]:
         """Return one system's matrices (k, n, n) and their derivatives (2, k, n, n) over x and y."""
@@ -91,37 +82,20 @@ class DirectFamily:
         values = np.concatenate([self.rectangle.values(points)] * 2)
         along = np.zeros_like(values)
         along[:count, 0], along[count:, 1] = self.rectangle.width
-        matrix, slope = (
-            self._part(part, _sized(value, self.states[part.system]))
-            for value in self.evaluator.slopes(values, along)[part.system]
-        )
+        pair = self.evaluator.slopes(values, along)[part.system]
+        matrix, slope = (_of_part(part, value) for value in pair)
         return matrix[:count], slope.reshape(2, count, *slope.shape[1:])
 
-    def _part(self, part: Part, matrices: Floats) -> Floats:
-        """Return the rows and columns of a part in matrices (k, n, n) of its system."""
-        if len(part.states) == self.states[part.system]:
-            return matrices
-        return matrices[:, part.states[:, None], part.states]
 
-
-def _sized(matrices: Floats, size: int) -> Floats:
-    """Return matrices (k, n, n) as (k, size, size): zeros are put on or left off, which moves nothing.
-
-    All of a matrix is NaN where there is none, or one with more states than that.
-    """
-    n = matrices.shape[1]
-    if n == size:
+def _of_part(part: Part, matrices: Floats) -> Floats:
+    """Return the rows and columns of a part in matrices (k, n, n) of its system."""
+    if len(part.states) == matrices.shape[1]:
         return matrices
-    values = np.zeros((len(matrices), size, size))
-    both = min(n, size)
-    values[:, :both, :both] = matrices[:, :both, :both]
-    lost = matrices[:, both:].any(axis=(1, 2)) | matrices[:, :, both:].any(axis=(1, 2))
-    values[lost | ~np.isfinite(matrices).all(axis=(1, 2))] = np.nan
-    return values
+    return matrices[:, part.states[:, None], part.states]
 
 
-def family_over(source: MatrixSource, rectangle: Rectangle, errors: Errors, *, split: bool) -> DirectFamily:
-    """Return the matrices over a rectangle.
+def family_over(source: MatrixSource, rectangle: Rectangle, errors: Errors) -> DirectFamily:
+    """Return the matrices over a rectangle, the states that drive each other by themselves.
 
     Parameters
     ----------
@@ -131,15 +105,12 @@ def family_over(source: MatrixSource, rectangle: Rectangle, errors: Errors, *, s
         Their ranges.
     errors
         Bounds (k, n, n) on the errors of each system's matrices at values (k, 2), entry by entry.
-    split
-        Whether a system has the same states everywhere: those that drive each other are then taken by
-        themselves.
     """
     corners = rectangle.values(np.array([[0.1, 0.1], [0.1, 0.9], [0.9, 0.1], [0.9, 0.9]]))
     wrong = tuple(values.max(axis=0) for values in errors(corners))
     parts: list[Part] = []
     for system, (error, matrix) in enumerate(zip(wrong, source.matrices(corners), strict=True)):
-        driving = driving_parts(np.abs(matrix).max(axis=0) + error != 0) if split else []
+        driving = driving_parts(np.abs(matrix).max(axis=0) + error != 0)
         parts += [Part(system, states) for states in driving or [np.arange(len(error))]]
     own = tuple(wrong[part.system][np.ix_(part.states, part.states)] for part in parts)
-    return DirectFamily(source, rectangle, tuple(parts), tuple(map(len, wrong)), own)
+    return DirectFamily(source, rectangle, tuple(parts), own)

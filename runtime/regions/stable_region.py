@@ -11,13 +11,14 @@ Does not: draw, or write files (see `present`).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import analyze, near_start, prepare_at_start
+from apc.analysis.analysis import near_start, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake
 from apc.compiler.timings import part
@@ -36,14 +37,15 @@ from apc.regions.curves import between
 from apc.regions.deciding import Eigenvalues, largest, log_magnitudes
 from apc.regions.rectangle import DirectFamily, Rectangle, family_over, rectangle_of
 from apc.regions.strips import BRANCHES, Striped, trace_strips
-from apc.regions.survey import blurred, survey
+from apc.regions.survey import blurred, just_inside, survey
 from apc.result import Look, Result
 from apc.threads import single_threaded
 from apc.vary.crossing import Progress
 from apc.vary.evaluator import (
-    PointEvaluator,
+    closed_at,
     evaluator_of_many,
     overrides_at,
+    parameters_suffice,
     reaches_count,
     reaches_time,
 )
@@ -52,9 +54,9 @@ from apc.vary.growth import (
     MEAN_SQUARE,
     NOMINAL,
     PASSIVE,
-    GrowthEvaluator,
+    RadiusEvaluator,
     criterion_of,
-    growth_at,
+    judge_at,
     refuse_time,
 )
 from apc.vary.leading import Part
@@ -285,36 +287,30 @@ def region(
     rectangle = rectangle_of(*axes)
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         prepared = prepared or prepare(system)
-        used = [prepared.jacobians[group.kind] for group in system.groups]
-        affine = all(site.affine for site in used)
+        affine = all(prepared.jacobians[group.kind].affine for group in system.groups)
         times = [place for place, item in enumerate(free) if reaches_time(system, item)]
         counts = [place for place, item in enumerate(free) if reaches_count(system, item)]
         if counts:
             _check_count(axes[counts[0]], len(counts) == 2, bool(times), meant, affine=affine)
-        times += counts
-        by_growth = meant in BY_GROWTH
-        times = [] if by_growth else times
-        suffice = all(site.parameters_suffice for site in used)
-        plane = _plane(system, free, rectangle, prepared, meant, timed=bool(times))
+        times = [] if meant in BY_GROWTH else times + counts
+        start = None if meant in BY_GROWTH else prepare_at_start(system, prepared, free)
+        plane = _points_plane(system, free, rectangle, prepared, meant, stepped=bool(times))
         striped: Striped | None = None
-        anywhere = not (by_growth or times or suffice)
-        start = prepare_at_start(system, prepared, free) if anywhere or len(times) == 1 else None
-        if start is not None and anywhere:
-            at_once = _plane(system, free, rectangle, start, meant, timed=False)
-            try:
-                striped = _surveyed(at_once, cells, tolerance, progress)
-                plane = at_once
-            except ApcError as error:
-                if error.mistakes[0].code != "E905":
-                    raise
-                # Other motions are free where it starts elsewhere: they are told point by point.
-                points = PointEvaluator(system, free, prepared, start)
-                family = replace(plane.family, evaluator=points)
-                plane = replace(plane, family=family, closed_at=points.closed_at)
-        elif start is not None:
+        if start is not None and len(times) == 1:
             striped = trace_strips(
                 system, axes, times[0], start, cells=cells, tolerance=tolerance, progress=progress
             )
+        elif start is not None and not times:
+            whole_plane = _matrix_plane(system, free, rectangle, start)
+            try:
+                striped = _surveyed(whole_plane, cells, tolerance, progress)
+                plane = whole_plane
+            except ApcError as error:
+                # Where other motions are free than where it starts they are told point by point.
+                if error.mistakes[0].code != "E905" or parameters_suffice(system, prepared):
+                    raise
+        if striped is None:
+            tolerance = max(tolerance, TOLERANCE_OF_GROWTH)
         stepped = plane.stepped and striped is None
         striped = striped or _surveyed(plane, cells, tolerance, progress)
         curves = tuple(_curve(plane, arc, meant) for arc in striped.arcs)
@@ -367,30 +363,32 @@ class _Plane:
     halvings: int = 0
 
 
-def _plane(
+def _points_plane(
     system: CompiledSystem,
     free: tuple[Free, ...],
     rectangle: Rectangle,
     prepared: Prepared,
     meant: str,
     *,
-    timed: bool,
+    stepped: bool,
 ) -> _Plane:
-    """Return what gives the matrices of a criterion; `timed`: a time or a number of peers varies."""
-    if meant in BY_GROWTH:
-        growth = GrowthEvaluator(system, free, prepared, PLACE, meant)
-        # One point's bounds are enough, and dear.
-        errors = tuple(values[0] for values in growth.errors(rectangle.values(np.array([[0.5, 0.5]]))))
-        parts = tuple(Part(place, np.arange(len(error))) for place, error in enumerate(errors))
-        family = DirectFamily(growth, rectangle, parts, tuple(map(len, errors)), errors)
-        # What hands can draw is known as the damping needed, which jumps.
-        return _Plane(family, None, meant == PASSIVE, HALVINGS)
-    if timed:  # each point has a schedule of its own: there are no slopes, and no one size
-        points = PointEvaluator(system, free, prepared)
-        return _Plane(DirectFamily(points, rectangle, (), (), ()), points.closed_at, stepped=True)
+    """Return what gives the one number of a criterion; `stepped`: a time or a number of peers varies."""
+    source = RadiusEvaluator(system, free, prepared, PLACE, meant)
+    # One point's bounds are enough, and dear.
+    (errors,) = source.errors(rectangle.values(np.array([[0.5, 0.5]])))
+    family = DirectFamily(source, rectangle, (Part(0, np.arange(1)),), (errors[0],))
+    closed = partial(closed_at, system, free, prepared) if meant == NOMINAL else None
+    # What hands can draw is known as the damping needed, which jumps.
+    halvings = HALVINGS if meant == PASSIVE else 0
+    return _Plane(family, closed, stepped or meant == PASSIVE, halvings)
+
+
+def _matrix_plane(
+    system: CompiledSystem, free: tuple[Free, ...], rectangle: Rectangle, prepared: Prepared
+) -> _Plane:
+    """Return what gives the matrices of a scene."""
     source = evaluator_of_many(system, free, PLACE, prepared=prepared)
-    family = family_over(source, rectangle, source.errors, split=source.same_shape)
-    return _Plane(family, source.closed_at, stepped=False)
+    return _Plane(family_over(source, rectangle, source.errors), source.closed_at, stepped=False)
 
 
 def _surveyed(plane: _Plane, cells: int, tolerance: float, progress: Progress | None) -> Striped:
@@ -409,7 +407,7 @@ def _surveyed(plane: _Plane, cells: int, tolerance: float, progress: Progress | 
         result = survey(samples, cells=cells)
         arcs = trace_steps(
             lambda points: samples(points)[:, 0],
-            lambda point: largest(plane.family.matrices(point[None])),
+            lambda point: _leading(plane, point),
             result,
             halvings=plane.halvings,
         )
@@ -441,9 +439,19 @@ def _samples(plane: _Plane, points: Floats) -> Floats:
     return log_magnitudes(matrices, BRANCHES)
 
 
+def _leading(plane: _Plane, point: Floats) -> complex:
+    """Return the eigenvalue that decides at a point (2,) where one number is known."""
+    source = plane.family.evaluator
+    assert isinstance(source, RadiusEvaluator), "one number is known"
+    modes = source.verdict(plane.family.rectangle.values(point).tolist()).modes
+    return modes[0].eigenvalue if modes else largest(plane.family.matrices(point[None]))
+
+
 def _curve(plane: _Plane, arc: Arc, criterion: str) -> Curve:
     """Return an arc in SI."""
-    rectangle = plane.family.rectangle
+    rectangle, values = plane.family.rectangle, arc.values
+    if arc.smooth and criterion == NOMINAL and isinstance(plane.family.evaluator, RadiusEvaluator):
+        values = np.array([_leading(plane, point) for point in just_inside(arc.knots)])
     return Curve(
         points=rectangle.values(arc.points),
         handles=rectangle.values(arc.handles),
@@ -452,7 +460,7 @@ def _curve(plane: _Plane, arc: Arc, criterion: str) -> Curve:
         closed=arc.closed,
         smooth=arc.smooth,
         knots=rectangle.values(arc.knots),
-        eigenvalues=arc.values,
+        eigenvalues=values,
         criterion=criterion,
         closed_at=plane.closed_at,
     )
@@ -511,10 +519,7 @@ def _decide(region: Region, values: Floats) -> NDArray[np.bool_]:
     prepared = prepare(region.system)
     decided = []
     for value in values.tolist():
-        changed = apply(region.system, overrides_at(region.system, (region.x.free, region.y.free), value))
-        if region.criterion in BY_GROWTH:
-            judged = growth_at(changed, prepared, [], PLACE, criterion=region.criterion)
-            decided.append(bool(judged.stable))
-        else:
-            decided.append(bool(analyze(changed, prepared=prepared).stable))
+        overrides = overrides_at(region.system, (region.x.free, region.y.free), value)
+        verdict = judge_at(region.system, prepared, overrides, PLACE, criterion=region.criterion)
+        decided.append(bool(verdict.stable))
     return np.array(decided, dtype=bool)

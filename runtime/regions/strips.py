@@ -25,18 +25,19 @@ from apc.compiler.compiled import CompiledSystem
 from apc.eigen.relative import relative_bounded
 from apc.eigen.spectrum import mode_near
 from apc.frame.instance import Prepared
-from apc.frame.names import Range, parameter_of
+from apc.frame.names import Free, Range, parameter_of
 from apc.regions.axes import PLACE
 from apc.regions.boundary import Arc, straight_arc, traced
 from apc.regions.curves import tangents
-from apc.regions.deciding import Eigenvalues, largest, log_magnitudes
+from apc.regions.deciding import Eigenvalues, log_magnitudes
 from apc.regions.rectangle import DirectFamily, Rectangle, family_over, rectangle_of
 from apc.regions.survey import HALVINGS
 from apc.vary.batch import batch_evaluator
 from apc.vary.counts import count_pieces
 from apc.vary.crossing import ESTIMATE, search
 from apc.vary.delays import Piece, delay_pieces, pace, system_with_delay
-from apc.vary.evaluator import PointEvaluator, evaluator_of_many, generic, reaches_count
+from apc.vary.evaluator import closed_at, evaluator_of_many, generic, reaches_count
+from apc.vary.growth import NOMINAL, RadiusEvaluator
 from apc.vary.line import MatrixLine
 
 Floats = NDArray[np.float64]
@@ -119,7 +120,7 @@ def trace_strips(
         if strip is None:
             return None
         strips.append(strip)
-    whole = PointEvaluator(system, (delay.free, other.free), prepared)
+    whole = RadiusEvaluator(system, (delay.free, other.free), prepared, PLACE, NOMINAL)
     arcs = [list(strip.arcs) for strip in strips]
     rectangle = rectangle_of(delay, other)
     edges = []
@@ -128,7 +129,8 @@ def trace_strips(
 
     def mode_of(arc: Arc) -> str:
         value = rectangle.values(arc.knots)[0].tolist()
-        return mode_near(whole.closed_at(value), complex(arc.values[0])).shape
+        closed = closed_at(system, whole.free, prepared, value)
+        return mode_near(closed, complex(arc.values[0])).shape
 
     listed = _joined([arc for own in arcs for arc in own] + edges, mode_of)
     widest = max(strip.end - strip.start for strip in strips)
@@ -163,7 +165,6 @@ def _strips(
     # What is too much is so before any strip is looked at.
     longest = system_with_delay(system, delay.free, delay.high)
     evaluator_of_many(longest, [other.free], PLACE, prepared=prepared)
-    source = PointEvaluator(system, (delay.free, other.free), prepared)
     tell = pace(system, delay.free, delay.low, delay.high, place=PLACE, progress=progress)
     for piece in delay_pieces(system, delay.free, delay.low, prepared, place=PLACE, high=delay.high):
         high = min(piece.high, delay.high)
@@ -172,7 +173,7 @@ def _strips(
         if piece.evaluator is None:
             yield _standing(piece, other, ends, prepared)
         else:
-            yield _moving(source, delay, other, piece, ends, cells, tolerance)
+            yield _moving(system, delay, other, piece, ends, prepared, cells, tolerance)
 
 
 def _standing(piece: Piece, other: Range, ends: Sequence[float], prepared: Prepared) -> _Strip | None:
@@ -206,11 +207,12 @@ def _standing(piece: Piece, other: Range, ends: Sequence[float], prepared: Prepa
 
 
 def _moving(
-    source: PointEvaluator,
+    system: CompiledSystem,
     delay: Range,
     other: Range,
     piece: Piece,
     ends: Sequence[float],
+    prepared: Prepared,
     cells: int,
     tolerance: float,
 ) -> _Strip | None:
@@ -218,7 +220,7 @@ def _moving(
     low = np.array([float(piece.low), float(other.low)])
     high = np.array([float(min(piece.high, delay.high)), float(other.high)])
     rectangle = Rectangle(low, high - low)
-    family = _within(source, piece, rectangle)
+    family = _within(system, (delay.free, other.free), prepared, piece, rectangle)
     if family is None:
         return None
     arcs, survey, area, off = traced(
@@ -232,15 +234,17 @@ def _moving(
     return _Strip(ends[0], ends[1], placed, (survey.corners[0], survey.corners[1]), area, off)
 
 
-def _within(source: PointEvaluator, piece: Piece, rectangle: Rectangle) -> DirectFamily | None:
+def _within(
+    system: CompiledSystem, free: tuple[Free, Free], prepared: Prepared, piece: Piece, rectangle: Rectangle
+) -> DirectFamily | None:
     """Return the matrices over a strip, each step linear in the delay; None where other motions are free."""
     assert piece.evaluator is not None, "something depends on the delay"
-    groups, exchange = lifted_groups(generic(piece.inside, source.free[1:]), prepared=source.prepared)
-    family = batch_evaluator(piece.inside, source.free, groups, exchange, durations=piece.evaluator.durations)
+    groups, exchange = lifted_groups(generic(piece.inside, free[1:]), prepared=prepared)
+    family = batch_evaluator(piece.inside, free, groups, exchange, durations=piece.evaluator.durations)
 
     def errors(values: Floats) -> tuple[Floats, ...]:
         """Return those of analyses at values, in the coordinates of the evaluator."""
-        closed = [source.closed_at(value) for value in values.tolist()]
+        closed = [closed_at(system, free, prepared, value) for value in values.tolist()]
         return tuple(
             np.stack(
                 [
@@ -253,7 +257,7 @@ def _within(source: PointEvaluator, piece: Piece, rectangle: Rectangle) -> Direc
 
     if any(wiring.moving for wiring in family.wirings):
         return None
-    return family_over(family, rectangle, errors, split=True)
+    return family_over(family, rectangle, errors)
 
 
 def _placed(arc: Arc, ends: Sequence[float]) -> Arc:
@@ -283,7 +287,7 @@ def _join(
     arcs: list[list[Arc]],
     place: int,
     same: float,
-    source: PointEvaluator,
+    source: RadiusEvaluator,
     rectangle: Rectangle,
 ) -> list[Arc]:
     """Join the curves of two strips at the edge between them; return the straight pieces along it.
@@ -332,7 +336,7 @@ def _edge_piece(
     stable_before: bool,
     strips: Sequence[_Strip],
     place: int,
-    source: PointEvaluator,
+    source: RadiusEvaluator,
     rectangle: Rectangle,
 ) -> Arc:
     """Return a piece of the boundary along an edge between strips, and the motion that grows beside it."""
@@ -340,7 +344,8 @@ def _edge_piece(
     inside = (1 if stable_before else -1) * INSIDE * (grows.end - grows.start)
     knot = np.array([edge + inside, (low + high) / 2])
     points = np.array([[edge, low], [edge, high]])
-    leading = largest(source.matrices(rectangle.values(knot[None])))
+    modes = source.verdict(rectangle.values(knot).tolist()).modes
+    leading = modes[0].eigenvalue if modes else complex(np.nan)
     # Upwards, the left-hand side is the strip before.
     points = points if stable_before else points[::-1].copy()
     return straight_arc(points, np.array([np.spacing(1.0)]), knot, leading)

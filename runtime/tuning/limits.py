@@ -26,6 +26,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.analysis.analysis import prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake
 from apc.eigen.eigenpairs import eigenvalues
@@ -37,7 +38,7 @@ from apc.tuning.demands import HINF, PLACE, SUBJECT, Demands, Felt
 from apc.vary.batch import BatchEvaluator, MatrixSource
 from apc.vary.delay_box import standing_delays
 from apc.vary.evaluator import evaluator_of_many
-from apc.vary.growth import BY_GROWTH, GrowthEvaluator
+from apc.vary.growth import BY_GROWTH, RadiusEvaluator
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -149,10 +150,11 @@ class Limits:
         if setting not in self.known:
             _, scene = self.settings[setting]
             free = [interval.free for interval in (*self.demands.free, *self.demands.box)]
+            start = None if self.by_growth else prepare_at_start(scene, self.prepared, free)
             self.known[setting] = (
-                GrowthEvaluator(scene, tuple(free), self.prepared, PLACE, self.demands.criterion)
-                if self.by_growth
-                else evaluator_of_many(scene, free, PLACE, prepared=self.prepared)
+                RadiusEvaluator(scene, tuple(free), self.prepared, PLACE, self.demands.criterion)
+                if start is None
+                else evaluator_of_many(scene, free, PLACE, prepared=start)
             )
         return self.known[setting]
 
@@ -293,7 +295,7 @@ class Limits:
                 point > [float(interval.low + interval.high) / 2 for interval in ranges], -1, 1
             )
             moved = np.vstack([point, point + STEP * inwards])
-            if isinstance(family, GrowthEvaluator):
+            if isinstance(family, RadiusEvaluator):
                 distinct, which = np.unique(self._numbers(moved), axis=0, return_inverse=True)
                 roots = np.array([family.parts(item) for item in distinct.tolist()])[which.reshape(-1)]
                 grown = np.nan_to_num(np.log(np.maximum(roots, TINY)), nan=BEYOND) - self.allowed

@@ -1,7 +1,7 @@
 """The frame matrices of a system for many values of its parameters at once, with their derivatives.
 
 Takes: groups of peers whose sites are affine, the exchange between them, and the parameters that vary.
-Gives: `MatrixSource`, `Evaluator`; `BatchEvaluator`, `batch_evaluator`; `lifted_systems`, `relative_here`,
+Gives: `MatrixSource`; `BatchEvaluator`, `batch_evaluator`; `lifted_systems`, `relative_here`,
 `inverse_size`, `is_beyond`.
 Guarantees: what is built once serves every value; rigid motions are taken out by their exact directions; a
 derivative is exact to rounding. A point whose matrices are not finite, or that has other rigid motions than
@@ -91,27 +91,6 @@ class MatrixSource(Protocol):
         """Return each system's matrices (k, n, n) and their derivatives along directions (k, m)."""
 
 
-class Evaluator(MatrixSource, Protocol):
-    """Frame matrices of closed systems over values of some parameters."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The names of the systems whose matrices are given."""
-
-    @property
-    def same_shape(self) -> bool:
-        """Whether each system has the same states everywhere."""
-
-    def closed_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
-        """Return the closed systems at one point (m,), as an analysis has them: with error bounds."""
-
-    def errors(self, values: Floats) -> tuple[Floats, ...]:
-        """Return bounds (k, n, n) on the errors of the matrices at values (k, m), entry by entry."""
-
-    def states(self) -> int:
-        """Return how many states the largest closed system has."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Bounded:
     """A closed system at k points.
@@ -145,7 +124,7 @@ class Bounded:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BatchEvaluator:
-    """An `Evaluator` of a scene whose matrices follow from its parameters in closed form.
+    """A `MatrixSource` of a scene whose matrices follow from its parameters in closed form.
 
     `durations` are the seconds of each step by its quanta, as (constant, slope), the slope over the only free
     value where that is a time. `tangents` are the coefficients of each kind with their derivatives, none
@@ -166,16 +145,6 @@ class BatchEvaluator:
     def closed(self) -> tuple[ClosedSystem, ...]:
         """The closed systems at a point that stands for all."""
         return tuple(wiring.system for wiring in self.wirings)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The names of the closed systems."""
-        return tuple(closed_system.name for closed_system in self.closed)
-
-    @property
-    def same_shape(self) -> bool:
-        """Each system has the same states everywhere."""
-        return True
 
     @property
     def timed(self) -> bool:

@@ -10,7 +10,6 @@ Does not: prove that there are no others, or find two nearer to each other than 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -26,8 +25,7 @@ from apc.compiler.words import with_unit
 from apc.frame.devices import replaced_hands
 from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, hangs_on_heard, prepare
-from apc.frame.linearize import reaches_start
-from apc.frame.names import Free, find, parameter_of, unit_of, values_by_group
+from apc.frame.names import Free, find, parameter_of, unit_of, value_now, values_by_group
 from apc.hands.passivity import passive_hands
 from apc.network.nominal import left_out, refuse_channel_number
 from apc.option_value import option_value
@@ -39,6 +37,7 @@ from apc.vary.delays import delay_now, pace
 from apc.vary.evaluator import (
     evaluator_of_many,
     many_packets,
+    parameters_suffice,
     reaches_count,
     reaches_time,
 )
@@ -47,16 +46,19 @@ from apc.vary.growth import (
     MEAN_SQUARE,
     NOMINAL,
     PASSIVE,
-    GrowthEvaluator,
-    GrowthLine,
+    PointLine,
+    RadiusEvaluator,
     criterion_of,
-    growth_at,
-    growth_points,
+    judge_at,
+    line_points,
     refuse_time,
 )
-from apc.vary.line import SPAN, AnalysedLine, CountLine, DelayLine, MatrixLine, delay_reach
+from apc.vary.line import SPAN, CountLine, DelayLine, MatrixLine, delay_reach
 
 _PLACE = Place("critical value")
+
+# The limits of a search in SI, None where not given.
+Ends = tuple[float | None, float | None]
 
 # Without a limit given, a delay is looked at over so many stretches at least, each from one coincidence of
 # events to the next, and up to so many times its present value.
@@ -169,8 +171,11 @@ def critical(
 
         def stable_of(changed: CompiledSystem) -> bool | None:
             if by_growth:
-                return growth_at(changed, prepared, [], _PLACE, criterion=chosen_criterion).stable
+                return judge_at(changed, prepared, [], _PLACE, criterion=chosen_criterion).stable
             return analyze(changed, prepared=prepared).stable
+
+        low, high = (None if limit is None else float(limit) for limit in limits)
+        ends = low, high
 
         if counted:
             result = search(
@@ -179,26 +184,23 @@ def critical(
             )
         elif by_growth:
             refuse_time(system, free, _PLACE, chosen_criterion)
-            low, high = (None if limit is None else float(limit) for limit in limits)
-            points = growth_points(system, free, low, high, present)
-            result = search(
-                GrowthLine(GrowthEvaluator(system, (free,), prepared, _PLACE, chosen_criterion), points),
-                progress=progress,
-            )
+            result = search(_singly(system, free, ends, prepared, chosen_criterion), progress=progress)
             if chosen_criterion == PASSIVE and not passive_hands(system, prepared).why:
                 result = replace(result, enters=True)  # where clamped devices shake all values are one
         elif timed:
-            start = _at_start(system, prepared, free)
+            start = prepare_at_start(system, prepared, [free])
+            if start is None:
+                raise hangs_on_heard(system)
             begin = limits[0] or Fraction(0)
             end = limits[1] or delay_reach(system, free, begin, pieces=PIECES, further=FURTHER)[0]
             tell = pace(system, free, begin, end, place=_PLACE, progress=progress)
             result = search(DelayLine(system, free, start, begin, end, tell))
         else:
-            at_start = None if reaches_start(system, free) else prepare_at_start(system, prepared)
-            result = search(_line(system, free, limits, at_start or prepared), progress=progress)
-            if at_start is not None and not result.sided:
+            at_start = prepare_at_start(system, prepared, [free])
+            result = search(_line(system, free, ends, at_start or prepared), progress=progress)
+            if at_start and not (result.sided or parameters_suffice(system, prepared)):
                 # Contacts close or open along the way, and other motions are left out of the verdict.
-                result = search(_line(system, free, limits, prepared), progress=progress)
+                result = search(_singly(system, free, ends, prepared, NOMINAL), progress=progress)
 
         def stable_now() -> bool | None:
             return stable_of(system)
@@ -247,32 +249,29 @@ def _everywhere(search: Search, present: float, stable_now: Callable[[], bool | 
     return f"{words} whatever its value: nothing that decides stability depends on it"
 
 
-def _line(system: CompiledSystem, free: Free, limits: Sequence[Fraction | None], prepared: Prepared) -> Line:
+def _line(system: CompiledSystem, free: Free, ends: Ends, prepared: Prepared) -> Line:
     """Return a scene along a parameter that reaches no time: by its matrices, or value by value."""
+    if not parameters_suffice(system, prepared):
+        return _singly(system, free, ends, prepared, NOMINAL)
     parameter = parameter_of(system, free)
-    low, high = (None if limit is None else float(limit) for limit in limits)
-    low = parameter.minimum if low is None else low
-    most = math.inf if parameter.maximum is None else parameter.maximum
+    low, high = ends
     try:
         family = evaluator_of_many(system, [free], _PLACE, prepared=prepared)
     except ApcError:
         if not many_packets(system, prepared):
             raise
-        scale = abs(parameter.value) or 1.0
-        top = min(SPAN * scale if high is None else high, most)
-        return AnalysedLine(system, free, prepared, low or 0.0, top, scale)
+        return _singly(system, free, ends, prepared, NOMINAL)
+    low = parameter.minimum if low is None else low
     line = MatrixLine(family, np.array([parameter.value]), 0, low, high)
-    if high is None and math.isfinite(most):
-        return replace(line, top=min(SPAN * line.scale, most))
+    if high is None and parameter.maximum is not None:
+        return replace(line, top=min(SPAN * line.scale, parameter.maximum))
     return line
 
 
-def _at_start(system: CompiledSystem, prepared: Prepared, free: Free) -> Prepared:
-    """Return what was prepared, as the parameters say; refuse a delay of a scene where they don't suffice."""
-    result = prepare_at_start(system, prepared, [free])
-    if result is None:
-        raise hangs_on_heard(system)
-    return result
+def _singly(system: CompiledSystem, free: Free, ends: Ends, prepared: Prepared, criterion: str) -> PointLine:
+    """Return a scene along a number, judged value by value."""
+    points, least = line_points(system, free, *ends, value_now(system, free) or 1.0)
+    return PointLine(RadiusEvaluator(system, (free,), prepared, _PLACE, criterion), points, least)
 
 
 def _limit(option: str, text: str | None, free: Free, unit: str) -> Fraction | None:

@@ -1,8 +1,8 @@
 """The values of one parameter at which one number passes 1: in mean square, or with passive hands.
 
 Takes: a `CompiledSystem` and the name of a parameter, or of what its links lose.
-Gives: `MEAN_SQUARE`, `NOMINAL`, `PASSIVE`, `BY_GROWTH`, `criterion_of`, `refuse_time`; `GrowthLine`,
-`growth_points`, `BOUNDED`; `growth_at`, `allowed`; `GrowthEvaluator`.
+Gives: `MEAN_SQUARE`, `NOMINAL`, `PASSIVE`, `BY_GROWTH`, `criterion_of`, `refuse_time`; `PointLine`,
+`line_points`, `BOUNDED`; `judge_at`, `allowed`; `RadiusEvaluator`.
 Guarantees: a verdict is by bounds on the growth of second moments, or on what hands can draw, which counts
 as a growth (see `passivity.passive_growth`).
 Does not: find two crossings between neighbouring samples; follow a delay, whose stretches are the nominal
@@ -15,10 +15,12 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.analysis.analysis import analyze
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.ages import aged
@@ -26,14 +28,13 @@ from apc.frame.instance import Prepared
 from apc.frame.names import Free, parameter_of, unit_of
 from apc.frame.overrides import Override, apply
 from apc.hands.passivity import loop_growths, passive_growth
-from apc.moments.network_verdict import Growth, growth
+from apc.moments.network_verdict import growth
 from apc.network.nominal import channel_numbers, unreliable
 from apc.vary.crossing import OneStretch, Stretch, Verdict
-from apc.vary.evaluator import reaches_time
-from apc.vary.line import SAMPLES, SPAN
+from apc.vary.evaluator import overrides_at, reaches_time
+from apc.vary.line import OPEN, SPAN, one_by_one, spread, verdict_of
 
 Floats = NDArray[np.float64]
-Complexes = NDArray[np.complex128]
 
 # The step of a difference, of a direction, whose cut-off and rounding are then alike; roots above 0.
 DIFFERENCE, LEAST = 1e-5, 1e-9
@@ -114,16 +115,16 @@ def refuse_time(system: CompiledSystem, free: Free, place: Place, criterion: str
 NOWHERE = ("E806", "E624")
 
 
-def growth_at(
+def judge_at(
     system: CompiledSystem,
     prepared: Prepared,
-    overrides: list[Override],
+    overrides: Sequence[Override],
     place: Place,
     *,
     bounded: bool = True,
     criterion: str = MEAN_SQUARE,
-) -> Growth:
-    """Return what second moments grow by with other numbers, or what stands for that by another criterion.
+) -> Verdict:
+    """Return the verdict with other numbers, by the spectral radius or what stands for it by a criterion.
 
     Parameters
     ----------
@@ -134,33 +135,40 @@ def growth_at(
     place
         Where they were asked for.
     bounded
-        Whether bounds are asked for.
+        Whether bounds are asked for; an analysis always has them.
     criterion
-        One of `BY_GROWTH`.
+        "nominal", or one of `BY_GROWTH`.
 
     Raises
     ------
     ApcError
-        E898 the network can't be judged with these numbers, by name; those of `passivity.passive_hands`.
+        E898 the network can't be judged with these numbers, by name; those of `passivity.passive_hands` and
+        of `analysis.analyze`.
     """
     changed = apply(system, overrides)
+    if criterion == NOMINAL:
+        return verdict_of(analyze(changed, prepared=prepared))
     if criterion == PASSIVE:
-        return passive_growth(changed, prepared, bounded=bounded)
-    result = growth(changed, prepared, bounded=bounded)
+        result = passive_growth(changed, prepared, bounded=bounded)
+    else:
+        result = growth(changed, prepared, bounded=bounded)
     if result.why:
         what = f"the scene can't be judged in mean square: {result.why}"
         hint = f"--in {NOMINAL}"
         if any(override.free.name in channel_numbers(system) for override in overrides):
             hint = "apc simulate" if aged(system) else "a narrower range between --lower and --upper"
         raise ApcError(Mistake("E898", place, what, hint=hint))
-    return result
+    proof = TAGGED if not result.exact else BOUNDED[criterion] if result.proved else ITERATED
+    error = max(result.high - result.radius, result.radius - result.low)
+    return Verdict(result.stable, result.radius, error, (), proof)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class GrowthEvaluator:
-    """An `Evaluator` of one number: the root of what is said to grow in a frame, as a matrix (1, 1).
+class RadiusEvaluator:
+    """A `MatrixSource` of one number at each point, as a matrix (1, 1): the radius that decides.
 
-    Derivatives are differences over a small part of the directions, right to about 1e-9 of them.
+    By a criterion of growth it is the root of what is said to grow in a frame. Derivatives are differences
+    over a small part of the directions, right to about 1e-9 of them.
     """
 
     system: CompiledSystem
@@ -169,24 +177,22 @@ class GrowthEvaluator:
     place: Place
     criterion: str = MEAN_SQUARE
 
-    def growth(self, value: Sequence[float], *, bounded: bool = False) -> Growth:
-        """Return what second moments grow by at a point (m,), NaN where there is none."""
-        overrides = [
-            Override(free, Fraction(float(number))) for free, number in zip(self.free, value, strict=True)
-        ]
+    def verdict(self, value: Sequence[float], *, bounded: bool = False) -> Verdict:
+        """Return the verdict at a point (m,), open where there is none."""
+        overrides = overrides_at(self.system, self.free, value)
         where = self.system, self.prepared, overrides, self.place
         try:
-            return growth_at(*where, bounded=bounded, criterion=self.criterion)
+            return judge_at(*where, bounded=bounded, criterion=self.criterion)
         except ApcError as error:
-            if error.mistakes[0].code not in NOWHERE:
+            if self.criterion != NOMINAL and error.mistakes[0].code not in NOWHERE:
                 raise
-            return Growth(math.nan, math.nan, math.nan, exact=True)
+            return OPEN
 
     def parts(self, value: Sequence[float]) -> list[float]:
         """Return the roots at a point (m,), of which the largest counts: one of each loop of hands."""
         if self.criterion != PASSIVE:
-            return [math.sqrt(self.growth(value).radius)]
-        changes = [Override(*pair) for pair in zip(self.free, map(Fraction, value), strict=True)]
+            return self.matrices(np.array([value]))[0].ravel().tolist()
+        changes = overrides_at(self.system, self.free, value)
         try:
             growths = loop_growths(apply(self.system, changes), self.prepared, bounded=False)
         except ApcError as error:
@@ -196,11 +202,12 @@ class GrowthEvaluator:
         return [math.sqrt(growth.radius) for growth in growths]
 
     def matrices(self, values: Floats) -> tuple[Floats, ...]:
-        """Return the root (k, 1, 1) at values (k, m)."""
-        return (np.sqrt([self.growth(value).radius for value in values.tolist()])[:, None, None],)
+        """Return the number (k, 1, 1) at values (k, m), NaN where there is none."""
+        radii = np.array([self.verdict(value).radius for value in values.tolist()])[:, None, None]
+        return (radii if self.criterion == NOMINAL else np.sqrt(radii),)
 
     def slopes(self, values: Floats, along: Floats) -> tuple[tuple[Floats, Floats], ...]:
-        """Return the root (k, 1, 1) and its derivatives along directions (k, m)."""
+        """Return the number (k, 1, 1) and its derivatives along directions (k, m)."""
         moved = DIFFERENCE * along
         # At an end of what a parameter may be, the parabola through two points further inside.
         at_end = ~(self._allowed(values - moved) & self._allowed(values + moved))[:, None]
@@ -220,13 +227,11 @@ class GrowthEvaluator:
         return result
 
     def errors(self, values: Floats) -> tuple[Floats, ...]:
-        """Return bounds (k, 1, 1) on the errors of the root at values (k, m)."""
-        growths = [self.growth(value, bounded=True) for value in values.tolist()]
-        return (
-            np.array([(growth.high - growth.low) / max(growth.radius, LEAST) for growth in growths])[
-                :, None, None
-            ],
-        )
+        """Return bounds (k, 1, 1) on the errors of the number at values (k, m)."""
+        verdicts = [self.verdict(value, bounded=True) for value in values.tolist()]
+        by = 1.0 if self.criterion == NOMINAL else 2.0
+        errors = [by * verdict.error / max(verdict.radius, LEAST) for verdict in verdicts]
+        return (np.array(errors)[:, None, None],)
 
 
 def allowed(system: CompiledSystem, free: Free) -> tuple[float, float]:
@@ -241,65 +246,63 @@ def allowed(system: CompiledSystem, free: Free) -> tuple[float, float]:
 
 
 @dataclass(frozen=True, eq=False)
-class GrowthLine(OneStretch):
-    """The one parameter of an evaluator of one number, at `points` (k,) to begin with."""
+class PointLine(OneStretch):
+    """The one parameter of a `RadiusEvaluator`, at `points` (k,) to begin with: each value by itself, once.
 
-    source: GrowthEvaluator
+    Cells are measured against `least` where the value is smaller.
+    """
+
+    source: RadiusEvaluator
     points: Floats
-    known: dict[float, Growth] = field(default_factory=dict)
+    least: float
+    known: dict[float, Verdict] = field(default_factory=dict)
 
     @property
     def label(self) -> str:
         """The number that varies."""
         return self.source.free[0].label
 
-    def look(self, values: Floats) -> tuple[Complexes, Complexes]:
-        """Return the growth at values (k, 1) without bounds, and no slopes."""
-        for value in values.tolist():
-            if value not in self.known:
-                self.known[value] = self.source.growth([value])
-        result = np.array([self.known[value].radius for value in values.tolist()], np.complex128)[:, None]
-        return result, np.full(result.shape, np.nan, np.complex128)
+    def _sampled(self, value: Fraction) -> Verdict:
+        """Return the verdict at a value, without bounds where these take longer."""
+        if float(value) not in self.known:
+            self.known[float(value)] = self.source.verdict([float(value)])
+        return self.known[float(value)]
 
     def judge(self, value: Fraction) -> Verdict:
         """Return the verdict at a value, bounded."""
-        growth = self.source.growth([float(value)], bounded=True)
-        proof = BOUNDED[self.source.criterion] if growth.proved else ITERATED
-        error = max(growth.high - growth.radius, growth.radius - growth.low)
-        return Verdict(growth.stable, growth.radius, error, (), proof if growth.exact else TAGGED)
+        if self.source.criterion == NOMINAL:
+            return self._sampled(value)
+        return self.source.verdict([float(value)], bounded=True)
 
     def stretches(self) -> Iterator[Stretch]:
         """Yield the one stretch."""
         low, high = Fraction(self.points[0]), Fraction(self.points[-1])
-        least = float(self.points[self.points > 0].min(initial=1.0))
-        yield Stretch(low, high, self.points, least, self.look, self.judge, slow=True)
+        look = partial(one_by_one, self._sampled)
+        yield Stretch(low, high, self.points, self.least, look, self.judge, slow=True)
 
 
-def growth_points(
-    system: CompiledSystem, free: Free, low: float | None, high: float | None, present: float
-) -> Floats:
-    """Return the values to look at first.
+def line_points(
+    system: CompiledSystem, free: Free, low: float | None, high: float | None, scale: float
+) -> tuple[Floats, float]:
+    """Return the values of a parameter to look at first, and what cells are measured against beside 0.
 
     Parameters
     ----------
     system, free
         The compiled scene and what varies.
     low, high
-        Between which values; where not given, a probability's all, or `SPAN` times smaller and larger than
-        the present value.
-    present
-        The present value.
+        Between which values; where not given, all of a probability, or from 0 (of what is negative, from
+        `SPAN` times it) up to `SPAN` times the scale.
+    scale
+        The present value or, where it is 0, what stands for it.
     """
     if unit_of(system, free.name) == "1" and free.name in channel_numbers(system):
         # Bursts that never end (r = 0) have no long run, and all packets lost neither.
         endless = {link.channel.loss.r for link in system.links if link.channel and link.channel.loss}
         least = 1 / SHARES if free.name in endless else 0.0
         bottom, top = low if low is not None else least, high if high is not None else 1 - 1 / SHARES
-        return np.linspace(bottom, top, SHARES)
-    scale = abs(present) or 1.0
-    bottom = low if low is not None else scale / SPAN
-    top = high if high is not None else max(scale, abs(bottom)) * SPAN
-    if bottom > 0:
-        count = max(math.ceil(SAMPLES * math.log10(top / bottom)), SAMPLES)
-        return np.geomspace(bottom, top, count + 1)
-    return np.linspace(bottom, top, 6 * SAMPLES + 1)
+        return np.linspace(bottom, top, SHARES), 1 / SHARES
+    least, most = allowed(system, free)
+    bottom = low if low is not None else max(least, 0.0 if scale > 0 else SPAN * scale)
+    top = high if high is not None else min(SPAN * max(abs(scale), abs(bottom)), most)
+    return spread(bottom, top, abs(scale)), abs(scale) / SPAN

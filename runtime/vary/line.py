@@ -1,7 +1,7 @@
 """A scene along one of its numbers: its eigenvalues at many values, and its analysis at any.
 
 Takes: a `CompiledSystem`, what was prepared of it, and the number that varies.
-Gives: `MatrixLine`, `DelayLine`, `CountLine`; `spread`, `SPAN`, `SAMPLES`.
+Gives: `MatrixLine`, `DelayLine`, `CountLine`; `spread`, `SPAN`; `one_by_one`, `verdict_of`, `OPEN`.
 Guarantees: `judge` is the scene's own analysis; `look` its matrices in floats.
 Does not: search (see `crossing`).
 """
@@ -28,7 +28,7 @@ from apc.eigen.spectrum import DRIFTS, Spectrum, solve_spectrum
 from apc.frame.instance import Prepared
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
-from apc.vary.batch import BatchEvaluator, Evaluator
+from apc.vary.batch import BatchEvaluator
 from apc.vary.crossing import ESTIMATE, UNSURE, Crossing, OneStretch, Stretch, Verdict
 from apc.vary.delays import (
     INSIDE,
@@ -68,23 +68,18 @@ NEAR = 1e-6
 # Counts from the lowest on are each looked at, so many of them; then each is so many times the one before.
 EVERY, FURTHER = 32, 1.25
 
+# Where there is no analysis.
+OPEN = Verdict(None, math.nan, math.inf, (), "")
+
 
 def judged(systems: Sequence[ClosedSystem]) -> Verdict:
     """Return the verdict of closed systems; what drifts does so on both sides of a crossing."""
-    spectrum = solve_spectrum(systems)
-    return _verdict(spectrum, spectrum.stable if spectrum.verdict != DRIFTS else True)
+    return verdict_of(solve_spectrum(systems), drifting=True)
 
 
-def analysed(system: CompiledSystem, prepared: Prepared) -> Verdict:
-    """Return the verdict of a scene, open where it drifts or can't be analysed."""
-    try:
-        analysis = analyze(system, prepared=prepared)
-    except ApcError:
-        return Verdict(None, math.nan, math.inf, (), "")
-    return _verdict(analysis, analysis.stable if analysis.verdict != DRIFTS else None)
-
-
-def _verdict(result: Spectrum | Analysis, stable: bool | None) -> Verdict:
+def verdict_of(result: Spectrum | Analysis, *, drifting: bool | None = None) -> Verdict:
+    """Return the verdict of an analysis; where the scene drifts, as is said."""
+    stable = result.stable if result.verdict != DRIFTS else drifting
     return Verdict(stable, result.spectral_radius, result.spectral_radius_error, result.modes, result.proof)
 
 
@@ -118,7 +113,7 @@ class MatrixLine(OneStretch):
     `bottom` and `top` are its ends, None for those of `SPAN`.
     """
 
-    family: Evaluator
+    family: BatchEvaluator
     base: Floats
     column: int
     bottom: float | None = None
@@ -162,7 +157,7 @@ class MatrixLine(OneStretch):
         yield Stretch(Fraction(bottom), Fraction(top), points, self.scale / SPAN, self.look, self.judge)
 
 
-def matrix_look(family: Evaluator, points: Floats, column: int) -> tuple[Complexes, Complexes]:
+def matrix_look(family: BatchEvaluator, points: Floats, column: int) -> tuple[Complexes, Complexes]:
     """Return the eigenvalues of all systems at points (k, m), and their slopes along one of the numbers.
 
     Returns
@@ -181,16 +176,15 @@ def matrix_look(family: Evaluator, points: Floats, column: int) -> tuple[Complex
     return values, slopes
 
 
-def _one_by_one(judge: Callable[[Fraction], Verdict], values: Floats) -> tuple[Complexes, Complexes]:
+def one_by_one(judge: Callable[[Fraction], Verdict], values: Floats) -> tuple[Complexes, Complexes]:
     """Return the radius at each value (k, 1) as if it were an eigenvalue, without a slope.
 
-    One nearer to the circle than floats can tell has the side that was proved; an open verdict has none.
+    One nearer to the circle than floats can tell has the side that was proved, where it was.
     """
     radii = []
     for verdict in (judge(Fraction(value)) for value in values.tolist()):
-        beside = abs(verdict.radius - 1) <= 2 * UNSURE
-        nearest = 1 - 2 * UNSURE if verdict.stable else 1 + 2 * UNSURE
-        radii.append(math.nan if verdict.stable is None else nearest if beside else verdict.radius)
+        beside = abs(verdict.radius - 1) <= 2 * UNSURE and verdict.stable is not None
+        radii.append(1 + (-2 if verdict.stable else 2) * UNSURE if beside else verdict.radius)
     result = np.array(radii, dtype=np.complex128)[:, None]
     return result, np.full(result.shape, np.nan, np.complex128)
 
@@ -219,28 +213,6 @@ class _JudgedLine:
 
 
 @dataclass(frozen=True, eq=False)
-class AnalysedLine(OneStretch, _JudgedLine):
-    """A parameter of a scene whose matrices are too large for many of them: each value is analysed."""
-
-    prepared: Prepared
-    bottom: float
-    top: float
-    scale: float
-
-    def _verdict(self, value: Fraction) -> Verdict:
-        return analysed(apply(self.system, [Override(self.free, value)]), self.prepared)
-
-    def stretches(self) -> Iterator[Stretch]:
-        """Yield the one stretch."""
-        points = spread(self.bottom, self.top, self.scale)
-        look = partial(_one_by_one, self.judge)
-        yield Stretch(
-            *(Fraction(self.bottom), Fraction(self.top), points, self.scale / SPAN, look, self.judge),
-            slow=True,
-        )
-
-
-@dataclass(frozen=True, eq=False)
 class DelayLine(_JudgedLine):
     """A delay from `low` to `high`: between two coincidences of events what decides is continuous.
 
@@ -255,7 +227,11 @@ class DelayLine(_JudgedLine):
     rigid: dict[int, list[int]] = field(default_factory=dict)
 
     def _verdict(self, value: Fraction) -> Verdict:
-        return analysed(system_with_delay(self.system, self.free, value), self.prepared)
+        changed = system_with_delay(self.system, self.free, value)
+        try:
+            return verdict_of(analyze(changed, prepared=self.prepared))
+        except ApcError:
+            return OPEN
 
     def _judge_within(self, value: Fraction) -> Verdict:
         """Return the verdict at a delay that moves events, of all systems without anything beside."""
@@ -292,7 +268,7 @@ class DelayLine(_JudgedLine):
         def look(_: Floats) -> tuple[Complexes, Complexes]:
             radius = self._radius(there)
             if abs(radius - 1) <= NEAR:
-                return _one_by_one(judge, point)
+                return one_by_one(judge, point)
             return np.array([[radius]], np.complex128), np.full((1, 1), np.nan, np.complex128)
 
         return Stretch(low, high, point, float(high - low), look, judge)
@@ -376,7 +352,7 @@ class CountLine(_JudgedLine):
 
     def stretches(self) -> Iterator[Stretch]:
         """Yield the counts that are looked at to begin with, in order."""
-        look = partial(_one_by_one, self.judge)
+        look = partial(one_by_one, self.judge)
         count = self.first
         while True:
             at = Fraction(count)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import analyze
+from apc.analysis.analysis import analyze, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Place
 from apc.compiler.timings import part
@@ -96,10 +96,11 @@ def eigenvalues_at(
     prepared
         From `instance.prepare`, of this system with any numbers.
     """
-    if reaches_count(system, free) or reaches_time(system, free):
+    start = prepare_at_start(system, prepared, [free])
+    if start is None or reaches_count(system, free) or reaches_time(system, free):
         return _one_by_one(system, free, values, prepared)
     with single_threaded(), np.errstate(all="ignore"):
-        family = evaluator_of_many(system, [free], Place(free.label), prepared=prepared)
+        family = evaluator_of_many(system, [free], Place(free.label), prepared=start)
         matrices = family.matrices(np.array(values, np.float64)[:, None])
     known = np.all([np.isfinite(matrix).all(axis=(1, 2)) for matrix in matrices], axis=0)
     chosen = [matrix[known] if len(matrix) > 1 else matrix for matrix in matrices]

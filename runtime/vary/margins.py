@@ -1,7 +1,7 @@
 """How much each coupler's stiffness and damping, and each delay, may grow before the boundary.
 
 Takes: a `CompiledSystem`.
-Gives: `Margin`, `Margins`, `margins`; `not_looked`; `coupler_parameters`; `STIFFNESSES`.
+Gives: `Margin`, `Margins`, `margins`, `network_margins`; `not_looked`; `coupler_parameters`; `STIFFNESSES`.
 Guarantees: a margin is the next crossing above the present value, with its error; none is said together with
 how far was looked.
 Does not: look below the present value (see `critical`), or vary two at once (see `box`).
@@ -17,24 +17,41 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apc.analysis.analysis import analyze, lifted_groups, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError
+from apc.compiler.errors import ApcError, Place
 from apc.compiler.timings import part
+from apc.compiler.words import counted
 from apc.eigen.modes import arrange
 from apc.eigen.peers import states_of
 from apc.eigen.spectrum import DRIFTS, finite
-from apc.frame.display_units import Unit
 from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, prepare
 from apc.frame.names import Free, named_times, parameter_of, unit_of, value_now
+from apc.moments.network_verdict import growth
+from apc.network.nominal import channel_numbers
 from apc.result import Result
 from apc.threads import single_threaded
-from apc.vary.crossing import ESTIMATE, Crossing, search
+from apc.vary.crossing import ESTIMATE, Search, search
 from apc.vary.delays import delay_now
-from apc.vary.evaluator import evaluator, free_parameters, many_packets
-from apc.vary.line import AnalysedLine, DelayLine, MatrixLine, delay_reach
+from apc.vary.evaluator import evaluator, free_parameters, many_packets, parameters_suffice
+from apc.vary.growth import (
+    BOUNDED,
+    MEAN_SQUARE,
+    NOMINAL,
+    PointLine,
+    RadiusEvaluator,
+    allowed,
+    line_points,
+)
+from apc.vary.line import DelayLine, MatrixLine, delay_reach
+from apc.vary.sensitivity import not_varied, of_channels
+
+Floats = NDArray[np.float64]
+
+PLACE = Place("margins")
 
 # Units of a stiffness and of a damping, along an axis or about one, as components write them.
 STIFFNESSES = ("N/m", "kg/s^2")
@@ -55,6 +72,11 @@ TAKES_LONG = "not looked for in passing in so large a scene (apc analyze --margi
 # Of larger systems a stiffness or damping is not looked at value by value, which takes half a minute of 400
 # states, nor a delay, which takes a minute or two of 800.
 MOST_SCANNED, MOST_DELAYED = 300, 1000
+
+# Values of a probability or jitter to look at, from the present one to the largest. More numbers times states
+# than this are looked at in mean square only if asked: a score of values of each number, of some milliseconds
+# and one more for every two states, are half a minute.
+SHARES, MOST_GROWN_IN_PASSING = 16, 500
 
 # What is said of a scene that is not stable.
 NOT_STABLE = "none: the scene is not {} as it is"
@@ -119,16 +141,17 @@ def margins(system: CompiledSystem, *, prepared: Prepared | None = None, quick: 
         slow = largest > MOST_SCANNED and many_packets(system, at)
         chosen = free if slow or largest <= MOST_SCANNED else []
         rest = [not_looked(system, item, f"{largest:,} states") for item in free if item not in chosen]
+        singly = slow or not parameters_suffice(system, at)
         now = analyze(system, prepared=prepared)
         if not now.stable and now.verdict != DRIFTS:
             return Margins((), NOT_STABLE.format("stable" if now.stable is False else "proved stable"))
         if not any(states):
             return Margins((), "none: nothing moves")
-        lines = _lines(system, chosen, at, slow=slow)
-        result = [row for pair in zip(chosen, lines, strict=True) if (row := _along(system, *pair))]
-        result += rest
-        result += [_delay_margin(system, delay, at, largest) for delay in delays]
-        return Margins(tuple(result), _notes(result, start))
+        lines = zip(chosen, _lines(system, chosen, at, singly=singly), strict=True)
+        rows = [_margin(system, item, search(line, first=True)) for item, line in lines if line]
+        rows += [*rest, *(_delay_margin(system, delay, at, largest) for delay in delays)]
+        result = tuple(filter(None, rows))
+        return Margins(result, _notes(result, start))
 
 
 def _loops(system: CompiledSystem, prepared: Prepared, *, most: float) -> list[int]:
@@ -174,24 +197,23 @@ def _delays(system: CompiledSystem) -> list[Free]:
 
 
 def _lines(
-    system: CompiledSystem, free: Sequence[Free], prepared: Prepared, *, slow: bool
-) -> Iterator[MatrixLine | AnalysedLine | None]:
+    system: CompiledSystem, free: Sequence[Free], prepared: Prepared, *, singly: bool
+) -> Iterator[MatrixLine | PointLine | None]:
     """Yield the line of each parameter from its present value on, None where it can't grow.
 
     What a stiffness of 0 leaves free is no relative motion of the scene as it is, but one of every scene in
-    which it varies: a parameter of 0 varies by itself.
+    which it varies: a parameter of 0 varies by itself. `singly`: each value is analysed by itself.
     """
     base = np.array([parameter_of(system, item).value for item in free])
     frees = [item for item, value in zip(free, base, strict=True) if value]
-    together = evaluator(system, frees, prepared=prepared) if frees and not slow else None
+    together = evaluator(system, frees, prepared=prepared) if frees and not singly else None
     for item, present in zip(free, base.tolist(), strict=True):
-        limit = parameter_of(system, item).maximum
-        most = math.inf if limit is None else limit
-        if slow:
+        most = allowed(system, item)[1]
+        if singly:
+            source = RadiusEvaluator(system, (item,), prepared, PLACE, NOMINAL)
             scale = abs(present) or 1.0
-            top = min(GROWTH * scale, most)
-            line = AnalysedLine(system, item, prepared, present, top, scale)
-            yield line if top > present else None
+            points, least = line_points(system, item, present, min(GROWTH * scale, most), scale)
+            yield PointLine(source, points, least) if points[-1] > present else None
             continue
         if present:
             assert together is not None, "it is among those that are not 0"
@@ -202,19 +224,7 @@ def _lines(
         yield replace(whole, top=top) if top > present else None
 
 
-def _along(system: CompiledSystem, free: Free, line: MatrixLine | AnalysedLine | None) -> Margin | None:
-    """Return the margin of a parameter, None where it can't grow or nothing depends on it."""
-    if line is None:
-        return None
-    result = search(line, first=True)
-    if not result.enters:
-        return None
-    lost = [edge for edge in result.edges if edge.stable_side == "below"]
-    present, unit = value_now(system, free), Unit.of(parameter_of(system, free))
-    return _margin(free.label, unit, present, lost[0] if lost else None, result.scanned[1])
-
-
-def _delay_margin(system: CompiledSystem, free: Free, prepared: Prepared, largest: int) -> Margin:
+def _delay_margin(system: CompiledSystem, free: Free, prepared: Prepared, largest: int) -> Margin | None:
     """Return the margin of a delay, in a scene whose largest loop has so many states."""
     now = delay_now(system, free)
     end, count = delay_reach(system, free, now, pieces=PIECES, further=FURTHER)
@@ -224,11 +234,9 @@ def _delay_margin(system: CompiledSystem, free: Free, prepared: Prepared, larges
     if largest > MOST_DELAYED and not late:
         return not_looked(system, free, f"{largest:,} states in each order of events")
     try:
-        result = search(DelayLine(system, free, prepared, now, end), first=True)
+        return _margin(system, free, search(DelayLine(system, free, prepared, now, end), first=True))
     except ApcError as error:
         return not_looked(system, free, error.mistakes[0].what)
-    crossing = result.edges[0] if result.edges else None
-    return _margin(free.name, "s", float(now), crossing, result.scanned[1])
 
 
 def not_looked(system: CompiledSystem, free: Free, why: str) -> Margin:
@@ -238,19 +246,101 @@ def not_looked(system: CompiledSystem, free: Free, why: str) -> Margin:
     return Margin(free.label, unit, present, None, None, None, None, "", present, why)
 
 
-def _margin(name: str, unit: str, present: float, crossing: Crossing | None, scanned: float) -> Margin:
+def _margin(system: CompiledSystem, free: Free, search: Search) -> Margin | None:
+    """Return how far a parameter may grow by a search, None where nothing depends on it."""
+    if not search.enters:
+        return None
+    present = value_now(system, free)
+    row = replace(not_looked(system, free, ""), scanned=search.scanned[1])
+    crossing = next((edge for edge in search.edges if edge.stable_side == "below"), None)
     if crossing is None:
-        return Margin(name, unit, present, None, None, None, None, "", scanned)
-    factor = crossing.value / present if present else None
-    return Margin(
-        name,
-        unit,
-        present,
-        crossing.value,
-        crossing.error,
-        factor,
-        finite(crossing.frequency_hz),
-        crossing.kind,
-        scanned,
+        return row
+    return replace(
+        row,
+        value=crossing.value,
+        error=crossing.error,
+        factor=crossing.value / present if present else None,
+        frequency_hz=finite(crossing.frequency_hz),
+        kind=crossing.kind,
         estimated=crossing.proof == ESTIMATE,
     )
+
+
+def network_margins(
+    system: CompiledSystem, prepared: Prepared, nominal: Margins, *, quick: bool = False
+) -> Margins:
+    """Find how much each stiffness, damping, probability and jitter may grow, stable in mean square.
+
+    On either side of a margin, by its error, bounds on the growth of second moments decide, or the note says
+    of which they don't. No delay or period is varied.
+
+    Parameters
+    ----------
+    system, prepared
+        The compiled scene, and what `instance.prepare` made of it.
+    nominal
+        The margins over the nominal network: how far to look from a value of 0.
+    quick
+        Whether margins that take long are left out.
+    """
+    with (
+        part("margins"),
+        single_threaded(),
+        finite_equations(system.origin.topology),
+        np.errstate(all="ignore"),
+    ):
+        free = [*coupler_parameters(system), *of_channels(system)]
+        states = max(len(kind.states) for kind in system.kinds)
+        if quick and len(free) * states > MOST_GROWN_IN_PASSING:
+            count = f"{len(free)} numbers of {states} states"
+            return Margins((), f"not looked for in passing: {count} (apc analyze --margins does)")
+        now = growth(system, prepared)
+        if why := not_varied(len(free), now):
+            return Margins((), f"not looked for: {why}")
+        if not now.stable:
+            known = "stable" if now.stable is False else "proved stable"
+            return Margins((), NOT_STABLE.format(f"{known} in mean square"))
+        scales = {row.parameter: row.value or row.scanned / GROWTH for row in nominal.rows}
+        open_rows = {row.parameter for row in nominal.rows if row.note}
+        rows: list[Margin | None] = []
+        open_sides, looked = [], 0
+        beyond: dict[str, list[str]] = {}
+        for item in free:
+            scale = abs(value_now(system, item)) or scales.get(item.label, 0.0)
+            points, least = _grown(system, item, scale)
+            unscaled = not nominal.rows or item.label in open_rows
+            if unscaled and len(points) == 1:
+                rows.append(not_looked(system, item, "from 0 nothing says how far"))
+                continue
+            source = RadiusEvaluator(system, (item,), prepared, PLACE)
+            result = search(PointLine(source, points, least), first=True)
+            looked += result.looked
+            rows.append(_margin(system, item, result))
+            if rows[-1] and result.why:
+                beyond.setdefault(result.why, []).append(item.label)
+            if rows[-1] and result.edges and result.edges[0].proof != BOUNDED[MEAN_SQUARE]:
+                open_sides.append(f"{item.label} ({result.edges[0].proof})")
+    notes = [f"beyond these values of {', '.join(labels)}, {why}" for why, labels in beyond.items()]
+    if open_sides:
+        notes.append(f"not bounded on either side: {', '.join(open_sides)}")
+    notes.append(
+        f"{counted(looked, 'value')} were looked at: a narrow change of the verdict could hide between two"
+    )
+    notes.append("delays and periods were not varied: they change the order of events")
+    return Margins(tuple(filter(None, rows)), "; ".join(notes))
+
+
+def _grown(system: CompiledSystem, free: Free, scale: float) -> tuple[Floats, float]:
+    """Return the values over which a number is looked at in mean square, and the least size of a cell."""
+    present, most = value_now(system, free), allowed(system, free)[1]
+    if free.name in channel_numbers(system):
+        delays = [
+            value_now(system, Free(link.delay))
+            for link in system.links
+            if link.channel is not None and link.channel.jitter == free.name
+        ]
+        points = np.linspace(present, min([most, *delays]), SHARES + 1)
+        return points, float(points[1])
+    if not scale:
+        return np.array([present]), 1.0
+    return line_points(system, free, present, min(GROWTH * scale, most), scale)

@@ -1,7 +1,8 @@
 """What moves the spectral radius most: its derivative with respect to every parameter.
 
 Takes: a `CompiledSystem`.
-Gives: `Sensitivity`, `Sensitivities`, `sensitivities`; `varied`.
+Gives: `Sensitivity`, `Sensitivities`, `sensitivities`, `network_sensitivities`; `varied`, `not_varied`,
+`of_channels`.
 Guarantees: the derivative is that of the motion that decides, whatever is rigid left out, to rounding, which
 an eigenvalue nearby makes worse; each name can be set as it stands; where several eigenvalues share the
 radius, one row for each of them and no gradient that belongs to none.
@@ -13,6 +14,7 @@ equal eigenvalues with a full set of vectors moves as the eigenvalues of W dM V,
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -20,8 +22,9 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import lifted_groups, prepare_at_start
+from apc.analysis.analysis import analyze, lifted_groups, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Place
 from apc.compiler.timings import part
 from apc.compiler.words import counted
 from apc.eigen.eigenpairs import driving_parts, eigenpairs
@@ -30,11 +33,13 @@ from apc.eigen.spectrum import solve_spectrum
 from apc.frame.display_units import Unit
 from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, prepare
-from apc.frame.names import Free, parameter_of
+from apc.frame.names import Free, named_times, parameter_of, unit_of, value_now
+from apc.moments.network_verdict import Growth, growth
 from apc.network.nominal import channel_numbers
 from apc.result import Result
 from apc.threads import single_threaded
 from apc.vary.evaluator import evaluator, free_parameters
+from apc.vary.growth import MEAN_SQUARE, NOMINAL, RadiusEvaluator
 
 Floats = NDArray[np.float64]
 Places = NDArray[np.intp]
@@ -53,7 +58,13 @@ WORST = 1e8
 # How far, relatively, a parameter is moved to see whether what was left out as rigid stays so.
 BESIDE = 2.0**-10
 
-NO_MATRIX = "what moves it most: not looked for: the present values have no frame matrix of their own"
+# More numbers than this are not varied over a network: at some ten milliseconds a value they take a minute.
+MOST_VARIED = 60
+
+# What grows in mean square is called so.
+MOMENTS = "second moments"
+
+PLACE = Place("sensitivities")
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,17 +123,15 @@ def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -
     """
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         free, prepared = varied(system), prepared or prepare(system)
-        start = prepare_at_start(system, prepared, free) or prepared
+        start = prepare_at_start(system, prepared, free)
+        if start is None:
+            return _singly(system, prepared, free)
         systems = split(*lifted_groups(system, prepared=start))
         most = solve_spectrum(systems, in_balls=False).spectral_radius + SHARED
 
         @cache
         def clusters_of(*together: Free) -> list[_Cluster] | None:
-            result = _clusters(system, together, start)
-            # Equations have edges that points step over.
-            return (
-                _clusters(system, together, prepared) if result is None and start is not prepared else result
-            )
+            return _clusters(system, together, start)
 
         def frees(*together: Free) -> bool:
             """Say whether something that is rigid in the scene as it is moves where these vary."""
@@ -141,8 +150,11 @@ def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -
         notes, untied = [], [free.label for free in loose]
         for together in listed:
             result = clusters_of(*together)
-            if result is None:
-                return Sensitivities(0.0, (), (), NO_MATRIX)
+            if result is None and together[0] in zero:  # other motions are free beside it
+                untied.append(together[0].label)
+                continue
+            if result is None:  # equations have edges, which differences step over
+                return _singly(system, prepared, free)
             clusters, first = clusters or result, 0
             for cluster in result:
                 if not cluster.condition < WORST:
@@ -185,6 +197,91 @@ def varied(system: CompiledSystem) -> list[Free]:
     starts |= {start for kind in system.kinds for clock in kind.clocks for start in clock.starts}
     kept_out = starts | channel_numbers(system)
     return [free for free in free_parameters(system) if free.name not in kept_out]
+
+
+def _singly(system: CompiledSystem, prepared: Prepared, free: Sequence[Free]) -> Sensitivities:
+    """Return the derivatives of a scene's spectral radius by differences of analyses."""
+    now = analyze(system, prepared=prepared)
+    if not now.modes:
+        return Sensitivities(0.0, (), (), "nothing moves: there is no eigenvalue")
+    most = now.spectral_radius - SHARED
+    active = tuple((mode.eigenvalue, mode.shape) for mode in now.modes if abs(mode.eigenvalue) >= most)
+    if len(active) > 1:
+        note = f"{len(active)} eigenvalues share the radius, which has no derivative there"
+        return Sensitivities(now.spectral_radius, active, (), note)
+    return _by_differences(system, prepared, free, NOMINAL, now.spectral_radius, active)
+
+
+def network_sensitivities(system: CompiledSystem, prepared: Prepared) -> Sensitivities:
+    """Differentiate what second moments grow by with respect to every parameter, and what links lose by.
+
+    Parameters
+    ----------
+    system, prepared
+        The compiled scene, and what `instance.prepare` made of it.
+    """
+    with (
+        part("sensitivities"),
+        single_threaded(),
+        finite_equations(system.origin.topology),
+        np.errstate(all="ignore"),
+    ):
+        free = [*varied(system), *of_channels(system)]
+        now = growth(system, prepared)
+        if why := not_varied(len(free), now):
+            return Sensitivities(0.0, (), (), f"what moves it most: not looked for: {why}")
+        active = ((complex(now.radius), MOMENTS),)
+        return _by_differences(system, prepared, free, MEAN_SQUARE, now.radius, active)
+
+
+def _by_differences(
+    system: CompiledSystem,
+    prepared: Prepared,
+    free: Sequence[Free],
+    criterion: str,
+    radius: float,
+    active: tuple[tuple[complex, str], ...],
+) -> Sensitivities:
+    """Return the derivatives of a radius of a criterion, as differences along each parameter's value."""
+    rows, without = [], []
+    for item in free:
+        present = value_now(system, item)
+        along = present or 1.0  # 0 has no size: its unit's
+        try:
+            ((number, slope),) = RadiusEvaluator(system, (item,), prepared, PLACE, criterion).slopes(
+                np.array([[present]]), np.array([[along]])
+            )
+        except ApcError:  # not even so near can it be judged
+            number = slope = np.full((1, 1, 1), np.nan)
+        # Of the root of what grows the derivative of the square is wanted.
+        rate = slope.item() * (2 * number.item() if criterion == MEAN_SQUARE else 1.0) / along
+        if math.isfinite(rate):
+            rows.append(Sensitivity(item.label, unit_of(system, item.name), present, rate, rate * present, 0))
+        else:
+            without.append(item.label)
+    rows.sort(key=lambda row: (-abs(row.relative), row.parameter))
+    note = "by differences" + (f"; not differentiated: {', '.join(without)}" if without else "")
+    return Sensitivities(radius, active, tuple(rows), note)
+
+
+def not_varied(count: int, growth: Growth) -> str:
+    """Return why a scene is not looked at over its network at many values of so many numbers, "" if it is."""
+    if count > MOST_VARIED:
+        return f"over this network, {count} numbers take too long to vary (apc critical varies one)"
+    if growth.why:
+        return f"over the network, the scene is not judged: {growth.why}"
+    if not growth.quick:
+        return (
+            "over this network, to judge one value takes long (apc critical looks at those of one parameter)"
+        )
+    return ""
+
+
+def of_channels(system: CompiledSystem) -> list[Free]:
+    """Return what links lose and delay packets by, where it follows from nothing else."""
+    numbers = channel_numbers(system)
+    times = [Free(timing.name) for timing in named_times(system) if timing.formula is None]
+    return [free for free in (*free_parameters(system), *times) if free.name in numbers]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -248,7 +345,8 @@ def _clusters(system: CompiledSystem, free: Sequence[Free], prepared: Prepared) 
     for values in beside:
         still &= np.isfinite(values).all(axis=(1, 2))
     result = []
-    for name, (matrix, slopes) in zip(family.names, pairs, strict=True):
+    names = (closed_system.name for closed_system in family.closed)
+    for name, (matrix, slopes) in zip(names, pairs, strict=True):
         if not matrix.shape[1]:
             continue
         clusters = _of_system(name, matrix[0], slopes[: len(free)], still)

@@ -108,8 +108,7 @@ def by_critical(system: CompiledSystem, near: float) -> tuple[float, float]:
 
 def by_margins(system: CompiledSystem, near: float) -> tuple[float, float]:
     from apc.frame.instance import prepare
-    from apc.vary.margins import Margins
-    from apc.vary.over_network import network_margins
+    from apc.vary.margins import Margins, network_margins
 
     found = network_margins(system, prepare(system), Margins((), ""))
     row = next(row for row in found.rows if row.parameter == STIFFNESS)

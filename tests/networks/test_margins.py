@@ -10,8 +10,8 @@ import apc
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.frame.instance import prepare
-from apc.vary.margins import Margins
-from apc.vary.over_network import network_margins, network_sensitivities
+from apc.vary.margins import Margins, network_margins
+from apc.vary.sensitivity import network_sensitivities
 from tests.bruteforce import Scene
 from tests.held_scenes import scene, system_of
 from tests.networks.second_moments import Law, second_moment_radius
