@@ -34,14 +34,16 @@ from apc.network.nominal import left_out, refuse_channel_number
 from apc.regions.axes import PLACE
 from apc.regions.boundary import Arc, relative_to, stable_area, trace_steps, traced
 from apc.regions.curves import between
-from apc.regions.deciding import Eigenvalues, largest, log_magnitudes
+from apc.regions.deciding import Eigenvalues, log_magnitudes
 from apc.regions.rectangle import DirectFamily, Rectangle, family_over, rectangle_of
 from apc.regions.strips import BRANCHES, Striped, trace_strips
 from apc.regions.survey import blurred, just_inside, survey
 from apc.result import Look, Result
 from apc.threads import single_threaded
+from apc.vary.batch import BatchEvaluator
 from apc.vary.crossing import Progress
 from apc.vary.evaluator import (
+    PiecewiseEvaluator,
     closed_at,
     evaluator_of_many,
     overrides_at,
@@ -294,23 +296,25 @@ def region(
             _check_count(axes[counts[0]], len(counts) == 2, bool(times), meant, affine=affine)
         times = [] if meant in BY_GROWTH else times + counts
         start = None if meant in BY_GROWTH else prepare_at_start(system, prepared, free)
-        plane = _points_plane(system, free, rectangle, prepared, meant, stepped=bool(times))
         striped: Striped | None = None
-        if start is not None and len(times) == 1:
-            striped = trace_strips(
-                system, axes, times[0], start, cells=cells, tolerance=tolerance, progress=progress
-            )
-        elif start is not None and not times:
-            whole_plane = _matrix_plane(system, free, rectangle, start)
+        if start is None or times:
+            plane = _points_plane(system, free, rectangle, prepared, meant, stepped=bool(times))
+            if meant == NOMINAL and not times:
+                tolerance = max(tolerance, TOLERANCE_OF_GROWTH)
+            if start is not None and len(times) == 1:
+                striped = trace_strips(
+                    system, axes, times[0], start, cells=cells, tolerance=tolerance, progress=progress
+                )
+        else:
+            source = evaluator_of_many(system, free, PLACE, prepared=start)
+            plane = _Plane(family_over(source, rectangle, source.errors), source.closed_at, stepped=False)
             try:
-                striped = _surveyed(whole_plane, cells, tolerance, progress)
-                plane = whole_plane
+                striped = _surveyed(plane, cells, tolerance, progress)
             except ApcError as error:
-                # Where other motions are free than where it starts they are told point by point.
                 if error.mistakes[0].code != "E905" or parameters_suffice(system, prepared):
                     raise
-        if striped is None:
-            tolerance = max(tolerance, TOLERANCE_OF_GROWTH)
+                # Other motions are free where it starts elsewhere.
+                plane = _pieces_plane(system, source, rectangle, prepared, start)
         stepped = plane.stepped and striped is None
         striped = striped or _surveyed(plane, cells, tolerance, progress)
         curves = tuple(_curve(plane, arc, meant) for arc in striped.arcs)
@@ -383,12 +387,19 @@ def _points_plane(
     return _Plane(family, closed, stepped or meant == PASSIVE, halvings)
 
 
-def _matrix_plane(
-    system: CompiledSystem, free: tuple[Free, ...], rectangle: Rectangle, prepared: Prepared
+def _pieces_plane(
+    system: CompiledSystem,
+    source: BatchEvaluator,
+    rectangle: Rectangle,
+    prepared: Prepared,
+    start: Prepared,
 ) -> _Plane:
-    """Return what gives the matrices of a scene."""
-    source = evaluator_of_many(system, free, PLACE, prepared=prepared)
-    return _Plane(family_over(source, rectangle, source.errors), source.closed_at, stepped=False)
+    """Return what gives the matrices of a scene in which other motions are free in parts of the rectangle."""
+    size = sum(len(closed.matrix) for closed in source.closed)
+    pieces = PiecewiseEvaluator(system, source.free, start, size)
+    (errors,) = pieces.errors(rectangle.values(np.array([[0.5, 0.5]])))
+    family = DirectFamily(pieces, rectangle, (Part(0, np.arange(size)),), (errors[0],))
+    return _Plane(family, partial(closed_at, system, source.free, prepared), stepped=False)
 
 
 def _surveyed(plane: _Plane, cells: int, tolerance: float, progress: Progress | None) -> Striped:
@@ -441,10 +452,9 @@ def _samples(plane: _Plane, points: Floats) -> Floats:
 
 def _leading(plane: _Plane, point: Floats) -> complex:
     """Return the eigenvalue that decides at a point (2,) where one number is known."""
-    source = plane.family.evaluator
+    source, rectangle = plane.family.evaluator, plane.family.rectangle
     assert isinstance(source, RadiusEvaluator), "one number is known"
-    modes = source.verdict(plane.family.rectangle.values(point).tolist()).modes
-    return modes[0].eigenvalue if modes else largest(plane.family.matrices(point[None]))
+    return source.leading(rectangle.values(point).tolist())
 
 
 def _curve(plane: _Plane, arc: Arc, criterion: str) -> Curve:

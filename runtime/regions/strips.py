@@ -344,8 +344,7 @@ def _edge_piece(
     inside = (1 if stable_before else -1) * INSIDE * (grows.end - grows.start)
     knot = np.array([edge + inside, (low + high) / 2])
     points = np.array([[edge, low], [edge, high]])
-    modes = source.verdict(rectangle.values(knot).tolist()).modes
-    leading = modes[0].eigenvalue if modes else complex(np.nan)
+    leading = source.leading(rectangle.values(knot).tolist())
     # Upwards, the left-hand side is the strip before.
     points = points if stable_before else points[::-1].copy()
     return straight_arc(points, np.array([np.spacing(1.0)]), knot, leading)

@@ -1,14 +1,15 @@
 """The evaluator of a system's matrices over some of its parameters, whatever kind of scene it is.
 
 Takes: a `CompiledSystem` and the parameters that vary.
-Gives: `evaluator`, `evaluator_of_many`; `parameters_suffice`, `Asked`; `many_packets`; `closed_at`;
-`free_parameters`, `reaches_time`, `reaches_count`, `overrides_at`.
+Gives: `evaluator`, `evaluator_of_many`, `PiecewiseEvaluator`; `parameters_suffice`, `Asked`; `many_packets`;
+`closed_at`, `leading_in_floats`; `free_parameters`, `reaches_time`, `reaches_count`, `overrides_at`.
 Guarantees: peers that are alike at some values only are kept apart.
 Does not: vary times (see `delays`).
 """
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -23,12 +24,14 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.modes import split
 from apc.eigen.peers import PeerGroup, states_of
+from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange
 from apc.frame.instance import Prepared
 from apc.frame.names import Free, is_named, parameter_of
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import free_rows, scope_of
 from apc.vary.batch import BatchEvaluator, batch_evaluator
+from apc.vary.wiring import reduced, wire
 
 Floats = NDArray[np.float64]
 
@@ -36,12 +39,89 @@ Floats = NDArray[np.float64]
 # agrees with such a value by accident. The next one is moved by a little more.
 GENERIC = Fraction(1, 1024) + Fraction(1, 65537)
 
+# What CasADi's evaluation of a site's Jacobians at its start rounds, in units of UNIT: each entry is a few
+# dozen operations, and an exponential makes no more of it than the entry is large.
+JACOBIAN_ROUNDINGS = 64
+
+# An eigenvalue left this near to 1 asks for the exact search for drifts: a pair at 1 is scattered by rounding
+# to the square root of 1e-15, and ten times that.
+DRIFT = 1e-6
+
+# So many sets of motions that are free somewhere are told apart; points beyond go alone.
+MOST_ALIKE = 8
+
 # States of one system beyond which no range of values is looked at: a hundred matrices and more are held at a
 # time, each with the vectors of its eigenvalues. Of 250 states a range takes ten seconds and half a GB.
 MOST_STATES = 300
 
 # Evaluators kept for the next question of the same parameters: another range of theirs, say.
 KEPT = 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PiecewiseEvaluator:
+    """A `MatrixSource` of a scene in which at some values other motions are free than at others.
+
+    Points at which the same are free are taken together by one of `alike`; a point next to where that
+    changes goes alone, and has no slope. All closed systems are blocks of one matrix (`size`, `size`), filled
+    up with zeros.
+    """
+
+    system: CompiledSystem
+    free: tuple[Free, ...]
+    prepared: Prepared  # from `analysis.prepare_at_start`
+    size: int
+    alike: list[BatchEvaluator] = field(default_factory=list)
+
+    def matrices(self, values: Floats) -> tuple[Floats, ...]:
+        """Return the matrices of all systems as blocks (k, n, n) at values (k, m), NaN for none."""
+        return (self.slopes(values, np.zeros_like(values))[0][0],)
+
+    def slopes(self, values: Floats, along: Floats) -> tuple[tuple[Floats, Floats], ...]:
+        """Return the matrices (k, n, n) and their derivatives along directions (k, m), NaN where alone."""
+        matrices, slopes = np.full((2, len(values), self.size, self.size), np.nan)
+        rest, place = np.flatnonzero(np.isfinite(values).all(axis=1)), 0
+        while len(rest) and place < MOST_ALIKE:
+            if place == len(self.alike):
+                self.alike.append(self._around(values[rest[0]]))
+            pairs = self.alike[place].slopes(values[rest], along[rest])
+            sure = np.all([_is_apart(matrix) for matrix, _ in pairs], axis=0)
+            for result, blocks in zip((matrices, slopes), zip(*pairs, strict=True), strict=True):
+                result[rest[sure]] = self._filled([block[sure] for block in blocks])
+            rest, place = rest[~sure], place + 1
+        for row in rest.tolist():
+            with contextlib.suppress(ApcError):
+                overrides = overrides_at(self.system, self.free, values[row].tolist())
+                blocks = _relative(apply(self.system, overrides), self.prepared)
+                matrices[row] = self._filled([block[None] for block in blocks])[0]
+        return ((matrices, slopes),)
+
+    def errors(self, values: Floats) -> tuple[Floats, ...]:
+        """Return how far the matrices (k, n, n) are off by what CasADi's evaluation rounds."""
+        return (JACOBIAN_ROUNDINGS * UNIT * np.abs(np.nan_to_num(self.matrices(values)[0])),)
+
+    def _around(self, value: Floats) -> BatchEvaluator:
+        """Return what serves the points at which the same motions are free as at one (m,)."""
+        at = apply(self.system, overrides_at(self.system, self.free, value.tolist()))
+        result = batch_evaluator(at, self.free, *Asked.of(at, self.free, self.prepared).lifted_anywhere())
+        return replace(result, wirings=tuple(map(wire, result.closed)))  # none that serve other points, too
+
+    def _filled(self, blocks: Sequence[Floats]) -> Floats:
+        """Return the blocks (k, n, n) of each point as one matrix, NaN where one is."""
+        result = np.zeros((len(blocks[0]), self.size, self.size))
+        start = 0
+        for block in blocks:
+            rows = slice(start, start := start + block.shape[1])
+            result[:, rows, rows] = block
+        result[~np.isfinite(result).all(axis=(1, 2))] = np.nan
+        return result
+
+
+def _is_apart(matrices: Floats) -> NDArray[np.bool_]:
+    """Say of each matrix (k, n, n) whether it is one, and no eigenvalue is next to 1."""
+    sure = np.isfinite(matrices).all(axis=(1, 2))
+    values = np.linalg.eigvals(np.where(sure[:, None, None], matrices, 0.0))
+    return np.asarray(sure & (np.abs(values - 1).min(axis=1, initial=np.inf) >= DRIFT))
 
 
 def evaluator(system: CompiledSystem, free: Sequence[Free], *, prepared: Prepared) -> BatchEvaluator:
@@ -101,6 +181,21 @@ def closed_at(
     """Return the closed systems at one point (m,), as an analysis has them."""
     changed = apply(system, overrides_at(system, free, value))
     return split(*lifted_groups(changed, prepared=prepared))
+
+
+def _relative(system: CompiledSystem, prepared: Prepared) -> list[Floats]:
+    """Return the matrices of a scene's closed systems, relative to what is rigid; NaN where there is none."""
+    systems = split(*lifted_groups(system, prepared=prepared))
+    return [reduced(wire(closed), closed.matrix[None], 1)[0] for closed in systems]
+
+
+def leading_in_floats(system: CompiledSystem, prepared: Prepared) -> complex:
+    """Return the largest eigenvalue of a scene in floats, what is rigid left out, NaN if there is none."""
+    matrices = _relative(system, prepared)
+    if not all(np.isfinite(matrix).all() for matrix in matrices):
+        return complex(np.nan)
+    values = np.concatenate([np.zeros(1), *map(np.linalg.eigvals, matrices)])
+    return complex(values[np.argmax(np.abs(values))])
 
 
 def many_packets(system: CompiledSystem, prepared: Prepared) -> bool:

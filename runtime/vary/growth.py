@@ -27,11 +27,9 @@ from apc.frame.ages import aged
 from apc.frame.instance import Prepared
 from apc.frame.names import Free, parameter_of, unit_of
 from apc.frame.overrides import Override, apply
-from apc.hands.passivity import loop_growths, passive_growth
-from apc.moments.network_verdict import growth
 from apc.network.nominal import channel_numbers, unreliable
 from apc.vary.crossing import OneStretch, Stretch, Verdict
-from apc.vary.evaluator import overrides_at, reaches_time
+from apc.vary.evaluator import leading_in_floats, overrides_at, reaches_time
 from apc.vary.line import OPEN, SPAN, one_by_one, spread, verdict_of
 
 Floats = NDArray[np.float64]
@@ -135,7 +133,7 @@ def judge_at(
     place
         Where they were asked for.
     bounded
-        Whether bounds are asked for; an analysis always has them.
+        Whether bounds are asked for, and what floats leave open is to be proved.
     criterion
         "nominal", or one of `BY_GROWTH`.
 
@@ -146,11 +144,19 @@ def judge_at(
         of `analysis.analyze`.
     """
     changed = apply(system, overrides)
-    if criterion == NOMINAL:
+    if criterion == NOMINAL and bounded:
         return verdict_of(analyze(changed, prepared=prepared))
+    if criterion == NOMINAL:
+        radius = abs(leading_in_floats(changed, prepared))
+        return Verdict(radius < 1, radius, math.nan, (), "")
+    # Each imported where it is asked for: most scenes need neither.
     if criterion == PASSIVE:
+        from apc.hands.passivity import passive_growth
+
         result = passive_growth(changed, prepared, bounded=bounded)
     else:
+        from apc.moments.network_verdict import growth
+
         result = growth(changed, prepared, bounded=bounded)
     if result.why:
         what = f"the scene can't be judged in mean square: {result.why}"
@@ -188,10 +194,20 @@ class RadiusEvaluator:
                 raise
             return OPEN
 
+    def leading(self, value: Sequence[float]) -> complex:
+        """Return the eigenvalue that decides at a point (m,), or the number that stands for it."""
+        if self.criterion != NOMINAL:
+            return complex(self.matrices(np.array([value]))[0].item())
+        return leading_in_floats(
+            apply(self.system, overrides_at(self.system, self.free, value)), self.prepared
+        )
+
     def parts(self, value: Sequence[float]) -> list[float]:
         """Return the roots at a point (m,), of which the largest counts: one of each loop of hands."""
         if self.criterion != PASSIVE:
             return self.matrices(np.array([value]))[0].ravel().tolist()
+        from apc.hands.passivity import loop_growths
+
         changes = overrides_at(self.system, self.free, value)
         try:
             growths = loop_growths(apply(self.system, changes), self.prepared, bounded=False)
@@ -265,7 +281,8 @@ class PointLine(OneStretch):
     def _sampled(self, value: Fraction) -> Verdict:
         """Return the verdict at a value, without bounds where these take longer."""
         if float(value) not in self.known:
-            self.known[float(value)] = self.source.verdict([float(value)])
+            bounded = self.source.criterion == NOMINAL  # an analysis spares matrices that are too large
+            self.known[float(value)] = self.source.verdict([float(value)], bounded=bounded)
         return self.known[float(value)]
 
     def judge(self, value: Fraction) -> Verdict:

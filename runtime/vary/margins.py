@@ -30,7 +30,6 @@ from apc.eigen.spectrum import DRIFTS, finite
 from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, prepare
 from apc.frame.names import Free, named_times, parameter_of, unit_of, value_now
-from apc.moments.network_verdict import growth
 from apc.network.nominal import channel_numbers
 from apc.result import Result
 from apc.threads import single_threaded
@@ -294,6 +293,8 @@ def network_margins(
         if quick and len(free) * states > MOST_GROWN_IN_PASSING:
             count = f"{len(free)} numbers of {states} states"
             return Margins((), f"not looked for in passing: {count} (apc analyze --margins does)")
+        from apc.moments.network_verdict import growth  # most scenes have an ideal network
+
         now = growth(system, prepared)
         if why := not_varied(len(free), now):
             return Margins((), f"not looked for: {why}")

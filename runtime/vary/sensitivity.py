@@ -18,6 +18,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,12 +35,14 @@ from apc.frame.display_units import Unit
 from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, prepare
 from apc.frame.names import Free, named_times, parameter_of, unit_of, value_now
-from apc.moments.network_verdict import Growth, growth
 from apc.network.nominal import channel_numbers
 from apc.result import Result
 from apc.threads import single_threaded
 from apc.vary.evaluator import evaluator, free_parameters
 from apc.vary.growth import MEAN_SQUARE, NOMINAL, RadiusEvaluator
+
+if TYPE_CHECKING:
+    from apc.moments.network_verdict import Growth
 
 Floats = NDArray[np.float64]
 Places = NDArray[np.intp]
@@ -226,6 +229,8 @@ def network_sensitivities(system: CompiledSystem, prepared: Prepared) -> Sensiti
         finite_equations(system.origin.topology),
         np.errstate(all="ignore"),
     ):
+        from apc.moments.network_verdict import growth  # most scenes have an ideal network
+
         free = [*varied(system), *of_channels(system)]
         now = growth(system, prepared)
         if why := not_varied(len(free), now):
