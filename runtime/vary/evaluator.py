@@ -92,8 +92,8 @@ class PiecewiseEvaluator:
         for row in rest.tolist():
             with contextlib.suppress(ApcError):
                 overrides = overrides_at(self.system, self.free, values[row].tolist())
-                blocks = _relative(apply(self.system, overrides), self.prepared)
-                matrices[row] = self._filled([block[None] for block in blocks])[0]
+                alone = _relative(apply(self.system, overrides), self.prepared)
+                matrices[row] = self._filled([block[None] for block in alone])[0]
         return ((matrices, slopes),)
 
     def errors(self, values: Floats) -> tuple[Floats, ...]:
@@ -119,7 +119,7 @@ class PiecewiseEvaluator:
 
 def _is_apart(matrices: Floats) -> NDArray[np.bool_]:
     """Say of each matrix (k, n, n) whether it is one, and no eigenvalue is next to 1."""
-    sure = np.isfinite(matrices).all(axis=(1, 2))
+    sure = np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
     values = np.linalg.eigvals(np.where(sure[:, None, None], matrices, 0.0))
     return np.asarray(sure & (np.abs(values - 1).min(axis=1, initial=np.inf) >= DRIFT))
 

@@ -20,12 +20,12 @@ from apc.analysis.analysis import analyze, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Place
 from apc.compiler.timings import part
-from apc.eigen.eigenpairs import eigenvalues as eigenvalues_of
 from apc.frame.instance import Prepared, prepare
 from apc.frame.names import Free, find
 from apc.frame.overrides import Override, apply
 from apc.threads import single_threaded
 from apc.vary.evaluator import evaluator_of_many, reaches_count, reaches_time
+from apc.vary.line import matrix_look
 
 if TYPE_CHECKING:
     from apc.vary.critical_values import Critical
@@ -101,15 +101,9 @@ def eigenvalues_at(
         return _one_by_one(system, free, values, prepared)
     with single_threaded(), np.errstate(all="ignore"):
         family = evaluator_of_many(system, [free], Place(free.label), prepared=start)
-        matrices = family.matrices(np.array(values, np.float64)[:, None])
-    known = np.all([np.isfinite(matrix).all(axis=(1, 2)) for matrix in matrices], axis=0)
-    chosen = [matrix[known] if len(matrix) > 1 else matrix for matrix in matrices]
-    listed = [eigenvalues_of(values, np.zeros_like(values))[0] for values in chosen]
-    places = np.flatnonzero(np.broadcast_to(known, len(values))).tolist()
-    every = np.concatenate(
-        [np.broadcast_to(values, (len(places), values.shape[1])) for values in listed], axis=1
-    )
-    return places, tuple(every.astype(np.complex128))
+        every, _ = matrix_look(family, np.array(values, np.float64)[:, None], 0)
+    places = np.flatnonzero(np.isfinite(every).all(axis=1)).tolist()
+    return places, tuple(every[places])
 
 
 def _one_by_one(
