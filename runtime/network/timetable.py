@@ -31,10 +31,7 @@ Flags = NDArray[np.bool_]
 
 # Ways from peer to peer: of each some packets are on their way, and so many bytes are kept.
 MOST_WAYS, WAY = 2_000_000, 200
-# Packets on their way on all ways of a link. Each takes so many bytes, and so many more where the order of
-# arrival matters.
-MOST_PACKETS = 2**29
-PACKET, ORDERED = 4, 8
+PACKET = 100  # bytes of a packet on its way, with what NumPy copies
 
 START = -1  # the "packet" before the first: the sender's start values
 
@@ -175,16 +172,10 @@ def _check_luck(system: CompiledSystem, route: Route, luck: Luck) -> None:
         raise ApcError(
             Mistake("E892", Place(system.origin.topology), what, hint="periods and delays in whole µs")
         )
-    packets, hint = luck.kept(route) * ways, "a shorter delay or jitter, fewer peers, or graph: ring"
-    if packets > MOST_PACKETS:
-        what = (
-            f"{route.link} is unreliable, and on {ways} ways up to {latest * float(luck.quantum):.3g} s long "
-            f"{packets} packets are kept; at most {MOST_PACKETS} can be followed"
-        )
-        raise ApcError(Mistake("E892", Place(system.origin.topology), what, hint=hint))
-    needed = WAY * ways + (PACKET if luck.newest else PACKET + ORDERED) * packets
+    packets = luck.kept(route) * ways
     what = f"{packets:,} packets kept on {ways:,} ways of {route.link}, which is unreliable,"
-    refuse_beyond(needed, "E892", Place(system.origin.topology), what, hint)
+    hint = "a shorter delay or jitter, fewer peers, or graph: ring"
+    refuse_beyond(WAY * ways + PACKET * packets, "E892", Place(system.origin.topology), what, hint)
 
 
 class Listener:
