@@ -67,7 +67,7 @@ def test_packets_that_would_not_fit_while_they_are_on_their_way_are_refused(
     channel = "delay: 20 s, loss: 2 %, jitter: 3 ms, reorder: all}"
     late = replaced(AVERAGE, ("count: 3", "count: 40"), ("delay: 8 ms}", channel))
     _leave(monkeypatch, 2e7)
-    # 100 bytes a packet, 200 a way: within 20 s and the jitter 2,500 are sent, and three frames more are kept.
+    # 100 bytes a packet, 200 a way: within 20 s and the jitter 2,500 are sent, and three frames more kept.
     needs = r"E892 3,904,680 packets kept on 1,560 ways of lan, which is unreliable, take about 391 MB"
     with pytest.raises(ApcError, match=needs):
         simulate(compiled(late), duration=Fraction(1))
