@@ -19,24 +19,30 @@ from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.dissipation import gains_at, peak_gain
+from apc.eigen.dissipation import gains_at, is_positive, peak_gain
+from apc.eigen.matrix_norms import balance
 from apc.eigen.relative import relative, relative_coordinates, relative_rows, with_doubt
 from apc.frame.discretize import exponential
 from apc.frame.radius import RADII, UNIT, radius_of, value_of
 from apc.hands.response import Pushed, Site, force_lanes
-from apc.moments.gains import around, stein
+from apc.moments.operator import stein
 
 Floats = NDArray[np.float64]
+Matrix = NDArray[Any]
 
 # Gauss nodes of an interval, and how many more tell how far the norm is off.
 NODES, MORE = 4, 2
 
 # What counts as none of a rigid motion in an output, relatively.
 UNSEEN = 1e-9
+
+# What share of the others' a state's variance counts as at least.
+AT_REST = 1e-12
 
 # What a norm is off by at least, relatively.
 ROUNDED = 1e-12
@@ -231,12 +237,60 @@ def noise_variance(
     at = with_doubt(relative_coordinates(basis))
     root = relative_rows(RADII.multiply(loop.k, inputs), at, RADII)
     driven = RADII.multiply(root, np.swapaxes(root, -1, -2))
-    moments = stein(relative(loop.m, at, RADII), driven[None], RADII)
+    moments = _lasting(relative(loop.m, at, RADII), driven)
     if moments is None:
         return None
     through = RADII.multiply(RADII.multiply(read, loop.d), inputs)
     whole = RADII.add(
-        around(seen[..., at.rest], moments[0], RADII), RADII.multiply(through, np.swapaxes(through, -1, -2))
+        _around(seen[..., at.rest], moments), RADII.multiply(through, np.swapaxes(through, -1, -2))
     )
     value, off = (float(np.trace(matrix)) / len(ticks) for matrix in (value_of(whole), radius_of(whole)))
     return value, off + (len(ticks) + 4) * UNIT * value
+
+
+def _around(left: Matrix, inner: Matrix) -> Matrix:
+    """Return L X Lᵀ."""
+    return RADII.multiply(RADII.multiply(left, inner), np.swapaxes(left, -1, -2))
+
+
+def _lasting(matrix: Matrix, driven: Matrix) -> Matrix | None:
+    """Return Σ_k M^k B M^kᵀ of a matrix M (2, n, n) and symmetric B, None where it is not proved to end.
+
+    Notes
+    -----
+    Let X̂ be what floats say, and E = B + M X̂ Mᵀ − X̂ what they leave, −θ D² ≤ E ≤ θ D² in the order of
+    symmetric matrices for some diagonal D. For a P ≥ 0 with P − M P Mᵀ ≥ (1 − φ) D², φ < 1, the powers of M
+    die out (Lyapunov), and X − X̂ = Σ_k M^k E M^kᵀ lies between −θ/(1 − φ) P and θ/(1 − φ) P. D² is as X̂ on
+    its diagonal, P as floats have Σ_k M^k D² M^kᵀ; θ and φ are the largest sums of rows, over D (Gershgorin).
+    """
+    value, n = value_of(matrix), matrix.shape[-1]
+    moments = stein(value, value_of(driven))
+    if moments is None or not n:
+        return None if moments is None else driven
+    units = balance(np.abs(value)) ** 2
+    shares = np.diagonal(moments) / units
+    weights = np.sqrt(units * np.maximum(shares, AT_REST * shares.max() or 1.0))
+    seed = np.diag(weights**2)
+    held = stein(value, seed)
+    if held is None:
+        return None
+    (moments, theta), (held, phi) = (
+        (guess, _left(matrix, added, guess, weights))
+        for guess, added in (
+            ((moments + moments.T) / 2, driven),
+            ((held + held.T) / 2, RADII.exact(seed)),
+        )
+    )
+    shape = held / np.outer(weights, weights)
+    if not (phi < 1 and is_positive(with_radius(shape, 2 * UNIT * np.abs(shape)))):
+        return None
+    wide = np.sqrt(np.diagonal(held))
+    return with_radius(moments, theta / (1 - phi) * np.outer(wide, wide) * (1 + 16 * UNIT))
+
+
+def _left(matrix: Matrix, added: Matrix, guess: Floats, weights: Floats) -> float:
+    """Return the largest sum of a row of B + M X̂ Mᵀ − X̂, over weights."""
+    exact = RADII.exact(guess)
+    left = RADII.subtract(RADII.add(_around(matrix, exact), added), exact)
+    size = (np.abs(value_of(left)) + radius_of(left)) / np.outer(weights, weights)
+    return float(size.sum(axis=-1).max() * (1 + (len(guess) + 8) * UNIT))

@@ -11,8 +11,8 @@ Let q[k] be what is sent, d[k] = q[k] − q[k−1], and let a tick hear, in the 
 at the middle of the range, one that is at most a packets newer or b older. What it hears is off by a sum of
 as many d, and over all frames, by Cauchy and Schwarz, this is an operator of norm at most √(a² + b²),
 whatever the delays (Kao and Lincoln, Simple stability criteria for systems with time-varying delays,
-Automatica 40, 2004). What peer i hears is off by r_i = Σ_j W_ij w_ij, ‖r‖ ≤ ‖|W|‖₂ √(a² + b²) ‖d‖ over all
-peers for each of J ticks of a frame, and by the small gain theorem the scene is stable if
+Automatica 40, 2004), for each of J ticks of a frame. By the small gain theorem (see `small_gain`) the scene
+is stable if
 
     ‖d ← r √(a² + b²)‖∞ ‖|W|‖₂ √J < 1
 """
@@ -20,33 +20,22 @@ peers for each of J ticks of a frame, and by the small gain theorem the scene is
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections import Counter
+from dataclasses import replace
 from fractions import Fraction
-from itertools import chain
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apc.compiler.compiled import Channel, CompiledSystem
-from apc.eigen.closing import Feedback, Loop, close, feedback_of, lay_out_loop
-from apc.eigen.dissipation import peak_gain, proves_gain
 from apc.eigen.modes import loops_at_right_angles
-from apc.eigen.relative import relative, relative_coordinates, relative_rows, with_doubt
-from apc.eigen.rigid import find_rigid_modes
 from apc.frame.instance import prepare
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
-from apc.frame.radius import RADII, value_of
-from apc.frame.schedule import Selected
-from apc.moments.crowd import Hearing, build_hearing, instants
-from apc.moments.held import held_scene
-from apc.moments.traces import heard_packets, hearing_packets, trace_radius
+from apc.moments.crowd import build_hearing
+from apc.moments.frames import refuse_unheld
+from apc.moments.small_gain import MOST_STATES, change_of_sent, felt_rows, ratios_of, weight_of
+from apc.moments.traces import Packets, trace_radius
 from apc.moments.unserved import UnservedError
-from apc.moments.worst import MOST_STATES, Ratios, Sizes, ratios_of, weight_of
-
-Matrix = NDArray[Any]
 
 # What a link whose packets come late is like: the newest that has arrived is heard, until there is another.
 HOLDING = Channel(None, None, "uniform", "newest", "hold", None)
@@ -56,15 +45,6 @@ LONGEST = 8
 
 # A gain is proved to be below so much more than it is: rounding takes a part of what lies between.
 ABOVE = 1 + 1e-3
-
-
-@dataclass(frozen=True, slots=True)
-class _Heard:
-    """The packet that each tick hears at the middle of the range, and the packets it may be off by."""
-
-    hearing: Hearing
-    middle: Mapping[Selected, int]
-    spread: Mapping[Selected, float]  # √(a² + b²)
 
 
 def small_gain(system: CompiledSystem, delay: Free, low: Fraction, high: Fraction) -> float:
@@ -96,16 +76,40 @@ def small_gain(system: CompiledSystem, delay: Free, low: Fraction, high: Fractio
     ):
         raise UnservedError("receivers ask how old packets are, or for the packet before")
     links = tuple(replace(item, channel=HOLDING) if item is link else item for item in middle.links)
-    held = held_scene(unreliable := replace(middle, links=links), prepare(unreliable))
-    loops = loops_at_right_angles(held.hearing.groups, held.hearing.exchange, MOST_STATES)
+    changing = replace(middle, links=links)
+    hearing = build_hearing(changing, prepare(changing))
+    refuse_unheld(changing, hearing)
+    loops = loops_at_right_angles(hearing.groups, hearing.exchange, MOST_STATES)
     if isinstance(loops, str):
         raise UnservedError(loops)
-    ratios = ratios_of(loops[0].sites, held.lossy)
-    weight, sizes = weight_of(loops, held.lossy)
-    heard = _heard(middle, delay, low, high)
-    apart = loops_at_right_angles(heard.hearing.groups, heard.hearing.exchange, MOST_STATES)
-    assert not isinstance(apart, str), "the same peers"
-    return max(_gain(loop, heard, ratios, sizes) for loop in apart) * weight
+    packets = Packets(changing, hearing)
+    lossy = frozenset(link.name for link in links if link.channel is not None)
+    ratios, (weight, sizes) = ratios_of(loops[0].sites, lossy), weight_of(loops, lossy)
+    heard = {row: packets.heard(row)[0] for row in packets.rows}
+    spread = {
+        row: math.hypot(packets.heard(row, low)[0] - number, number - packets.heard(row, high)[0])
+        for row, number in heard.items()
+        if row.way.delay == delay.name
+    }
+    gains = []
+    for loop in loops:
+        now = packets.loop(loop, heard, packets.depths(heard.items(), 1))
+        rows = hearing.of(loop)
+        off = [
+            (g, {line: 0}, spread[rows[g][line]])
+            for g, site in enumerate(now.sites)
+            for line, _ in felt_rows(site, link.name)
+            if spread.get(rows[g][line])
+        ]
+        response = change_of_sent(now, off, ratios, sizes)
+        gain = response.peak * ABOVE
+        if not math.isfinite(gain) or not response.is_below(gain):
+            return math.inf
+        ticks = Counter(
+            (g, rows[g][line].way, rows[g][line].channel) for g, lines, _ in off for line in lines
+        )
+        gains.append(gain * math.sqrt(max(ticks.values(), default=0)) * ABOVE)
+    return max(gains) * weight
 
 
 def unstable_delays(
@@ -129,89 +133,3 @@ def unstable_delays(
         if links != system.links and trace_radius(recorded, prepare(recorded)).low > 1:
             return first, then
     return None
-
-
-def _heard(middle: CompiledSystem, delay: Free, low: Fraction, high: Fraction) -> _Heard:
-    """Return what each tick hears at the middle of a range, and how far from it at the ends."""
-    hearing = build_hearing(middle, prepare(middle))
-    times = {clock.name: instants(hearing, clock) for clock in middle.clocks}
-    links = {link.name: link for link in middle.links}
-    numbers, spread = {}, {}
-    for row in chain.from_iterable(hearing.rows.values()):
-        link, now = links[row.way.link], hearing.timings[row.way.delay]
-        ends = (low, high) if row.way.delay == delay.name else (now, now)
-        newest, number, oldest = (
-            heard_packets(link, number, times[link.clock], times[row.clock][row.tick], hearing)[0]
-            for number in (ends[0], now, ends[1])
-        )
-        numbers[row], spread[row] = number, math.hypot(newest - number, number - oldest)
-    return _Heard(hearing, numbers, spread)
-
-
-def _gain(loop: Loop, heard: _Heard, ratios: Ratios, sizes: Sizes) -> float:
-    """Return ‖d ← r √(a² + b²)‖∞ √J of a loop, proved from above."""
-    rows = heard.hearing.of(loop)
-    slots = dict.fromkeys((sent.link for site in loop.sites for sent in site.schedule.sent), 1)
-    packets = [heard.middle[row] for listed in rows for row in listed]
-    depth = dict.fromkeys(slots, max(1, -min(packets, default=0)))
-    now = hearing_packets(loop, rows, iter(packets), depth, slots)
-    layout = lay_out_loop(now)
-    if (n := len(layout.names)) > MOST_STATES:
-        raise UnservedError(f"peers make one system of {n:,} states, and {MOST_STATES} are the most")
-
-    def size(site: int, link: str) -> float:
-        return math.sqrt(loop.sites[site].count) * sizes.get((link, loop.sites[site].name), 1.0)
-
-    used = [
-        (g, line, row)
-        for g, (site, listed) in enumerate(zip(now.sites, rows, strict=True))
-        for line, row in enumerate(listed)
-        if heard.spread[row]
-        and any(value_of(block)[:, line].any() for block in (site.lifted.q, site.lifted.d))
-    ]
-    # Of several numbers that are heard as one, that which counts once is what the others add to.
-    entering = [
-        (g, line, heard.spread[row] / size(g, row.way.link))
-        for g, line, row in used
-        if ratios.get((row.way.link, row.channel), 1) == 1
-    ]
-    feedback = []
-    for g, hears in enumerate(feedback_of(now, layout)):
-        before = np.concatenate([hears.before, np.zeros((*hears.before.shape[:2], len(entering)))], axis=-1)
-        for place, (site, line, share) in enumerate(entering):
-            if site == g:
-                before[:, line, n + place] = share, 8 * np.finfo(float).eps * share
-        feedback.append(Feedback(hears.now, before))
-    closed = close([site.lifted for site in now.sites], feedback, layout, numbers=RADII)
-    before = np.zeros_like(closed.sent)
-    senders = [
-        (h, row, sent) for h, site in enumerate(now.sites) for row, sent in enumerate(site.schedule.sent)
-    ]
-    places = {(packet.site, packet.row, packet.lag): place for packet, place in layout.places.items()}
-    for line, (h, row, _) in enumerate(senders):
-        before[0, line, places[h, row, 1]] = 1.0
-    change = RADII.subtract(closed.sent, before)
-    combined: dict[tuple[int, str, str], Matrix] = {}
-    for line, (h, _, sent) in enumerate(senders):
-        if any((row.way.link, row.channel) == (sent.link, sent.channel) for *_, row in used):
-            ratio = ratios.get((sent.link, sent.channel))
-            number = (h, sent.link, sent.channel if ratio is None else "")
-            by = float(ratio or 1) * size(h, sent.link)
-            weighing = combined.setdefault(number, np.zeros((2, len(senders))))
-            weighing[:, line] = by, 8 * np.finfo(float).eps * abs(by)
-    if not entering or not combined:
-        return 0.0
-    at = with_doubt(relative_coordinates(find_rigid_modes(now, with_drifts=False).basis))
-    a = relative(closed.matrix[..., :n], at, RADII)
-    b = relative_rows(closed.matrix[..., n:], at, RADII)
-    output = RADII.multiply(np.stack(list(combined.values()), axis=1), change)
-    c, d = output[..., :n][..., at.rest], output[..., n:]
-    gain = peak_gain(*map(value_of, (a, b, c, d)))[0] * ABOVE
-    if not math.isfinite(gain) or not proves_gain(a, b, c, d, gain):
-        return math.inf
-    together = [
-        sum(site == g and rows[g][line].way == way for site, line, _ in entering)
-        for g, listed in enumerate(rows)
-        for way in {row.way for row in listed}
-    ]
-    return gain * math.sqrt(max(together)) * ABOVE

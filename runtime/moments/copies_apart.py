@@ -7,9 +7,8 @@ the scene, whenever frames are said to begin.
 Does not: say whether the scene is stable (see `network`); bound rounding.
 
 Every device is pushed by a force of its own of variance 1 N², drawn anew at each tick of the fastest clock as
-a frame begins; the error of a copy is its position less the mean of the others', as frames begin. Of pushes
-the loops of means make moments, and of these come covariances V₀ of luck; luck drives itself, V = V₀ + G(1) V
-(see `gains`), and the moments of positions are what pushes and V make together.
+a frame begins; the error of a copy is its position less the mean of the others', as frames begin. Pushes add
+to second moments frame by frame, and what of that lasts is what the operator makes of them, over and over.
 """
 
 from __future__ import annotations
@@ -29,10 +28,9 @@ from apc.eigen.peers import PeerGroup
 from apc.eigen.relative import Relative
 from apc.frame.devices import Device, coupled_directly, find_device
 from apc.frame.ports import with_holds, with_ports
-from apc.frame.radius import FLOATS, RADII
 from apc.frame.site import LinearSite
-from apc.moments.crowd import Hearing, instants
-from apc.moments.gains import Answer, Drive, Moments, Part, gain
+from apc.moments.crowd import Hearing, Moments, instants
+from apc.moments.operator import settled
 from apc.moments.unserved import UnservedError
 
 Floats = NDArray[np.float64]
@@ -185,30 +183,27 @@ def moments_error(of: Moments, classes: Sequence[tuple[int, Peer]]) -> float:
     classes
         How many peers each class has, and what they got.
     """
-    rows = _error_rows([(part.only, part.at, part.offsets) for part in of.parts], classes)
-    count = of.entries
-    entry = np.zeros((2, 1), np.intp)
-
-    def read(drive: Drive) -> Drive:
-        added = []
-        for number, row in enumerate(row[drive.part] for row in rows):
-            form = np.zeros((1, 2, 1, drive.matrix.shape[-1]))
-            form[0, 0, 0, : len(row)] = row
-            place = slice(count + number, count + number + 1)
-            added.append(Answer(place, form, form, np.array([drive.share]), entry))
-        return replace(drive, answers=(*drive.answers, *added))
-
-    drives = list(of.drives)
-    for number, part in enumerate(of.parts):
-        drawn, n = _pushes(part, classes), len(part.at.rest)
-        into = RADII.exact(np.eye(n))
-        drives.append(
-            Drive(part.matrix, into, drawn[None], slice(count, count + 1), part.answers, number, 1.0)
-        )
-    matrix = gain([read(drive) for drive in drives], (count + len(rows), count + 1), 1.0, FLOATS)
-    assert matrix is not None, "means grow, and second moments were to die out"
-    luck = np.linalg.solve(np.eye(count) - matrix[:count, :count], matrix[:count, count])
-    return _largest(matrix[count:, :count] @ luck + matrix[count:, count])
+    added = []
+    for moving, n in zip(of.moving, of.operator.sizes, strict=True):
+        drawn = np.zeros(n)
+        if moving.heard is None:  # a peer that is pushed
+            _, peer = classes[moving.loop.of[0]]
+            whole = np.zeros(len(moving.at.held) + len(moving.at.rest))
+            whole[np.array(peer.drawn, np.intp)] = 1.0
+            drawn[:] = whole[moving.at.rest]
+        added.append(np.diag(drawn))
+    moments = settled(of.operator, added)
+    variances = dict[tuple[Copy, int], float]()
+    for moving, moment in zip(of.moving, moments, strict=True):
+        sites = [
+            (site.count, classes[g][1])
+            for site, g in zip(moving.loop.loop.sites, moving.loop.of, strict=True)
+        ]
+        for copy, place, row in _error_rows(sites, moving.at, moving.offsets):
+            n, weight = len(row), moving.loop.many[place] * (moving.heard or 1)
+            key = copy, moving.loop.of[place]
+            variances[key] = variances.get(key, 0.0) + weight * float(row @ moment[:n, :n] @ row)
+    return _largest(np.array(list(variances.values())))
 
 
 def largest_error(
@@ -225,8 +220,8 @@ def largest_error(
     classes
         What each peer got, as for `moments_error`.
     """
-    rows = _error_rows([(None, at, offsets)], classes)
-    return _largest(np.array([row @ moments @ row for (row,) in rows]))
+    rows = _error_rows(classes, at, offsets)
+    return _largest(np.array([row @ moments @ row for *_, row in rows]))
 
 
 def _largest(variances: Floats) -> float:
@@ -237,53 +232,34 @@ def _largest(variances: Floats) -> float:
     return math.sqrt(largest)
 
 
-def _pushes(part: Part, classes: Sequence[tuple[int, Peer]]) -> Floats:
-    """Return the moments (n, n) that pushes add to a loop of means as a frame begins."""
-    variance = np.zeros(len(part.at.held) + len(part.at.rest))
-    for g, (count, peer) in enumerate(classes):
-        if part.only in (None, g):
-            start = part.offsets[g] if part.only is None else 0
-            share = 1 / count if part.only is None else 1 - 1 / count
-            variance[start + np.array(peer.drawn, np.intp)] = share
-    return np.diag(variance[part.at.rest])
-
-
 def _error_rows(
-    loops: Sequence[tuple[int | None, Relative, Sequence[int]]], classes: Sequence[tuple[int, Peer]]
-) -> list[list[Floats]]:
-    """Return the error of a copy of each class that has others, over the coordinates (n,) of each loop.
+    sites: Sequence[tuple[int, Peer]], at: Relative, offsets: Sequence[int]
+) -> list[tuple[Copy, int, Floats]]:
+    """Return the error of a copy of each site that has others: which copy and site, and it over coordinates.
 
     It is x_i − (Σ_j x_j − x_i)/(N − 1).
 
     Parameters
     ----------
-    loops
-        Of each loop the class whose peers' differences it holds, None where it holds all classes; its
-        coordinates; and where each class's states begin.
-    classes
-        How many peers each class has, and what they got.
+    sites
+        How many peers each site has, and what they got.
+    at, offsets
+        Relative coordinates, of states that begin at the offsets, site by site.
     """
     errors = []
-    for copy in dict.fromkeys(copy for _, peer in classes for copy in peer.copies):
-        places = {g: peer.copies[copy] for g, (_, peer) in enumerate(classes) if copy in peer.copies}
-        others = sum(classes[g][0] for g in places) - 1
+    for copy in dict.fromkeys(copy for _, peer in sites for copy in peer.copies):
+        places = {
+            g: offsets[g] + peer.copies[copy] for g, (_, peer) in enumerate(sites) if copy in peer.copies
+        }
+        others = sum(sites[g][0] for g in places) - 1
         for g in places if others else ():
-            rows = []
-            for only, at, offsets in loops:
-                row = np.zeros(len(at.held) + len(at.rest))
-                if only is None:
-                    for k, place in places.items():
-                        row[offsets[k] + place] = -classes[k][0] / others
-                start = offsets[g] if only is None else 0
-                if only in (None, g):
-                    row[start + places[g]] += 1 + 1 / others
-                moved = row[at.held] + row[at.rest] @ at.weights
-                if np.abs(moved).max(initial=0.0) > STANDING * np.abs(row).max(initial=0.0):
-                    raise UnservedError(
-                        "nothing holds the copies together: what they differ by grows for ever"
-                    )
-                rows.append(row[at.rest])
-            errors.append(rows)
+            row = np.zeros(len(at.held) + len(at.rest))
+            for k, place in places.items():
+                row[place] = (k == g) * (1 + 1 / others) - sites[k][0] / others
+            moved = row[at.held] + row[at.rest] @ at.weights
+            if np.abs(moved).max(initial=0.0) > STANDING * np.abs(row).max(initial=0.0):
+                raise UnservedError("nothing holds the copies together: what they differ by grows for ever")
+            errors.append((copy, g, row[at.rest]))
     if not errors:
         raise UnservedError("no position of a mass is told to others")
     return errors

@@ -10,7 +10,8 @@ Does not: say what it can't serve (see `network`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
@@ -23,6 +24,7 @@ from apc.compiler.compiled import Clock, CompiledSystem, Kind
 from apc.eigen.closing import Coupling, Loop, without_packets
 from apc.eigen.modes import complete_degrees, complete_loops, couple, dense_loop, split_exchangeable
 from apc.eigen.peers import PeerGroup, used_ways
+from apc.eigen.relative import Relative
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.exchange import Exchange
 from apc.frame.instance import Prepared
@@ -31,9 +33,9 @@ from apc.frame.parameters import resolve
 from apc.frame.radius import radius_of, value_of
 from apc.frame.schedule import Event, Schedule, Selected, Send, Sent, Tick, Way, tick_by_tick
 from apc.frame.scheduling import build_schedules
-from apc.frame.taylor import arithmetic_of, entrywise
-from apc.moments.gains import Answer, Drive, Moments, Part, number_of
+from apc.frame.taylor import arithmetic_of
 from apc.moments.mean_loops import Listened, Remembered, Route, mean_loop, remember
+from apc.moments.operator import Block, Operator
 from apc.moments.packet_memory import memory_of
 from apc.network.channel import ChannelLaw, channel_law
 
@@ -137,43 +139,107 @@ def standing_in(schedule: Schedule, kind: Kind) -> Schedule:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Apart:
+    """A loop in which one peer of a class, its first site, moves apart from the others.
+
+    `of` says of which class each site is, `many` for how many peers the first site's place could be taken by
+    another such that a peer of a site is in the same place: what luck of all such peers drives a peer by.
+    `standing` are its rigid motions over the sites' own z.
+    """
+
+    loop: Loop
+    of: tuple[int, ...]
+    many: tuple[int, ...]
+    standing: Floats
+
+    def sites_of(self, which: int) -> list[tuple[int, int]]:
+        """Return the sites of a class, and `many` of each."""
+        listed = enumerate(zip(self.of, self.many, strict=True))
+        return [(site, many) for site, (own, many) in listed if own == which]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Classes:
-    """The loops of a scene, that of all classes of peers first, with their rigid motions.
+    """The classes of a scene's peers that can change places: the loop of all, and of each one that of a peer.
 
     `weights` says what a peer of one class weighs one of another by.
     """
 
     hearing: Hearing
-    loops: tuple[Loop, ...]
+    common: Loop
     weights: Coupling
-    standing: tuple[Floats, ...]
+    loops: tuple[Apart, ...]
 
-    def only(self, place: int) -> int | None:
-        """Return the class whose peers a loop moves against each other, None for the loop of all classes."""
-        names = [site.name for site in self.loops[0].sites]
-        return names.index(self.loops[place].sites[0].name) if place else None
+    @property
+    def counts(self) -> list[int]:
+        """How many peers each class has."""
+        return [site.count for site in self.common.sites]
 
 
 def classes_of(hearing: Hearing) -> Classes:
     """Return the loops of a scene with their rigid motions."""
-    loops, weights = peer_classes(hearing)
-    return Classes(hearing, loops, weights, tuple(map(standing_motions, loops)))
+    common, weights = peer_classes(hearing)
+    loops = []
+    for which, own in enumerate(common.sites):
+        sites = [(which, replace(own, count=1, peers=own.peers[:1]), 1)]
+        for g, site in enumerate(common.sites):
+            first = int(g == which)
+            if count := site.count - first:
+                many = count if first else own.count
+                sites.append((g, replace(site, count=count, peers=site.peers[first:]), many))
+        coupling = {
+            way: tuple(
+                tuple(rows[g][h] * (to.count - (place == of)) for of, (h, to, _) in enumerate(sites))
+                for place, (g, *_) in enumerate(sites)
+            )
+            for way, rows in weights.items()
+        }
+        loop = Loop(own.name, 1, tuple(site for _, site, _ in sites), coupling)
+        listed = tuple(g for g, *_ in sites), tuple(many for *_, many in sites)
+        loops.append(Apart(loop, *listed, standing_motions(loop)))
+    return Classes(hearing, common, weights, tuple(loops))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Luck:
-    """The luck of the channels from peers of class `sender` to those of `listened.site`.
+class Moving:
+    """Where a block's motions are: the relative coordinates `at` of a loop whose sites begin at `offsets`.
 
-    `places` are where each slot's covariances stand in G, `entries` which rows and columns (2, entries) of it
-    they are, `units` a unit of each over the luck of all slots (b, k, k).
+    It stands for `heard` channels to the loop's first site; or for that site itself.
+    """
+
+    loop: Apart
+    at: Relative
+    offsets: tuple[int, ...]
+    heard: int | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moments:
+    """How second moments of a scene move, and what each block of them is.
+
+    `entries` counts covariances of luck, `states` are those of the largest loop that luck drives.
+    """
+
+    operator: Operator
+    moving: tuple[Moving, ...]
+    entries: int
+    states: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Kind:
+    """The channels from peers of class `sender` to those of class `receiver`; their lucks, slot by slot.
+
+    Each slot's packet replaces so many values by chance, of covariance `spreads`; `heard` such channels reach
+    each receiver.
     """
 
     sender: int
+    receiver: int
+    heard: int
     listened: Listened
+    lucks: range
     spreads: tuple[Matrix, ...]
-    places: tuple[slice, ...]
-    entries: tuple[NDArray[np.intp], ...]
-    units: Floats
 
 
 def crowd(system: CompiledSystem, hearing: Hearing) -> Moments:
@@ -187,7 +253,7 @@ def crowd(system: CompiledSystem, hearing: Hearing) -> Moments:
         Its peers.
     """
     of = classes_of(hearing)
-    return moments_of(of, remembered_of(system, of.hearing, of.loops[0]))
+    return moments_of(of, remembered_of(system, of.hearing, of.common))
 
 
 def moments_of(
@@ -204,100 +270,118 @@ def moments_of(
     frames
         As for `mean_loops.mean_loop`.
     """
-    luck = _luck(of.loops[0], of.weights, memories)
-    parts, drives = [], []
-    for number, loop in enumerate(of.loops):
-        only = of.only(number)
-        driving = [item for item in luck if only in (None, item.listened.site)]
-        listened = [item.listened if only is None else replace(item.listened, site=0) for item in driving]
-        mean, channels = mean_loop(loop, of.hearing.of(loop), memories, listened, of.standing[number], frames)
-        classes = tuple(range(len(loop.sites))) if only is None else (only,)
-        parts.append(
-            Part(mean.matrix, only, mean.at, mean.offsets, tuple(_answers(mean.misses, luck, classes)))
-        )
-        for item, channel in zip(driving, channels, strict=True):
-            receivers = of.loops[0].sites[item.listened.site].count
-            heard = of.loops[0].sites[item.sender].count - (item.sender == item.listened.site)
-            # One channel drives the mean of all receivers by 1/n, and their differences by 1 − 1/n or −1/n.
-            by = 1 / receivers
-            share = heard * (by if only is None else 1 - by)
-            own = item, channel.own, by if only is None else -by
-            answers = tuple(_answers(channel.misses, luck, classes, share, *own))
-            place = slice(item.places[0].start, item.places[-1].stop)
-            drives.append(Drive(channel.matrix, channel.into, item.units, place, answers, number, share))
-    return Moments(tuple(parts), tuple(drives), luck[-1].places[-1].stop if luck else 0)
+    kinds = _kinds(of, memories)
+    spreads = [spread for kind in kinds for spread in kind.spreads]
+    widths = [len(spread[0]) for spread in spreads]
+    blocks, moving, states = list[Block](), list[Moving](), 0
+    for h, apart in enumerate(of.loops):
+        driving = [kind for kind in kinds if kind.receiver == h]
+        rows = of.hearing.of(apart.loop)
+        listened = [kind.listened for kind in driving]
+        mean, channels = mean_loop(apart.loop, rows, memories, listened, apart.standing, frames)
+        blocks.append(_block(mean.matrix, _forms(kinds, apart, mean.misses), widths))
+        moving.append(Moving(apart, mean.at, mean.offsets))
+        for kind, channel in zip(driving, channels, strict=True):
+            forms = _forms(kinds, apart, channel.misses, kind, channel.own)
+            blocks.append(_block(channel.matrix, forms, widths, channel.into, kind.lucks))
+            moving.append(Moving(apart, mean.at, mean.offsets, kind.heard))
+            states = max(states, channel.matrix.shape[-1])
+    width, like = max(widths, default=0), blocks[0].matrix
+    listed = np.zeros((len(widths), len(like), width, width))
+    for own, spread, size in zip(listed, spreads, widths, strict=True):
+        own[: len(spread), :size, :size] = spread
+    entries = sum(size * (size + 1) // 2 for size in widths)
+    return Moments(Operator(tuple(blocks), listed), tuple(moving), entries, states)
 
 
-def _answers(
+# What luck follows from: which, by what weight, and by which form over a block's states and its own luck.
+Form = tuple[int, float, Matrix]
+
+
+def _forms(
+    kinds: Sequence[_Kind],
+    apart: Apart,
     misses: Mapping[tuple[int, Route, int], Matrix],
-    luck: Sequence[_Luck],
-    classes: Sequence[int],
-    share: float = 1.0,
-    driving: _Luck | None = None,
-    matrices: Sequence[Matrix] = (),
-    by: float = 0.0,
-) -> Iterator[Answer]:
-    """Give the covariances of luck that follow from a loop's moments.
+    kind: _Kind | None = None,
+    own: Sequence[Matrix] = (),
+) -> list[Form]:
+    """Return by which forms luck follows from what moves in a loop, driven by channels of a kind or none.
 
     Parameters
     ----------
+    kinds, apart
+        All kinds of channels, and the loop.
     misses
-        How far packets are from what is heard, by site, route and slot, over the loop's states.
-    luck
-        All kinds of luck.
-    classes
-        The classes of the loop's sites.
-    share
-        How many channels drive the loop.
-    driving, matrices, by
-        Of a loop driven by a channel: which kind, how far its packets are from what it hears by itself, slot
-        by slot, and how much of it the loop takes part in.
+        How far packets are from what is heard, by site, route and slot.
+    kind, own
+        What drives it, and how far its packets are from what it hears by itself, slot by slot.
     """
-    for (site, route, slot), miss in misses.items():
-        for kind in luck:
-            if (kind.listened.route, kind.sender) != (route, classes[site]):
-                continue
-            left, right, weights = miss[None], miss[None], np.array([share])
-            if kind is driving:
-                # by (m oᵀ + o mᵀ), and o oᵀ itself once, in the loop of all.
-                numbers = arithmetic_of(miss)
-                more = entrywise(miss, number_of(2 * by, numbers))
-                more = numbers.add(more, matrices[slot]) if by > 0 else more
-                left, right = np.stack([miss, more]), np.stack([miss, matrices[slot]])
-                weights = np.array([share, 1.0])
-            yield Answer(kind.places[slot], left, right, weights, kind.entries[slot], kind.spreads[slot])
+    forms = []
+    for target in kinds:
+        for (slot, luck), (site, many) in itertools.product(
+            enumerate(target.lucks), apart.sites_of(target.sender)
+        ):
+            miss = misses[site, target.listened.route, slot]
+            weight = many * (1 if kind is None else kind.heard)
+            if target is kind and site:  # one of these channels is that whose packet it is
+                weight -= 1
+                forms.append((luck, 1.0, arithmetic_of(miss).add(miss, own[slot])))
+            if weight:
+                forms.append((luck, float(weight), miss))
+    return forms
 
 
-def _luck(common: Loop, weights: Coupling, memories: Sequence[Remembered]) -> list[_Luck]:
-    """Return the luck of the channels left to chance, one of each kind."""
-    kinds: list[_Luck] = []
-    first = 0
+def _block(
+    matrix: Matrix,
+    forms: Sequence[Form],
+    widths: Sequence[int],
+    into: Matrix | None = None,
+    by: Sequence[int] = (),
+) -> Block:
+    """Return a block of the operator.
+
+    Parameters
+    ----------
+    matrix, forms
+        What moves its states, and what luck follows from them.
+    widths
+        How many values each luck has.
+    into, by
+        How its own lucks enter its states, one after the other.
+    """
+    n, p = matrix.shape[-1], max(widths, default=0)
+    ends = np.cumsum([0, *(widths[luck] for luck in by)]).tolist()
+    enters = np.zeros((len(by), len(matrix), n, p))
+    seen, shares = np.zeros((len(forms), len(matrix), p, n)), np.zeros((len(widths), len(forms)))
+    at_once = np.zeros((len(forms), len(by), len(matrix), p, p))
+    for k, (luck, weight, form) in enumerate(forms):
+        shares[luck, k] = weight
+        seen[k, :, : widths[luck]] = form[..., :n]
+        for e, (start, end) in enumerate(itertools.pairwise(ends)):
+            at_once[k, e, :, : widths[luck], : end - start] = form[..., n + start : n + end]
+    for e, (start, end) in enumerate(itertools.pairwise(ends)):
+        assert into is not None, "luck enters by something"
+        enters[e, ..., : end - start] = into[..., start:end]
+    return Block(matrix, enters, tuple(by), seen, shares, at_once if at_once.any() else None)
+
+
+def _kinds(of: Classes, memories: Sequence[Remembered]) -> list[_Kind]:
+    """Return the kinds of channels left to chance."""
+    kinds: list[_Kind] = []
+    first, counts = 0, of.counts
     for memory in memories:
-        count, total = len(memory.channels), sum(memory.sizes)
-        starts = np.cumsum([0, *memory.sizes])
-        numbers = np.ones((count, count))  # all numbers of a packet are lost together
-        spreads = tuple(np.kron(numbers, memory.memory.spread(slot)) for slot in range(memory.memory.slots))
-        entries = tuple(np.array(np.triu_indices(count * size)) for size in memory.sizes)
-        units = []
-        for start, size, listed in zip(starts, memory.sizes, entries, strict=False):
-            where = (np.arange(count)[:, None] * total + start + np.arange(size)).ravel()
-            for a, b in where[listed].T:
-                unit = np.zeros((count * total, count * total))
-                unit[a, b] = unit[b, a] = 1.0
-                units.append(unit)
-        if not units:
+        if not any(memory.sizes):
             continue
-        for h, site in enumerate(common.sites):
-            for g in range(len(common.sites)):
-                weighed = {
-                    way: rows[h][g] for way, rows in weights.items() if (way.link, way.delay) == memory.route
-                }
-                if any(weighed.values()) and (g != h or site.count > 1):
-                    ends = np.cumsum([first, *(entry.shape[1] for entry in entries)]).tolist()
-                    places = tuple(map(slice, ends, ends[1:]))
-                    listened = Listened(h, memory.route, weighed)
-                    kinds.append(_Luck(g, listened, spreads, places, entries, np.array(units)))
-                    first = ends[-1]
+        numbers = np.ones((len(memory.channels),) * 2)  # all numbers of a packet are lost together
+        spreads = tuple(np.kron(numbers, memory.memory.spread(slot)) for slot in range(memory.memory.slots))
+        for h, g in itertools.product(range(len(counts)), repeat=2):
+            weighed = {
+                way: rows[h][g] for way, rows in of.weights.items() if (way.link, way.delay) == memory.route
+            }
+            heard = counts[g] - (g == h)
+            if heard and any(weighed.values()):
+                lucks = range(first, first := first + len(spreads))
+                kinds.append(_Kind(g, h, heard, Listened(0, memory.route, weighed), lucks, spreads))
     return kinds
 
 
@@ -307,9 +391,8 @@ def standing_motions(loop: Loop) -> Floats:
     return find_rigid_modes(without_packets(loop), with_drifts=False).basis[:states]
 
 
-def peer_classes(hearing: Hearing) -> tuple[tuple[Loop, ...], Coupling]:
-    """Return the loops of a scene, that of all classes first, and what a peer of one weighs one of another
-    by.
+def peer_classes(hearing: Hearing) -> tuple[Loop, Coupling]:
+    """Return the loop of all classes of peers, and what a peer of one weighs one of another by.
 
     Peers of a class can change places: each hears all others alike, of its own class too, or none of them.
     """
@@ -320,17 +403,17 @@ def peer_classes(hearing: Hearing) -> tuple[tuple[Loop, ...], Coupling]:
         def one(way: Way, g: int, h: int) -> Fraction:
             return Fraction(groups[h].count > (1 if g == h else 0))
 
-        return complete_loops(groups, exchange), couple(groups, exchange, one, degrees)
+        return complete_loops(groups, exchange)[0], couple(groups, exchange, one, degrees)
     whole = dense_loop(groups, exchange)
-    loops = split_exchangeable(whole, exchange)
+    common = split_exchangeable(whole, exchange)[0]
     place = {int(group.peers[0]): number for number, group in enumerate(whole.sites)}
-    first = [place[int(site.peers[0])] for site in loops[0].sites]
-    last = [place[int(site.peers[-1])] for site in loops[0].sites]
+    first = [place[int(site.peers[0])] for site in common.sites]
+    last = [place[int(site.peers[-1])] for site in common.sites]
     weights = {
         way: tuple(tuple(rows[g][last[k] if g == h else h] for k, h in enumerate(first)) for g in first)
         for way, rows in whole.coupling.items()
     }
-    return loops, weights
+    return common, weights
 
 
 def remembered_of(

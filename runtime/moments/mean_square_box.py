@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from apc.analysis.box import open_sites
 from apc.analysis.box_proof import TOGETHER, UNDECIDED, BoxProof, Looked, middle, search_box
-from apc.analysis.cells import Cell, OpenFrames, contracted, frames_over, open_frames
+from apc.analysis.cells import Cell, OpenFrames, frames_over, open_frames
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
@@ -41,9 +41,9 @@ from apc.frame.parameters import resolve
 from apc.frame.radius import UNIT
 from apc.frame.taylor import hull, within
 from apc.moments.crowd import Classes, build_hearing, classes_of, moments_of, peer_classes, remembered_of
-from apc.moments.gains import below_1
 from apc.moments.mean_loops import Remembered
 from apc.moments.network_verdict import STABLE, UNSTABLE, growth
+from apc.moments.operator import dies_out
 from apc.moments.packet_memory import is_memoryless
 from apc.network.channel import channel_law
 from apc.network.nominal import channel_numbers, unreliable
@@ -93,7 +93,7 @@ def prove_box(system: CompiledSystem, ranges: Sequence[Range], *, cells: int | N
     """
     with single_threaded(), np.errstate(all="ignore"):
         asked = _question(system, ranges)
-        for loop in asked.classes.loops:
+        for loop in (apart.loop for apart in asked.classes.loops):
             bare = without_packets(loop)
             if not stays_rigid(bare, [asked.frames.sites[asked.places[site.name]] for site in bare.sites]):
                 note = f"{loop.name} moves freely in a direction that changes with the parameters"
@@ -127,13 +127,12 @@ def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question:
     whole = tuple((ranges[place].low, ranges[place].high) for place in own)
     maps = [frame_map.mapped(lambda block: hull(block)[0]) for frame_map in frames_over(frames, [whole])]
     lifted_wide = [group.with_lifted(frame) for group, frame in zip(hearing.groups, maps, strict=True)]
-    wide = peer_classes(replace(hearing, groups=tuple(lifted_wide)))[0][0]
+    wide = peer_classes(replace(hearing, groups=tuple(lifted_wide)))[0]
     memories = remembered_of(opened.at, hearing, wide)
     classes = classes_of(hearing)
     places = {
         site.name: next(place for place, group in enumerate(hearing.groups) if site.peers[0] in group.peers)
-        for loop in classes.loops
-        for site in loop.sites
+        for site in classes.common.sites
     }
     return _Question(system, prepared, tuple(ranges), own, classes, frames, places, wide, memories)
 
@@ -202,11 +201,7 @@ def _proved(asked: _Question, cell: Cell, lifted: Sequence[FrameMap]) -> tuple[b
         return False, False
     frames = {name: lifted[which] for name, which in asked.places.items()}
     of = moments_of(asked.classes, _memories(asked, cell), frames)
-    for matrix in of.means[1]:
-        contraction = contracted(matrix[None])
-        if not contraction.proved.all():
-            return False, bool(contraction.inside.all())
-    return below_1(of)
+    return dies_out(of.operator)
 
 
 def _memories(asked: _Question, cell: Cell) -> Sequence[Remembered]:

@@ -9,31 +9,23 @@ Does not: look at the nominal network (see `analysis`).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
 
 from apc.compiler.compiled import CompiledSystem, Link
 from apc.compiler.multiples import common_multiple
-from apc.frame.exchange import arcs
 from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, prepare
 from apc.frame.parameters import resolve
 from apc.moments.almost_sure import AlmostSure, almost_sure
-from apc.moments.bursts import affine, tagged_error, tagged_radius
+from apc.moments.bursts import tagged_error, tagged_radius
 from apc.moments.copies_apart import forced, moments_error
-from apc.moments.crowd import Hearing, build_hearing, crowd, peer_classes
-from apc.moments.gains import Moments, mean_square_radius
-from apc.moments.held import every_channel, held_scene
+from apc.moments.crowd import Hearing, Moments, build_hearing, crowd, peer_classes
+from apc.moments.frames import LossyFrame, channels_of, held_frame, refuse_unheld, stand_in_frame
+from apc.moments.operator import enclosed
 from apc.moments.packet_memory import is_memoryless
-from apc.moments.patterns import (
-    MOST_CHANNELS,
-    held_patterns,
-    pattern_error,
-    pattern_radius,
-    stand_in_patterns,
-)
 from apc.moments.stand_in import stand_in
 from apc.moments.traces import trace_radius
 from apc.moments.unserved import UnservedError
@@ -56,6 +48,9 @@ UNPROVED = "not proved: the radius is that of an iteration in floats"
 EXACTLY_TAGGED, MOST_TAGGED, ORDERS = 4, 8, (2, 3)
 ESTIMATE = f"an estimate: moments of at most {ORDERS[1]} channels' states together; with {ORDERS[0]}"
 
+# Channels whose patterns are all looked at.
+MOST_CHANNELS = 6
+
 # Peers of which any number may be heard, one by one, where values stand in.
 ENUMERATED = 4
 
@@ -65,6 +60,9 @@ ROUNDED = 4e-15
 
 # Covariances of luck times cubes of the means' states, up to which one growth takes some ten milliseconds.
 QUICK = 200_000
+
+# As much takes some ten seconds.
+MOST_WORK = 20_000_000
 
 # How many times what two estimates differ by counts as their error; what bounds may be apart at most.
 DOUBTS, LOOSE = 10, 1e-9
@@ -156,22 +154,15 @@ def _growth(system: CompiledSystem, prepared: Prepared, bounded: bool) -> Growth
     holding = {link.channel.on_loss == "hold" for link, law in lossy if link.channel and law.mean_loss}
     memoryless = all(is_memoryless(law) for _, law in lossy)
     if memoryless and holding <= {True}:
-        return _by_gain(system, prepared, bounded, None)
+        return _by_gain(system, prepared, None, bounded=bounded)
     if any(law.jitter for _, law in lossy):
         raise UnservedError("jitter beside losses of another link that come in bursts or with on_loss: zero")
     if holding == {True}:
-        return _of_held(system, prepared)
+        return _by_tags(system, prepared, None)
     first = _due(system, lossy)
     if memoryless:
-        return _by_gain(system, prepared, bounded, first)
-    hearing = build_hearing(system, prepared, first=first, stand_in=True)
-    of = stand_in_patterns(system, hearing)
-
-    def errors() -> tuple[float, str]:
-        pushed = forced(system, hearing, first)
-        return pattern_error(stand_in_patterns(system, pushed.hearing), pushed.peer_by_peer()), ""
-
-    return _iterated(pattern_radius(of), errors)
+        return _by_gain(system, prepared, first, bounded=bounded)
+    return _by_tags(system, prepared, first)
 
 
 def _over_trace(system: CompiledSystem, prepared: Prepared) -> Growth:
@@ -189,7 +180,7 @@ def _over_trace(system: CompiledSystem, prepared: Prepared) -> Growth:
     return Growth(radius, max(radius - doubt, 0.0), radius + doubt, False, note=note, errors=errors)
 
 
-def _by_gain(system: CompiledSystem, prepared: Prepared, bounded: bool, first: Fraction | None) -> Growth:
+def _by_gain(system: CompiledSystem, prepared: Prepared, first: Fraction | None, *, bounded: bool) -> Growth:
     """Return what second moments grow by where packets are lost or late one by one.
 
     Parameters
@@ -207,59 +198,63 @@ def _by_gain(system: CompiledSystem, prepared: Prepared, bounded: bool, first: F
 
     def errors() -> tuple[float, str]:
         pushed = forced(system, hearing, first or Fraction(0))
-        classes = pushed.of(peer_classes(pushed.hearing)[0][0].sites)
+        classes = pushed.of(peer_classes(pushed.hearing)[0].sites)
         return moments_error(moments(pushed.hearing), classes), ""
 
     of = moments(hearing)
-    inner = mean_square_radius(of, bounded=bounded)
+    if of.entries * of.states**3 > MOST_WORK:
+        raise UnservedError(
+            f"{of.entries:,} covariances of random losses and delays that drive loops of {of.states} states "
+            "would take minutes: fewer ticks at which a packet may arrive, a shorter delay, or fewer peers "
+            "that differ"
+        )
+    inner = enclosed(of.operator, bounded=bounded)
     # Of many peers whose values stand in, the nodes of a quadrature are rounded.
     proved = first is None or system.peers <= ENUMERATED
     quick = proved if first is not None else of.entries * of.states**3 <= QUICK
     return Growth(inner.radius, inner.low, inner.high, True, proved=proved, quick=quick, errors=errors)
 
 
-def _of_held(system: CompiledSystem, prepared: Prepared) -> Growth:
-    """Return what second moments grow by where losses come in bursts, and what was heard last is held."""
-    scene = held_scene(system, prepared)
-    links = [link for link in system.links if link.name in scene.lossy]
-    channels = sum(_channels(link, system.peers) for link in links)
+def _by_tags(system: CompiledSystem, prepared: Prepared, first: Fraction | None) -> Growth:
+    """Return what second moments grow by where losses come in bursts.
+
+    Parameters
+    ----------
+    system, prepared, first
+        As for `_by_gain`.
+    """
+    hearing = build_hearing(system, prepared, first=first or Fraction(0), stand_in=first is not None)
     complete = all(link.graph.shape == "complete" for link in system.links)
-    same = len(system.groups) == 1 and not system.groups[0].columns and len(links) == 1 and complete
-    sure = all(law.one_minus_h == 1 and law.one_minus_k == 0 for _, law in unreliable(system))
-    tagged = sure and same and system.peers <= MOST_TAGGED
-    if not tagged and channels > MOST_CHANNELS:
-        what = f"followed are {MOST_CHANNELS}, or {MOST_TAGGED} equal peers that hold what they miss"
-        raise UnservedError(f"bursts on {channels} ways: {what}")
-    orders = ORDERS if system.peers > EXACTLY_TAGGED else (channels,)
-    held, chances = every_channel(system, scene)
+    alike = complete and len(system.groups) == 1 and not system.groups[0].columns
+    channels = MOST_CHANNELS
+    if first is None:
+        refuse_unheld(system, hearing)
+        links = [link for link in system.links if link.channel]
+        channels = sum(channels_of(link, system.peers) for link in links)
+        alike = alike and len(links) == 1 and system.peers <= MOST_TAGGED
+        if not alike and channels > MOST_CHANNELS:
+            what = f"followed are {MOST_CHANNELS}, or {MOST_TAGGED} equal peers that hold what they miss"
+            raise UnservedError(f"bursts on {channels} ways: {what}")
+    orders = (channels,) if system.peers <= EXACTLY_TAGGED or channels <= MOST_CHANNELS else ORDERS
+
+    def frame(hearing: Hearing) -> LossyFrame:
+        if first is None:
+            return held_frame(system, hearing, alike=alike)
+        return stand_in_frame(system, hearing, MOST_CHANNELS, alike=alike)
 
     def errors() -> tuple[float, str]:
-        pushed = forced(system, scene.hearing)
-        whole = every_channel(system, replace(scene, hearing=pushed.hearing))
-        if not tagged:
-            return pattern_error(held_patterns(*whole), pushed.peer_by_peer()), ""
-        first, *more = (tagged_error(affine(*whole), order, pushed.peer_by_peer()) for order in orders)
-        return (more[0], f"{ESTIMATE} it is {first:.9g} m") if more else (first, "")
+        pushed = forced(system, hearing, first or Fraction(0))
+        whole = frame(pushed.hearing)
+        rough, *more = (tagged_error(whole, order, pushed.peer_by_peer()) for order in orders)
+        return (more[0], f"{ESTIMATE} it is {rough:.9g} m") if more else (rough, "")
 
-    if not tagged:
-        return _iterated(pattern_radius(held_patterns(held, chances)), errors)
-    frame = affine(held, chances)
-    rough, *more = (tagged_radius(frame, order) for order in orders)
+    whole = frame(hearing)
+    rough, *more = (tagged_radius(whole, order) for order in orders)
     if not more:
-        return _iterated(rough, errors)
+        return Growth(rough, rough * (1 - ITERATED), rough * (1 + ITERATED), True, errors=errors)
     off = abs(more[0] - rough)
     note = f"{ESTIMATE} the radius is {rough:.9g}"
     return Growth(more[0], more[0] - off, more[0] + off, False, note=note, errors=errors)
-
-
-def _iterated(radius: float, errors: Callable[[], tuple[float, str]]) -> Growth:
-    """Return a growth that an iteration found."""
-    return Growth(radius, radius * (1 - ITERATED), radius * (1 + ITERATED), True, errors=errors)
-
-
-def _channels(link: Link, peers: int) -> int:
-    """Return how many ways a link has."""
-    return peers * (peers - 1) if link.graph.shape == "complete" else len(arcs(link.graph, peers)[0])
 
 
 def _unserved(system: CompiledSystem, lossy: Sequence[tuple[Link, ChannelLaw]]) -> str:

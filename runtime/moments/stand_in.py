@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -28,14 +28,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
-from apc.eigen.closing import Coupling, Loop
+from apc.eigen.closing import Coupling, Feedback, Loop, StateLayout, close
 from apc.eigen.relative import relative_coordinates, relative_rows, with_doubt
-from apc.frame.radius import RADII, UNIT
+from apc.frame.radius import RADII, UNIT, with_radius
 from apc.frame.schedule import Selected, Way
 from apc.frame.taylor import entrywise
-from apc.moments.crowd import Hearing, own_value, peer_classes, remembered_of, standing_motions
-from apc.moments.gains import Answer, Drive, Moments, Part, number_of, weighted
+from apc.moments.crowd import (
+    Apart,
+    Hearing,
+    Moments,
+    Moving,
+    classes_of,
+    own_value,
+    remembered_of,
+)
 from apc.moments.mean_loops import Remembered, Site, standing_state, with_memory
+from apc.moments.operator import Block, Operator, mean_of, number_of
 from apc.moments.unserved import UnservedError
 from apc.network.channel import ChannelLaw, channel_law
 
@@ -53,16 +61,16 @@ NODE_ROUNDINGS = 16
 class Receiver:
     """How a peer of a class moves by how many it hears: each row of `heard` (m, K) of probability `weight`.
 
-    `mean` (2, n, n) is that of P(a), `shares` are k_g, the mean that one peer of each class g takes part with
-    (2, n, n_g). `varies` (m, 2, n, n + Σ n_g) is [P(a) − P, a K_g(a) − n_g k_g], and `per_peer` K_g(a) − k_g.
+    `alone` is P(a) (m, 2, n, n), `mean` its mean, `heard_of` K_g(a) for each class g (m, 2, n, n_g), and
+    `shares` k_g (2, n, n_g), by which one peer of it takes part in the mean.
     """
 
     heard: Floats
     weight: Floats
+    alone: Matrix
     mean: Matrix
+    heard_of: tuple[Matrix, ...]
     shares: tuple[Matrix, ...]
-    varies: Matrix
-    per_peer: tuple[Matrix, ...]
 
 
 def quadrature(n: int, chance: float, most: int) -> tuple[Floats, Floats]:
@@ -100,13 +108,35 @@ def stand_in(system: CompiledSystem, hearing: Hearing) -> Moments:
     hearing
         Its peers, of `crowd.hearing` with what stands in; packets are due as frames begin.
     """
-    loops, weights = peer_classes(hearing)
-    receivers, offsets, _ = receivers_of(system, hearing, loops, weights)
-    return _closed(receivers, [site.count for site in loops[0].sites], offsets, loops)
+    of = classes_of(hearing)
+    receivers, offsets, _ = receivers_of(system, hearing, of.common, of.weights)
+    sizes = np.diff(offsets).tolist()
+    width = max(sizes)
+    blocks, moving = [], []
+    for own, apart in enumerate(of.loops):
+        starts = np.cumsum([0, *(sizes[g] for g in apart.of)]).tolist()
+        matrix = _mean(receivers, apart, starts)
+        at = relative_coordinates(standing_state(matrix, apart.standing, apart.loop, starts))
+        bounded, seen, shares = with_doubt(at), [], []
+        for site, g in enumerate(apart.of):
+            for weights, forms in _forms(receivers[g], apart, site, starts, matrix):
+                seen.append(np.pad(forms[..., at.rest], [*[(0, 0)] * 2, (0, width - sizes[g]), (0, 0)]))
+                shares.append(np.outer(np.arange(len(sizes)) == g, apart.many[site] * weights))
+        into = relative_rows(
+            RADII.exact(np.eye(starts[-1], width) * (np.arange(width) < sizes[own])), bounded, RADII
+        )
+        inner = relative_rows(matrix[..., at.rest], bounded, RADII)
+        listed = np.concatenate(seen), np.concatenate(shares, axis=-1)
+        blocks.append(Block(inner, into[None], (own,), *listed))
+        moving.append(Moving(apart, at, tuple(starts)))
+    everything = np.ones((len(sizes), width, width))
+    entries = sum(size * (size + 1) // 2 for size in sizes)
+    operator = Operator(tuple(blocks), with_radius(everything, np.zeros_like(everything)))
+    return Moments(operator, tuple(moving), entries, max(operator.sizes))
 
 
 def receivers_of(
-    system: CompiledSystem, hearing: Hearing, loops: Sequence[Loop], weights: Coupling
+    system: CompiledSystem, hearing: Hearing, common: Loop, weights: Coupling
 ) -> tuple[list[Receiver], list[int], ChannelLaw]:
     """Return how peers of each class move, where their states start, and the law of what they miss.
 
@@ -114,12 +144,11 @@ def receivers_of(
     ----------
     system, hearing
         The compiled scene and its peers.
-    loops
-        The loops of classes of peers, that of all first.
+    common
+        The loop of all classes of peers.
     weights
         What a peer of one class weighs one of another by.
     """
-    common = loops[0]
     remembered = remembered_of(system, hearing, common, perfect=True)
     if len(remembered) != 1:
         raise UnservedError("values that stand in beside what is heard over other links")
@@ -190,140 +219,74 @@ def _receiver(
         The ways of hearing so many of each class (m, K), and their probabilities (m,).
     """
     heard_now = sorted(set(remembered.memory.heard.values()))
-    plain = site.map
-    own_places = sorted({site.sent[own_value(row)] for row in rows if row.gap})
-    m, n_r = len(heard), len(rows)
-    gap = np.zeros((m, 2, n_r, len(own_places)))
-    from_class = [np.zeros((2, n_r, rows_of.shape[-2])) for rows_of in values]
+    n = site.states
+    ends = np.cumsum([n, *(rows_of.shape[-2] for rows_of in values)]).tolist()
+    now = np.zeros((len(heard), 2, len(rows), site.map.s.shape[-2]))
+    before = np.zeros((len(heard), 2, len(rows), ends[-1]))
     for line, row in enumerate(rows):
         if (row.way.link, row.way.delay) != remembered.route or row.channel not in remembered.channels:
             continue
+        own = np.array([float(weight) for weight in weights[row.way]])
         if row.gap:
-            missed = sum(float(weights[row.way][g]) * (others[g] - heard[:, g]) for g in range(len(others)))
-            place = own_places.index(site.sent[own_value(row)])
-            gap[:, 0, line, place] = missed
-            gap[:, 1, line, place] = (
-                16
-                * UNIT
-                * sum(
-                    abs(float(weights[row.way][g])) * (others[g] + np.abs(heard[:, g]))
-                    for g in range(len(others))
-                )
-            )
+            place = site.sent[own_value(row)]
+            now[:, 0, line, place] = (others - heard) @ own
+            now[:, 1, line, place] = 16 * UNIT * ((others + np.abs(heard)) @ np.abs(own))
             continue
         value = heard_now.index(remembered.memory.heard[row.clock, row.tick])
         value += remembered.channels.index(row.channel) * len(heard_now)
-        for g, block in enumerate(from_class):
-            own = float(weights[row.way][g])
-            block[0, line, value], block[1, line, value] = own, UNIT * abs(own)
-    own_rows, own_heard = plain.s[:, own_places], plain.d[:, own_places]
-    # r = gap o + s and o = O x + D r: time orders it, D gap is nilpotent.
-    felt = np.broadcast_to(RADII.exact(np.eye(n_r)), (m, 2, n_r, n_r)).copy()
-    step = RADII.multiply(gap, own_heard)
-    term = felt
-    for _ in range(n_r):
-        term = RADII.multiply(step, term)
-        if not term.any():
-            break
-        felt = RADII.add(felt, term)
-    reached = RADII.multiply(plain.q, felt)
-    alone = RADII.add(
-        np.broadcast_to(plain.p, (m, *plain.p.shape)), RADII.multiply(RADII.multiply(reached, gap), own_rows)
-    )
+        before[:, :, line, np.array(ends[:-1]) + value] = own, UNIT * np.abs(own)
+    layout = StateLayout((0,), ("",) * n, {})
+    moved = close([site.map], [Feedback(now, before)], layout, numbers=RADII).matrix
+    alone = moved[..., :n]
 
-    def averaged(blocks: Matrix) -> Matrix:
-        return np.asarray(weighted(blocks[None], weight, RADII)[0])
-
-    mean = averaged(alone)
-    varies, shares, per_peer = [RADII.subtract(alone, mean)], [], []
-    for g, (felt_of, rows_of) in enumerate(zip(from_class, values, strict=True)):
-        block = RADII.multiply(RADII.multiply(reached, felt_of), rows_of)
-        counts = np.stack([heard[:, g], NODE_ROUNDINGS * UNIT * np.abs(heard[:, g])], axis=-1)
-        alike = entrywise(block, counts[..., None, None])
-        shared = averaged(alike)
-        shares.append(entrywise(shared, number_of(1 / max(others[g], 1), RADII)))
-        varies.append(RADII.subtract(alike, shared))
-        per_peer.append(RADII.subtract(block, shares[g]))
-    return Receiver(heard, weight, mean, tuple(shares), np.concatenate(varies, axis=-1), tuple(per_peer))
+    heard_of = [
+        RADII.multiply(moved[..., start:end], rows_of)
+        for start, end, rows_of in zip(ends, ends[1:], values, strict=False)
+    ]
+    shares = []
+    for g, by in enumerate(heard_of):
+        shared = mean_of(weight, entrywise(by, _counts(heard[:, g])))
+        shares.append(entrywise(shared, number_of(1 / max(others[g], 1))))
+    mean = mean_of(weight, alone)
+    return Receiver(heard, weight, alone, mean, tuple(heard_of), tuple(shares))
 
 
-def _closed(
-    receivers: Sequence[Receiver], counts: Sequence[int], offsets: Sequence[int], loops: Sequence[Loop]
-) -> Moments:
-    """Close the means' loops, of all peers and of what peers of each class differ by."""
-    common, n = loops[0], offsets[-1]
-    states = [slice(*ends) for ends in itertools.pairwise(offsets)]
-    whole = np.zeros((2, n, n))
-    for h, receiver in enumerate(receivers):
-        for g, count in enumerate(counts):
-            block = entrywise(receiver.shares[g], number_of(float(count - (g == h)), RADII))
-            whole[:, states[h], states[g]] = RADII.add(receiver.mean, block) if h == g else block
-    loops_of: list[tuple[int | None, Matrix]] = [(None, whole)]
-    names = [site.name for site in common.sites]
-    for loop in loops[1:]:
-        h = names.index(loop.sites[0].name)
-        loops_of.append((h, RADII.subtract(receivers[h].mean, receivers[h].shares[h])))
-    listed = [np.array(np.triu_indices(state.stop - state.start)) for state in states]
-    ends = np.cumsum([0, *(entries.shape[1] for entries in listed)]).tolist()
-    places = list(map(slice, ends, ends[1:]))
-    parts, drives = [], []
-    for number, ((only, matrix), loop) in enumerate(zip(loops_of, loops, strict=True)):
-        starts = offsets if only is None else [0, len(matrix[0])]
-        at = relative_coordinates(standing_state(matrix, standing_motions(loop), loop, starts))
-        bounded, inner = with_doubt(at), matrix[..., at.rest]
-        answers = tuple(
-            Answer(places[h], forms[..., at.rest], forms[..., at.rest], weights, listed[h])
-            for h in range(len(counts))
-            for forms, weights in [_forms(receivers, h, only, counts, states)]
-            if len(weights)
-        )
-        part = Part(relative_rows(inner, bounded, RADII), only, at, tuple(starts), answers)
-        parts.append(part)
-        for d in range(len(counts)) if only is None else [only]:
-            # Of a peer in n, the mean of all takes 1/n, and what it differs by from that the rest.
-            share = 1 / counts[d] if only is None else 1 - 1 / counts[d]
-            units = np.zeros((listed[d].shape[1], *[states[d].stop - states[d].start] * 2))
-            a, b = listed[d]
-            units[np.arange(len(a)), a, b] = units[np.arange(len(a)), b, a] = 1.0
-            columns = states[d] if only is None else slice(None)
-            into = relative_rows(RADII.exact(np.eye(matrix.shape[-1])[:, columns]), bounded, RADII)
-            into = entrywise(into, number_of(share**0.5, RADII))
-            drives.append(Drive(part.matrix, into, units, places[d], answers, number, 1.0))
-    return Moments(tuple(parts), tuple(drives), ends[-1])
+def _mean(receivers: Sequence[Receiver], apart: Apart, starts: Sequence[int]) -> Matrix:
+    """Return the matrix (2, n, n) that the means of a loop's sites move by."""
+    spans, matrix = list(map(slice, starts, starts[1:])), np.zeros((2, starts[-1], starts[-1]))
+    for place, g in enumerate(apart.of):
+        for of, (h, site) in enumerate(zip(apart.of, apart.loop.sites, strict=True)):
+            block = entrywise(receivers[g].shares[h], number_of(float(site.count - (of == place))))
+            matrix[:, spans[place], spans[of]] = RADII.add(receivers[g].mean, block) if of == place else block
+    return matrix
 
 
 def _forms(
-    receivers: Sequence[Receiver], h: int, only: int | None, counts: Sequence[int], states: Sequence[slice]
-) -> tuple[Matrix, Floats]:
-    """Return by which forms (k, 2, n_h, n) and weights (k,) luck adds to a peer of class h.
+    receiver: Receiver, apart: Apart, place: int, starts: Sequence[int], mean: Matrix
+) -> Iterator[tuple[Floats, Matrix]]:
+    """Give the probabilities (m,) of how a peer of a site moves beside the mean, and how (m, 2, n_h, n).
 
-    What luck adds is how a peer moves beside the mean of such peers, those it hears taken to be the same; and
-    which of those that differ it hears, a of n.
-
-    Parameters
-    ----------
-    receivers, counts, states
-        The classes: how peers of each move, how many there are, and where their states are in the loop of
-        all.
-    h
-        The class that receives.
-    only
-        The class whose peers' differences the loop holds, None for the loop of all.
+    Of n others of the class that the first site is of, a peer that hears a hears that one with the
+    probability a/n; all others of a class move alike.
     """
-    receiver = receivers[h]
-    size = receiver.mean.shape[-1]
-    itself, others = receiver.varies[..., :size], receiver.varies[..., size:]
-    if only is None:
-        forms = others.copy()
-        forms[..., states[h]] = RADII.add(others[..., states[h]], itself)
-        return forms, receiver.weight
-    # Two peers of a class of n differ from its mean by amounts of covariance −1/(n − 1).
-    n = counts[only]
-    forms = others[..., states[only]]
-    pairs = [(RADII.add(forms, itself) if h == only else forms, -receiver.weight / (n - 1))]
-    if h == only:
-        pairs.append((itself, receiver.weight * n / (n - 1)))
-    missed = float(receiver.weight @ (n - (h == only) - receiver.heard[:, only]))
-    pairs.append((receiver.per_peer[only], receiver.weight * receiver.heard[:, only] * n / (n - 1)))
-    pairs.append((receiver.shares[only][None], np.array([missed * n / (n - 1)])))
-    return np.concatenate([forms for forms, _ in pairs]), np.concatenate([weights for _, weights in pairs])
+    own = apart.of[0]
+    heard, n = (
+        receiver.heard[:, own],
+        sum(site.count for site, g in zip(apart.loop.sites, apart.of, strict=True) if g == own)
+        - (apart.of[place] == own),
+    )
+    for first in (0, 1) if place and n else (0,):
+        chance = np.abs(1 - first - heard / n) if place and n else np.ones(len(heard))
+        moved = np.zeros((len(heard), 2, starts[place + 1] - starts[place], starts[-1]))
+        for site, g in enumerate(apart.of):
+            number = receiver.heard[:, g] - first * (g == own) if site else np.full(len(heard), float(first))
+            columns = slice(starts[site], starts[site + 1])
+            moved[..., columns] = entrywise(receiver.heard_of[g], _counts(number))
+            if site == place:
+                moved[..., columns] = RADII.add(moved[..., columns], receiver.alone)
+        yield receiver.weight * chance, RADII.subtract(moved, mean[:, starts[place] : starts[place + 1]])
+
+
+def _counts(numbers: Floats) -> Matrix:
+    """Return numbers of peers (m, 2, 1, 1) with what they may be off by."""
+    return np.stack([numbers, NODE_ROUNDINGS * UNIT * np.abs(numbers)], axis=-1)[..., None, None]

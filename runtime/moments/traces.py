@@ -1,7 +1,7 @@
 """A scene over recorded delays, played again and again: frames that come back after a period.
 
 Takes: a scene all of whose unreliable links say `trace`.
-Gives: `trace_radius`, `Found`; `heard_packets`, `hearing_packets`.
+Gives: `trace_radius`, `Found`; `Packets`.
 Guarantees: nothing is left to chance: each frame hears what `simulate` hears, once the first packets are
 gone.
 Does not: serve values that stand in for missed ones, or a trace of losses only.
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem, Link
+from apc.compiler.compiled import CompiledSystem
 from apc.eigen.closing import Loop, close, feedback_of, lay_out_loop
 from apc.eigen.enclosure import enclose_eigenvalues
 from apc.eigen.modes import arrange
@@ -31,7 +31,7 @@ from apc.eigen.relative import Relative, relative, relative_coordinates, with_do
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.instance import Prepared
 from apc.frame.radius import RADII, radius_of, value_of, with_radius
-from apc.frame.schedule import Heard, Schedule, Selected, Sent
+from apc.frame.schedule import Heard, Selected, Sent
 from apc.moments.crowd import Hearing, build_hearing, instants
 from apc.moments.unserved import UnservedError
 from apc.network.timetable import instant_of
@@ -54,6 +54,76 @@ class Found:
     frames: int
 
 
+class Packets:
+    """The packets of a scene, counted from the first of the frame they are looked at from: which ticks hear.
+
+    `slots` says how many are sent in a frame on each link.
+    """
+
+    def __init__(self, system: CompiledSystem, hearing: Hearing) -> None:
+        self.hearing = hearing
+        self.rows = dict.fromkeys(row for listed in hearing.rows.values() for row in listed)
+        self.links = {link.name: link for link in system.links}
+        self.times = {clock.name: instants(hearing, clock) for clock in system.clocks}
+        self.slots = {name: len(self.times[link.clock]) for name, link in self.links.items()}
+
+    def heard(self, row: Selected, delay: Fraction | None = None, trace: Floats | None = None) -> list[int]:
+        """Return which packet a tick hears, frame by frame over a period.
+
+        Parameters
+        ----------
+        row
+            The tick.
+        delay
+            The delay of all packets in seconds, unless it is the nominal one.
+        trace
+            Delays to play again and again instead, in seconds, infinite for a lost packet.
+        """
+        link, hearing, slots = self.links[row.way.link], self.hearing, self.slots[row.way.link]
+        sent, tick = self.times[link.clock], self.times[row.clock][row.tick]
+        delays: list[Fraction | None] = [hearing.timings[row.way.delay] if delay is None else delay]
+        if trace is not None:
+            finite = np.isfinite(trace).tolist()
+            pairs = zip(trace.tolist(), finite, strict=True)
+            delays = [instant_of(late, hearing.quantum) if arrives else None for late, arrives in pairs]
+        longest = max(late for late in delays if late is not None)
+        newest = link.channel is None or link.channel.reorder == "newest"
+        numbers = []
+        for frame in range(_period_of(len(delays), slots)):
+            best: tuple[Fraction, int] | None = None
+            for number in itertools.count(slots - 1, -1):
+                ago, slot = divmod(number, slots)
+                at = sent[slot] + ago * hearing.frame
+                if best is not None and (newest or at + longest < best[0]):
+                    break  # what was sent before this can't have arrived later
+                late = delays[(frame * slots + number) % len(delays)]
+                if late is None or at + late > tick or (at + late == tick and hearing.strictly):
+                    continue
+                best = max(best or (at + late, number), (at + late, number))
+            assert best is not None
+            numbers.append(best[1])
+        return numbers
+
+    def depths(self, numbers: Iterable[tuple[Selected, int]], least: int = 0) -> dict[str, int]:
+        """Return for how many frames packets of each link are kept, if ticks hear those of these numbers."""
+        depths = dict.fromkeys(self.links, least)
+        for row, number in numbers:
+            depths[row.way.link] = max(depths[row.way.link], -(number // self.slots[row.way.link]))
+        return depths
+
+    def loop(self, loop: Loop, numbers: Mapping[Selected, int], depths: Mapping[str, int]) -> Loop:
+        """Return a loop whose ticks hear the packets of these numbers."""
+        sites = []
+        for site, rows in zip(loop.sites, self.hearing.of(loop), strict=True):
+            heard = []
+            for row in rows:
+                frames, slot = divmod(numbers[row], self.slots[row.way.link])
+                heard.append(Heard(row.way, Sent(row.way.link, row.channel, slot), -frames))
+            kept = tuple(depths[sent.link] for sent in site.schedule.sent)
+            sites.append(replace(site, schedule=replace(site.schedule, heard=tuple(heard), depths=kept)))
+        return replace(loop, sites=tuple(sites))
+
+
 def trace_radius(system: CompiledSystem, prepared: Prepared) -> Found:
     """Return what motions grow by in a frame, on the mean over a period.
 
@@ -67,104 +137,49 @@ def trace_radius(system: CompiledSystem, prepared: Prepared) -> Found:
     UnservedError
         The period or the delays are too long to follow.
     """
-    hearing = build_hearing(system, prepared)
-    links = {link.name: link for link in system.links}
-    times = {clock.name: instants(hearing, clock) for clock in system.clocks}
-    rows = {row: None for listed in hearing.rows.values() for row in listed}
-    slots = {name: len(times[link.clock]) for name, link in links.items()}
-    frames = math.lcm(*(_period_of(links[row.way.link], slots[row.way.link]) for row in rows))
+    packets = Packets(system, build_hearing(system, prepared))
+    traces = {name: link.channel.trace for name, link in packets.links.items() if link.channel}
+    lengths = {name: 1 if trace is None else len(trace) for name, trace in traces.items()}
+    used = {row.way.link for row in packets.rows}
+    frames = math.lcm(*(_period_of(lengths.get(name, 1), packets.slots[name]) for name in used))
     if frames > MOST_FRAMES:
         what = f"the recorded delays come again after {frames:,} frames"
         raise UnservedError(f"{what}, and {MOST_FRAMES:,} are the most")
-    heard = {
-        row: heard_packets(
-            link, hearing.timings[row.way.delay], times[link.clock], times[row.clock][row.tick], hearing
-        )
-        for row in rows
-        for link in [links[row.way.link]]
-    }
-    depth = {
-        name: max(
-            (-(n // slots[name]) for row in rows if row.way.link == name for n in heard[row]), default=0
-        )
-        for name in links
-    }
+    heard = {row: packets.heard(row, trace=traces.get(row.way.link)) for row in packets.rows}
+    depths = packets.depths((row, number) for row, numbers in heard.items() for number in numbers)
     result = []
-    for loop in arrange(hearing.groups, hearing.exchange).loops:
-        packets = sum(depth[sent.link] for site in loop.sites for sent in site.schedule.sent)
-        if packets + sum(len(site.z_names) for site in loop.sites) > MOST_STATES:
+    for loop in arrange(packets.hearing.groups, packets.hearing.exchange).loops:
+        kept = sum(depths[sent.link] for site in loop.sites for sent in site.schedule.sent)
+        if kept + sum(len(site.z_names) for site in loop.sites) > MOST_STATES:
             raise UnservedError("the recorded delays are longer than can be followed")
-        result.append(_period(loop, hearing, heard, depth, slots, frames))
+        result.append(_period(loop, packets, heard, depths, frames))
     low, high, radius, doubt = np.array(result).max(axis=0).tolist()
     return Found(low, high, radius, doubt, frames)
 
 
-def heard_packets(
-    link: Link, delay: Fraction, sent: Sequence[Fraction], tick: Fraction, hearing: Hearing
-) -> list[int]:
-    """Return which packet a tick hears, frame by frame over a period, counted from the first of its frame.
-
-    Parameters
-    ----------
-    link, delay
-        The link, and its nominal delay in seconds.
-    sent, tick
-        When in a frame packets are sent, and when the tick is, in seconds.
-    hearing
-        The peers of the scene.
-    """
-    slots = len(sent)
-    trace = None if link.channel is None else link.channel.trace
-    delays = (
-        [delay]
-        if trace is None
-        else [instant_of(late, hearing.quantum) if math.isfinite(late) else None for late in trace.tolist()]
-    )
-    longest = max(late for late in delays if late is not None)
-    newest = link.channel is None or link.channel.reorder == "newest"
-    numbers = []
-    for frame in range(_period_of(link, slots)):
-        best: tuple[Fraction, int] | None = None
-        for number in itertools.count(slots - 1, -1):
-            ago, slot = divmod(number, slots)
-            at = sent[slot] + ago * hearing.frame
-            if best is not None and (newest or at + longest < best[0]):
-                break  # what was sent before this can't have arrived later
-            late = delays[(frame * slots + number) % len(delays)]
-            if late is None or at + late > tick or (at + late == tick and hearing.strictly):
-                continue
-            best = max(best or (at + late, number), (at + late, number))
-        assert best is not None
-        numbers.append(best[1])
-    return numbers
-
-
-def _period_of(link: Link, slots: int) -> int:
-    """Return after how many frames what ticks hear of a link comes again."""
-    trace = None if link.channel is None else link.channel.trace
-    count = 1 if trace is None else len(trace)
-    return math.lcm(count, slots) // slots
+def _period_of(delays: int, slots: int) -> int:
+    """Return after how many frames of so many packets so many delays come again."""
+    return math.lcm(delays, slots) // slots
 
 
 def _period(
     loop: Loop,
-    hearing: Hearing,
+    packets: Packets,
     heard: Mapping[Selected, Sequence[int]],
-    depth: Mapping[str, int],
-    slots: Mapping[str, int],
+    depths: Mapping[str, int],
     frames: int,
 ) -> tuple[float, float, float, float]:
     """Return bounds on what a loop grows by in a frame, an estimate, and how far another one is from it."""
     known: dict[tuple[int, ...], Balls] = {}
     at: Relative | None = None
-    rows = [hearing.rows[id(site.schedule)] for site in loop.sites]
+    rows = dict.fromkeys(row for listed in packets.hearing.of(loop) for row in listed)
     # The eigenvalues of a product are those of its halves in either order, with other roundings.
     halves: list[Balls] = []
     scale = 0
     for frame in range(frames):
-        numbers = tuple(heard[row][frame % len(heard[row])] for listed in rows for row in listed)
+        numbers = tuple(heard[row][frame % len(heard[row])] for row in rows)
         if numbers not in known:
-            now = hearing_packets(loop, rows, iter(numbers), depth, slots)
+            now = packets.loop(loop, dict(zip(rows, numbers, strict=True)), depths)
             layout = lay_out_loop(now)
             maps = [site.lifted for site in now.sites]
             matrix = close(maps, feedback_of(now, layout), layout, numbers=RADII).matrix
@@ -199,35 +214,3 @@ def _scaled(matrix: Balls, near: float) -> tuple[Balls, int]:
     exponent = math.frexp(near)[1] if 0 < near < math.inf else 0
     value, radius = (np.ldexp(item, -exponent) for item in (value_of(matrix), radius_of(matrix)))
     return with_radius(value, radius), exponent
-
-
-def hearing_packets(
-    loop: Loop,
-    rows: Sequence[Sequence[Selected]],
-    numbers: Iterator[int],
-    depth: Mapping[str, int],
-    slots: Mapping[str, int],
-) -> Loop:
-    """Return a loop whose ticks hear the packets of these numbers.
-
-    Parameters
-    ----------
-    loop, rows
-        The loop, and what each row of r of each site hears.
-    numbers
-        The packets, row after row, counted from the first of their frame.
-    depth, slots
-        How many frames a packet is kept for, and how many are sent in a frame, by the link's name.
-    """
-    sites = []
-    for site, row in zip(loop.sites, rows, strict=True):
-        depths = tuple(depth[sent.link] for sent in site.schedule.sent)
-        packets = tuple(_packet(row, next(numbers), slots) for row in row)
-        schedule: Schedule = replace(site.schedule, heard=packets, depths=depths)
-        sites.append(replace(site, schedule=schedule))
-    return replace(loop, sites=tuple(sites))
-
-
-def _packet(row: Selected, number: int, slots: Mapping[str, int]) -> Heard:
-    frames, slot = divmod(number, slots[row.way.link])
-    return Heard(row.way, Sent(row.way.link, row.channel, slot), -frames)
