@@ -28,7 +28,7 @@ from apc.eigen.dissipation import gains_at, is_positive, peak_gain
 from apc.eigen.matrix_norms import balance
 from apc.eigen.relative import relative, relative_coordinates, relative_rows, with_doubt
 from apc.frame.discretize import exponential
-from apc.frame.radius import RADII, UNIT, radius_of, value_of
+from apc.frame.radius import RADII, UNIT, radius_of, value_of, with_radius
 from apc.hands.response import Pushed, Site, force_lanes
 from apc.moments.operator import stein
 

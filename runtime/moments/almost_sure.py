@@ -103,8 +103,9 @@ def _lost(
 
     Each channel starts in its stationary state.
     """
-    p, r, share = (np.array([[getattr(law, name)] for law in laws]) for name in ("p", "r", "bad"))
-    in_bad, in_good = (np.array([[getattr(law, f"one_minus_{name}")] for law in laws]) for name in "hk")
+    names = ("p", "r", "bad", "one_minus_h", "one_minus_k")
+    numbers = np.array([[getattr(law, name) for law in laws] for name in names])[..., None]
+    p, r, share, in_bad, in_good = numbers
     bad = luck.random((len(laws), courses)) < share
     for _ in range(frames):
         loss, change = luck.random((2, len(laws), courses))

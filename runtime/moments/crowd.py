@@ -34,7 +34,7 @@ from apc.frame.radius import radius_of, value_of
 from apc.frame.schedule import Event, Schedule, Selected, Send, Sent, Tick, Way, tick_by_tick
 from apc.frame.scheduling import build_schedules
 from apc.frame.taylor import arithmetic_of
-from apc.moments.mean_loops import Listened, Remembered, Route, mean_loop, remember
+from apc.moments.mean_loops import Heard, Listened, Remembered, Route, mean_loop, remember
 from apc.moments.operator import Block, Operator
 from apc.moments.packet_memory import memory_of
 from apc.network.channel import ChannelLaw, channel_law
@@ -278,14 +278,15 @@ def moments_of(
         driving = [kind for kind in kinds if kind.receiver == h]
         rows = of.hearing.of(apart.loop)
         listened = [kind.listened for kind in driving]
-        mean, channels = mean_loop(apart.loop, rows, memories, listened, apart.standing, frames)
-        blocks.append(_block(mean.matrix, _forms(kinds, apart, mean.misses), widths))
-        moving.append(Moving(apart, mean.at, mean.offsets))
-        for kind, channel in zip(driving, channels, strict=True):
-            forms = _forms(kinds, apart, channel.misses, kind, channel.own)
-            blocks.append(_block(channel.matrix, forms, widths, channel.into, kind.lucks))
-            moving.append(Moving(apart, mean.at, mean.offsets, kind.heard))
-            states = max(states, channel.matrix.shape[-1])
+        mean = mean_loop(apart.loop, rows, memories, listened, apart.standing, frames)
+        n = len(mean.at.rest)
+        for kind, channel in [(None, None), *zip(driving, mean.channels, strict=True)]:
+            own = np.arange(n) if channel is None else np.r_[0:n, channel.kept]
+            luck = channel.luck if channel else range(0)
+            forms = _forms(kinds, apart, mean.misses, kind, channel)
+            blocks.append(_block(mean.matrix, own, luck, forms, widths, kind.lucks if kind else ()))
+            moving.append(Moving(apart, mean.at, mean.offsets, kind and kind.heard))
+            states = max(states, len(own))
     width, like = max(widths, default=0), blocks[0].matrix
     listed = np.zeros((len(widths), len(like), width, width))
     for own, spread, size in zip(listed, spreads, widths, strict=True):
@@ -302,8 +303,8 @@ def _forms(
     kinds: Sequence[_Kind],
     apart: Apart,
     misses: Mapping[tuple[int, Route, int], Matrix],
-    kind: _Kind | None = None,
-    own: Sequence[Matrix] = (),
+    kind: _Kind | None,
+    channel: Heard | None,
 ) -> list[Form]:
     """Return by which forms luck follows from what moves in a loop, driven by channels of a kind or none.
 
@@ -313,8 +314,8 @@ def _forms(
         All kinds of channels, and the loop.
     misses
         How far packets are from what is heard, by site, route and slot.
-    kind, own
-        What drives it, and how far its packets are from what it hears by itself, slot by slot.
+    kind, channel
+        What drives it, and that in the loop.
     """
     forms = []
     for target in kinds:
@@ -323,9 +324,9 @@ def _forms(
         ):
             miss = misses[site, target.listened.route, slot]
             weight = many * (1 if kind is None else kind.heard)
-            if target is kind and site:  # one of these channels is that whose packet it is
+            if channel and target is kind and site:  # one of these channels is that whose packet it is
                 weight -= 1
-                forms.append((luck, 1.0, arithmetic_of(miss).add(miss, own[slot])))
+                forms.append((luck, 1.0, arithmetic_of(miss).add(miss, channel.misses[slot])))
             if weight:
                 forms.append((luck, float(weight), miss))
     return forms
@@ -333,36 +334,40 @@ def _forms(
 
 def _block(
     matrix: Matrix,
+    own: NDArray[np.intp],
+    luck: range,
     forms: Sequence[Form],
     widths: Sequence[int],
-    into: Matrix | None = None,
-    by: Sequence[int] = (),
+    by: Sequence[int],
 ) -> Block:
     """Return a block of the operator.
 
     Parameters
     ----------
-    matrix, forms
-        What moves its states, and what luck follows from them.
-    widths
-        How many values each luck has.
-    into, by
-        How its own lucks enter its states, one after the other.
+    matrix
+        What moves a loop.
+    own, luck
+        Which of its states are of the block, and which are the luck that drives it.
+    forms
+        What luck follows from them.
+    widths, by
+        How many values each luck has, and which drive the block, one after the other.
     """
-    n, p = matrix.shape[-1], max(widths, default=0)
-    ends = np.cumsum([0, *(widths[luck] for luck in by)]).tolist()
-    enters = np.zeros((len(by), len(matrix), n, p))
-    seen, shares = np.zeros((len(forms), len(matrix), p, n)), np.zeros((len(widths), len(forms)))
+    p = max(widths, default=0)
+    ends = np.cumsum([luck.start, *(widths[luck] for luck in by)]).tolist()
+    spans = [slice(*span) for span in itertools.pairwise(ends)]
+    enters = np.zeros((len(by), len(matrix), len(own), p))
+    seen, shares = np.zeros((len(forms), len(matrix), p, len(own))), np.zeros((len(widths), len(forms)))
     at_once = np.zeros((len(forms), len(by), len(matrix), p, p))
-    for k, (luck, weight, form) in enumerate(forms):
-        shares[luck, k] = weight
-        seen[k, :, : widths[luck]] = form[..., :n]
-        for e, (start, end) in enumerate(itertools.pairwise(ends)):
-            at_once[k, e, :, : widths[luck], : end - start] = form[..., n + start : n + end]
-    for e, (start, end) in enumerate(itertools.pairwise(ends)):
-        assert into is not None, "luck enters by something"
-        enters[e, ..., : end - start] = into[..., start:end]
-    return Block(matrix, enters, tuple(by), seen, shares, at_once if at_once.any() else None)
+    for e, span in enumerate(spans):
+        enters[e, ..., : span.stop - span.start] = matrix[:, own, span]
+    for k, (number, weight, form) in enumerate(forms):
+        shares[number, k] = weight
+        seen[k, :, : widths[number]] = form[..., own]
+        for e, span in enumerate(spans):
+            at_once[k, e, :, : widths[number], : span.stop - span.start] = form[..., span]
+    moved = matrix[:, own[:, None], own]
+    return Block(moved, enters, tuple(by), seen, shares, at_once if at_once.any() else None)
 
 
 def _kinds(of: Classes, memories: Sequence[Remembered]) -> list[_Kind]:

@@ -127,30 +127,25 @@ def held_frame(system: CompiledSystem, hearing: Hearing, *, alike: bool = False)
                 ways.append((g, h, number))
                 laws.append(channel_law(system, links[memory.route[0]], hearing.timings[memory.route[1]]))
     everything = np.zeros((sum(len(site.z_names) for site in loop.sites), 0))
-    means, channels = mean_loop(loop, hearing.of(loop), memories, listened, everything)
-    first = means.offsets[-1]
-    ends = np.cumsum([first, *(channel.matrix.shape[-1] - first for channel in channels)]).tolist()
+    means = mean_loop(loop, hearing.of(loop), memories, listened, everything)
+    matrix, first = value_of(means.matrix), means.offsets[-1]
+    luck = [place for channel in means.channels for place in channel.luck]
+    rest = np.delete(np.arange(len(matrix)), luck)
+    width = max((len(channel.luck) for channel in means.channels), default=0)
+    enters, misses = np.zeros((len(ways), len(rest), width)), np.zeros((len(ways), width, len(rest)))
+    for c, (channel, (_, sender, _), listen) in enumerate(zip(means.channels, ways, listened, strict=True)):
+        missed = value_of(means.misses[sender, listen.route, 0])
+        if missed[:, luck].any():
+            raise UnservedError("a packet follows from another one of its frame")
+        missed = missed + value_of(channel.misses[0])
+        enters[c, :, : len(channel.luck)] = -matrix[np.ix_(rest, channel.luck)]
+        misses[c, : len(channel.luck)] = missed[:, rest]
+    ends = np.cumsum([first, *(len(channel.kept) for channel in means.channels)]).tolist()
     held = tuple(map(range, ends, ends[1:]))
-    widths = [channel.into.shape[-1] for channel in channels]
-    mean = np.zeros((ends[-1], ends[-1]))
-    mean[:first, :first] = value_of(means.matrix)
-    enters = np.zeros((len(ways), ends[-1], max(widths, default=0)))
-    misses = np.zeros((len(ways), enters.shape[-1], ends[-1]))
-    for c, (channel, places, width) in enumerate(zip(channels, held, widths, strict=True)):
-        moved, into = value_of(channel.matrix), value_of(channel.into)
-        mean[:first, places], mean[np.ix_(places, places)] = moved[:first, first:], moved[first:, first:]
-        enters[c, :first, :width], enters[c, places, :width] = -into[:first], -into[first:]
-        missed = ways[c][1], listened[c].route, 0
-        misses[c, :width, :first] = value_of(means.misses[missed])
-        for other, others in zip(channels, held, strict=True):
-            sent = value_of(other.misses[missed])
-            if sent[:, first + len(others) :].any():
-                raise UnservedError("a packet follows from another one of its frame")
-            misses[c, :width, others] = sent[:, first : first + len(others)].T
-        misses[c, :width, places] += value_of(channel.own[0])[:, first : first + len(places)].T
-    offsets = means.offsets
-    basis = np.zeros((ends[-1], standing_motions(loop).shape[1]))
-    basis[:first] = standing_state(means.matrix, standing_motions(loop), loop, offsets)
+    standing, loop_matrix = standing_motions(loop), means.matrix[:, :first, :first]
+    basis = np.zeros((len(rest), standing.shape[1]))
+    basis[:first] = standing_state(loop_matrix, standing, loop, means.offsets)
+    mean, offsets = matrix[np.ix_(rest, rest)], means.offsets
     terms = tuple((way,) for way in ways)
     return _projected(mean, terms, enters, misses, ways, laws, offsets, held, basis, alike)
 

@@ -1,7 +1,7 @@
 """The loops that the mean of all peers moves by, and what one channel's luck does to them.
 
 Takes: the loops of a scene whose ticks each hear by themselves, and what channels remember.
-Gives: `Remembered`, `remember`; `Site`, `with_memory`, `standing_state`; `Listened`, `Channel`, `MeanLoop`,
+Gives: `Remembered`, `remember`; `Site`, `with_memory`, `standing_state`; `Listened`, `Heard`, `MeanLoop`,
 `mean_loop`.
 Guarantees: each matrix comes with the radius of its rounding, those of the sites' frames included; rigid
 motions are taken out, which no luck moves.
@@ -88,30 +88,28 @@ class Listened:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Channel:
-    """What the luck of a channel does to a loop.
+class Heard:
+    """A channel in a loop: where in the state what it keeps is, and its luck ξ, drawn as a frame begins.
 
-    `matrix` (2, n + m, n + m) moves the loop's n states and the channel's own m, and `into` (2, n + m, k) its
-    luck ξ, which is drawn as a frame begins. `misses` says how far what is uncertain of each site's packets,
-    by site, route and slot, is from what is sent, over these states and ξ; `own`, of each slot, what the
-    channel itself adds to that.
+    `misses` say, slot by slot, what it adds itself to how far its uncertain values are from what is sent.
     """
 
-    matrix: Matrix
-    into: Matrix
-    misses: Mapping[tuple[int, Route, int], Matrix]
-    own: tuple[Matrix, ...]
+    kept: range
+    luck: range
+    misses: tuple[Matrix, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeanLoop:
-    """A loop of means in relative coordinates: its `matrix` (2, n, n) with its radius.
+    """A loop of means in relative coordinates, and behind these what some channels keep, and their luck.
 
-    `at` are these, of states that begin at `offsets`, site by site; `misses` are as those of a `Channel`,
-    over the loop's own states (2, k_slot, n).
+    `matrix` (2, N, N) moves them all; of the loop's own n states, `at` are the coordinates, of states that
+    begin at `offsets`, site by site. `misses` say how far what is uncertain of each site's packets, by site,
+    route and slot, is from what is sent (2, k, N).
     """
 
     matrix: Matrix
+    channels: tuple[Heard, ...]
     at: Relative
     offsets: tuple[int, ...]
     misses: Mapping[tuple[int, Route, int], Matrix]
@@ -239,7 +237,7 @@ def mean_loop(
     listened: Sequence[Listened],
     standing: Floats,
     frames: Mapping[str, FrameMap] | None = None,
-) -> tuple[MeanLoop, list[Channel]]:
+) -> MeanLoop:
     """Close a loop of means, and say what the luck of some channels does to it.
 
     Parameters
@@ -289,30 +287,30 @@ def mean_loop(
     rest, n = at.rest, len(at.rest)
     moved = relative_rows(closed.matrix, with_doubt(at, numbers), numbers)
 
-    def missed(columns: NDArray[np.intp]) -> dict[tuple[int, Route, int], Matrix]:
-        return {
-            (h, *which): closed.sent[:, starts[h] + rows.start : starts[h] + rows.stop][..., columns]
-            for h, site in enumerate(sites)
-            for which, rows in site.misses.items()
-        }
-
-    channels = []
-    for listen, own, first, last in zip(listened, values, firsts, firsts[1:], strict=False):
+    columns = np.concatenate([rest, np.arange(offsets[-1], firsts[-1])])
+    matrix = np.zeros((len(like), len(columns), len(columns)))
+    matrix[:, :n] = moved[..., columns]
+    channels, start = [], n
+    for listen, own in zip(listened, values, strict=True):
         item = of_route[listen.route]
-        kept = [
-            number * len(item.memory.old) + e
-            for number in range(len(item.channels))
-            for e in item.memory.kept
-        ]
-        columns = np.concatenate([rest, np.arange(first, last)])
-        states = n + len(kept)
-        matrix = np.zeros((len(like), states, len(columns)))
-        matrix[:, :n] = moved[..., columns]
-        matrix[:, n:, n:] = over_as_many(own[:, kept], like)
-        memorized = [over_as_many(item.memorized(miss), like) for miss in item.misses]
-        within = [np.concatenate([np.zeros((*miss.shape[:-1], n)), miss], axis=-1) for miss in memorized]
-        channels.append(Channel(matrix[..., :states], matrix[..., states:], missed(columns), tuple(within)))
-    return MeanLoop(moved[..., rest], at, tuple(offsets), missed(rest)), channels
+        count = len(item.memory.old)
+        kept = [number * count + e for number in range(len(item.channels)) for e in item.memory.kept]
+        end = start + own.shape[-1]
+        matrix[:, start : start + len(kept), start:end] = over_as_many(own[:, kept], like)
+        misses = []
+        for miss in item.misses:
+            memorized = item.memorized(miss)
+            wide = np.zeros((len(like), memorized.shape[-2], len(columns)))
+            wide[..., start:end] = over_as_many(memorized, like)
+            misses.append(wide)
+        channels.append(Heard(range(start, start + len(kept)), range(start + len(kept), end), tuple(misses)))
+        start = end
+    missed = {
+        (h, *which): closed.sent[:, starts[h] + rows.start : starts[h] + rows.stop][..., columns]
+        for h, site in enumerate(sites)
+        for which, rows in site.misses.items()
+    }
+    return MeanLoop(matrix, tuple(channels), at, tuple(offsets), missed)
 
 
 def standing_state(matrix: Matrix, standing: Floats, loop: Loop, offsets: Sequence[int]) -> Floats:

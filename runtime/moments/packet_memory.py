@@ -25,7 +25,8 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.frame.radius import UNIT
+from apc.frame.radius import UNIT, value_of
+from apc.frame.taylor import arithmetic_of, entrywise
 from apc.network.channel import LATEST, PARETO_SHAPE, ChannelLaw
 
 Floats = NDArray[np.float64]
@@ -83,22 +84,12 @@ class Memory:
         """Return the covariance (2 + m, n, n) of whether a slot's packet takes the place of uncertain values.
 
         With its radius, and over a cell: min(π, ϖ) − π ϖ of two chances, which one is the smaller being the
-        same all over the cell; the variance π (1 − π) has the slope 1 − 2 π.
+        same all over the cell.
         """
-        place = self.uncertain(slot)
-        chance, moves = self.chances[place, slot], self.moves[:, place, slot]
-        # Of a chance near 1 the variance is small, and what the chance rounds is not.
-        doubt = self.doubts[place, slot] + CHANCE_ROUNDINGS * UNIT
-        wander = np.abs(moves).sum(axis=0)
-        result = np.minimum.outer(chance, chance) - np.outer(chance, chance)
-        least = np.where(chance[:, None] <= chance, moves[:, :, None], moves[:, None, :])
-        slopes = least - chance[:, None] * moves[:, None, :] - moves[:, :, None] * chance
-        both = np.outer(chance + wander, doubt) + np.outer(doubt, chance + wander) + np.outer(doubt, doubt)
-        off = np.maximum.outer(doubt, doubt) + both
-        np.fill_diagonal(off, (np.abs(1 - 2 * chance) + 2 * wander) * doubt + doubt**2)
-        off += np.outer(wander, wander)
-        off = off * (1 + 8 * UNIT) + (4 + len(moves)) * UNIT * (chance + 4 * wander)
-        return np.concatenate([np.stack([result, off]), slopes])
+        chance = self.chance(slot)
+        rows, columns = chance[..., :, None], chance[..., None, :]
+        least = np.where(value_of(rows) <= value_of(columns), rows, columns)
+        return np.asarray(arithmetic_of(least).subtract(least, entrywise(rows, columns)))
 
 
 def is_memoryless(law: ChannelLaw) -> bool:
