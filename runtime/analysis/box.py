@@ -229,7 +229,8 @@ def open_sites(
     at = apply(system, point)
     groups, exchange = lifted(at)
     sites = {
-        group.name: _open_site(group, opened[exchange.group_of(group.peers[0])], system) for group in groups
+        group.name: _open_site(group, opened[exchange.group_of(group.peers.first)], system)
+        for group in groups
     }
     return OpenSites(at, groups, exchange, sites)
 

@@ -29,13 +29,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
-import numpy as np
-
 from apc.compiler.weights import exact_weight
 from apc.eigen.closing import ClosedSystem, Coupling, Loop, close_loop
 from apc.eigen.graph_loops import common_graph, graph_loop, graph_scale
 from apc.eigen.graph_modes import graph_modes
-from apc.eigen.peers import MOST_STATES, PeerGroup, group_name, states_of, too_large, used_ways
+from apc.eigen.peers import MOST_STATES, PeerGroup, Peers, group_name, states_of, too_large, used_ways
 from apc.frame.exchange import Exchange, check_mean
 from apc.frame.schedule import Way
 
@@ -186,9 +184,9 @@ def refuse_dense(groups: Sequence[PeerGroup], exchange: Exchange) -> None:
 def dense_loop(groups: Sequence[PeerGroup], exchange: Exchange) -> Loop:
     """Return every peer of the whole system as one loop."""
     everyone = tuple(
-        replace(group, name=exchange.peer_name(peer), count=1, peers=np.array([peer]))
+        replace(group, name=exchange.peer_name(peer), count=1, peers=Peers((range(peer, peer + 1),)))
         for peer, group in sorted(
-            ((int(peer), group) for group in groups for peer in group.peers), key=lambda pair: pair[0]
+            ((peer, group) for group in groups for peer in group.peers), key=lambda pair: pair[0]
         )
     )
     weights = {
@@ -273,12 +271,8 @@ def _weight_of(loop: Loop, way: Way, members: Sequence[int], others: Sequence[in
 
 def _together(sites: Sequence[PeerGroup], exchange: Exchange) -> PeerGroup:
     """Return equal sites as one group."""
-    peers = np.sort(np.concatenate([np.array(list(site.peers)) for site in sites]))
-    groups = np.searchsorted(exchange.starts, peers, side="right") - 1
-    parts = [
-        (group, peers[groups == group] - exchange.starts[group]) for group in sorted(set(groups.tolist()))
-    ]
-    return replace(sites[0], name=group_name(parts, exchange), count=len(peers), peers=peers)
+    peers = Peers(tuple(run for site in sites for run in site.peers.runs))
+    return replace(sites[0], name=group_name(peers, exchange), count=len(peers), peers=peers)
 
 
 def couple(
@@ -308,7 +302,7 @@ def couple(
             if hears and way.operator == "mean":
                 total = degrees.get((way.link, g))
                 check_mean(
-                    exchange, int(group.peers[0]), way.link, "mean", total is not None, total or Fraction(0)
+                    exchange, group.peers.first, way.link, "mean", total is not None, total or Fraction(0)
                 )
             row = []
             for h, sender in enumerate(groups):

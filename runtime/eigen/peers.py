@@ -2,7 +2,7 @@
 
 Takes: an `Instance` of a scene.
 Gives: `PeerGroup`, `peer_groups`, `representatives`, `more_differ`; `used_ways`, `states_of`; `too_large`;
-`Peers`, `Runs`.
+`Peers`.
 Guarantees: as few groups as there are peers of different dynamics, found in a time that grows with the number
 of peers, not with its square; peers that follow one another take no memory, however many they are. A site
 that is not affine is linearized at its own start values, hearing the others at theirs. A group's matrices are
@@ -12,6 +12,7 @@ Does not: close the loop between them (see `modes` and `closing`).
 
 from __future__ import annotations
 
+import bisect
 import functools
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -47,42 +48,21 @@ Integers = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
-class Runs:
-    """Peers by number, in runs that follow one another: a billion equal peers take no memory."""
+class Peers:
+    """Peers of a scene by number, in rising runs, each of a group: a billion equal peers take no memory."""
 
-    ranges: tuple[range, ...]
+    runs: tuple[range, ...]
 
     def __len__(self) -> int:
-        return sum(len(run) for run in self.ranges)
+        return sum(map(len, self.runs))
 
     def __iter__(self) -> Iterator[int]:
-        return itertools.chain.from_iterable(self.ranges)
+        return itertools.chain.from_iterable(self.runs)
 
-    def __getitem__(self, place: int | slice) -> Any:
-        if isinstance(place, slice):
-            return list(itertools.islice(self, place.start, place.stop, place.step))
-        return next(itertools.islice(self, place, None))
-
-    def shifted(self, by: int) -> Runs:
-        """Return the peers counted from another start."""
-        return Runs(tuple(range(run.start + by, run.stop + by) for run in self.ranges))
-
-
-# Some peers of a group, or of the scene, by number.
-Peers = Integers | Runs
-
-
-def shifted(peers: Peers, by: int) -> Peers:
-    """Return peers counted from another start."""
-    return peers.shifted(by) if isinstance(peers, Runs) else peers + by
-
-
-def joined(listed: Sequence[Peers]) -> Peers:
-    """Return peers together, in order."""
-    runs = [runs for runs in listed if isinstance(runs, Runs)]
-    if len(runs) == len(listed):
-        return Runs(tuple(sorted((run for item in runs for run in item.ranges), key=lambda run: run.start)))
-    return np.sort(np.concatenate([np.fromiter(item, np.int64, len(item)) for item in listed]))
+    @property
+    def first(self) -> int:
+        """The first of them."""
+        return self.runs[0].start
 
 
 # More states than this in one system are refused: at the cost of n³, its eigenvalues would take minutes, and
@@ -176,33 +156,32 @@ class PeerGroup:
 
 def build_group(
     place: int,
-    parts: Sequence[tuple[int, Peers]],
+    peers: Peers,
     vector: Floats,
     built: SiteJacobians,
-    site: LinearSite,
     schedule: Schedule,
     exchange: Exchange,
     *,
     listening: Listening | None = None,
     gains: Gains | None = None,
 ) -> PeerGroup:
-    """Put a site together with what is known of its peers, `parts` of the scene's groups.
+    """Put a site together with what is known of its peers.
 
     Parameters
     ----------
     place
         What the `gains` call the group.
-    parts
-        Its peers: groups of the scene and which of their peers, counted in the group.
-    vector, built, site, schedule
-        The parameters (n_p,) of the first of them, its kind's Jacobians, its matrices, its schedule.
+    peers
+        Its peers.
+    vector, built, schedule
+        The parameters (n_p,) of the first of them, its kind's Jacobians, its schedule.
     exchange
         The links.
     listening, gains
         What it hears at the start and weighs each sender by, where that matters.
     """
     check_packets(schedule)
-    peers = joined([shifted(peers, int(exchange.starts[group])) for group, peers in parts])
+    site = linearize(built, vector, listening)
 
     @functools.cache
     def exacting() -> LinearSite:
@@ -213,7 +192,7 @@ def build_group(
         return lift(site, schedule, exact=exacting() if built.walkable else None)
 
     return PeerGroup(
-        name=group_name(parts, exchange),
+        name=group_name(peers, exchange),
         count=len(peers),
         parameters=vector,
         jacobians=built,
@@ -222,22 +201,23 @@ def build_group(
         schedule=schedule,
         lifting=functools.cache(lifting),
         peers=peers,
-        role=exchange.role(parts[0][0]),
+        role=exchange.role(exchange.group_of(peers.first)),
         place=place,
         listening=listening,
         gains=gains or {},
     )
 
 
-def group_name(parts: Sequence[tuple[int, Peers]], exchange: Exchange) -> str:
+def group_name(peers: Peers, exchange: Exchange) -> str:
     """Return `left+right[1,3]`, for peers of the scene's groups; all of a group are its name alone."""
-    counts = np.diff(exchange.starts)
-    names = []
-    for group, peers in parts:
-        name = exchange.groups[group]
-        if len(peers) < counts[group]:
-            more = ["…"] if len(peers) > MOST_NAMED else []
-            name += f"[{','.join([*(str(int(peer) + 1) for peer in peers[:MOST_NAMED]), *more])}]"
+    names, starts = [], exchange.starts.tolist()
+    for end, listed in itertools.groupby(peers.runs, key=lambda run: bisect.bisect(starts, run.start)):
+        inside, start = Peers(tuple(listed)), starts[end - 1]
+        name = exchange.groups[end - 1]
+        if len(inside) < starts[end] - start:
+            more = ["…"] if len(inside) > MOST_NAMED else []
+            numbers = (str(peer - start + 1) for peer in itertools.islice(inside, MOST_NAMED))
+            name += f"[{','.join([*numbers, *more])}]"
         names.append(name)
     if len(names) > MOST_NAMED:
         names = [*names[:MOST_NAMED], "…"]
@@ -277,16 +257,12 @@ def too_large(exchange: Exchange, what: str, states: int, *, auto: bool = False)
 class StartClasses:
     """Classes of peers that start alike at the start of time, each hearing the others where they start."""
 
-    def __init__(self, instance: Instance, parts: Sequence[Sequence[tuple[int, Peers]]]) -> None:
-        numbers, exchange = instance.numbers, instance.exchange
-        self.exchange = exchange
-        self.counts = [sum(len(peers) for _, peers in part) for part in parts]
-        self.groups = [part[0][0] for part in parts]
-        self.peers = [int(exchange.starts[part[0][0]] + part[0][1][0]) for part in parts]
-        self.vectors = [
-            numbers.parameters[group][numbers.rows[group][int(part[0][1][0])]]
-            for group, part in zip(self.groups, parts, strict=True)
-        ]
+    def __init__(self, instance: Instance, classes: Sequence[Peers]) -> None:
+        self.exchange = exchange = instance.exchange
+        self.counts = list(map(len, classes))
+        self.peers = [peers.first for peers in classes]
+        self.groups = list(map(exchange.group_of, self.peers))
+        self.vectors = [_numbers_of(peer, instance) for peer in self.peers]
         self.sites = [instance.sites[group] for group in self.groups]
         self.schedules = [instance.schedules[group] for group in self.groups]
         exact: dict[tuple[int, bytes], tuple[list[Fraction], dict[str, list[Fraction]]]] = {}
@@ -416,12 +392,6 @@ class StartClasses:
 # edge functions and the start values of what is heard cost their square.
 MOST_DIFFERENT = 400
 
-# Peers looked at together for whether they differ: mostly, the first ones tell.
-PEEK = 1024
-
-# What equal peers have in common: their kind, their role in the exchange, their numbers as bytes.
-_Key = tuple[int, int, bytes]
-
 
 def peer_groups(instance: Instance) -> tuple[PeerGroup, ...]:
     """Find the groups of equal peers of a system, linearize each once.
@@ -434,9 +404,7 @@ def peer_groups(instance: Instance) -> tuple[PeerGroup, ...]:
         value that is not finite.
     """
     try:
-        if all(site.parameters_suffice for site in instance.sites):
-            return _by_matrices(instance)
-        return _by_start(instance)
+        return _peer_groups(instance)
     except ApcError as error:
         origin = instance.system.origin
         raise ApcError(
@@ -444,88 +412,90 @@ def peer_groups(instance: Instance) -> tuple[PeerGroup, ...]:
         ) from None
 
 
-def _by_matrices(instance: Instance) -> tuple[PeerGroup, ...]:
-    """Group peers of equal matrices, whatever their start values and constant forces."""
-    numbers, exchange = instance.numbers, instance.exchange
-    rows: dict[_Key, tuple[int, Floats]] = {}
-    members: dict[_Key, list[tuple[int, Peers]]] = {}
-    for place, (parameters, row_of) in enumerate(zip(numbers.parameters, numbers.rows, strict=True)):
-        keys = _keys(instance, place, parameters)
-        for key, vector in zip(keys, parameters, strict=True):
-            rows.setdefault(key, (place, vector))
-        for key, peers in _split(keys, row_of):
-            members.setdefault(key, []).append((place, peers))
-    check_size([instance.jacobians[key[0]] for key in members], exchange)
-    peer_groups = []
-    for number, (key, parts) in enumerate(members.items()):
-        place, vector = rows[key]
-        built = instance.sites[place]
-        site = linearize(built, vector)
-        peer_groups.append(
-            build_group(number, parts, vector, built, site, instance.schedules[place], exchange)
-        )
-    return tuple(peer_groups)
-
-
-def _keys(instance: Instance, place: int, parameters: Floats) -> list[_Key]:
-    """Return what peers of a group that are equal have in common, for each row of parameters."""
-    role, kind = instance.exchange.role(place), instance.system.groups[place].kind
-    rows = linearize_rows(instance.jacobians[kind], parameters)
-    return [(kind, role, matrices.tobytes()) for matrices in rows]
-
-
-def _by_start(instance: Instance) -> tuple[PeerGroup, ...]:
-    """Group peers that start alike among others that start alike, and linearize them there."""
-    system, numbers, exchange = instance.system, instance.numbers, instance.exchange
-    links = {way.link for way in used_ways(instance.schedules)}
-    complete = all(exchange.is_complete(link) for link in links)
-    members: dict[tuple[Any, ...], list[tuple[int, Peers]]] = {}
-    for place, group in enumerate(system.groups):
-        role, vectors = exchange.role(place), numbers.parameters[place]
-        keys = [(group.kind, role, (vector + 0.0).tobytes()) for vector in vectors]
-        for key, peers in _split(keys, numbers.rows[place]):
-            if complete:
-                members.setdefault(key, []).append((place, peers))
-            else:  # who hears whom may differ from peer to peer
-                members |= {
-                    (*key, place, int(peer)): [(place, np.array([peer]))]
-                    for peer in peers[: MOST_DIFFERENT + 1]
-                }
-    if len(members) > MOST_DIFFERENT:
-        what = f"more than {MOST_DIFFERENT} peers that differ, in their place in a graph or at the start,"
-        raise ApcError(Mistake("E804", Place(exchange.scene), f"{what} can't be linearized pair by pair"))
-    parts = sorted(members.values(), key=lambda part: (part[0][0], int(part[0][1][0])))
-    sites = StartClasses(instance, parts)
-    listened = [sites.listen(g) for g in range(len(parts))]
-
-    # Peers apart in the graph are one group if they turned out alike, and weigh all others alike.
-    merged: dict[tuple[Any, ...], int] = {}
-    alike = all(len(gain) == 1 for _, gains in listened for gain in gains.values())
-    joined: dict[int, list[tuple[int, Peers]]] = {}
-    for g, (listening, gains) in enumerate(listened):
-        own = parts[g][0][0]
-        same = (
-            *(system.groups[own].kind, exchange.role(own), sites.vectors[g].tobytes()),
-            *(listening, tuple(gains.items()), g if not alike else 0),
-        )
-        joined.setdefault(merged.setdefault(same, g), []).extend(parts[g])
-    first = list(joined)
-    built = [sites.sites[g] for g in first]
+def _peer_groups(instance: Instance) -> tuple[PeerGroup, ...]:
+    """Group peers of equal matrices; where the start matters, those that start alike among such others."""
+    exchange = instance.exchange
+    by_matrices = all(site.parameters_suffice for site in instance.sites)
+    classes = _classes(instance, by_matrices=by_matrices)
+    heard: list[tuple[Listening | None, Gains]] = [(None, {})] * len(classes)
+    places = list(range(len(classes)))
+    if not by_matrices:
+        links = {way.link for way in used_ways(instance.schedules)}
+        if not all(map(exchange.is_complete, links)):  # who hears whom may differ from peer to peer
+            each = itertools.islice(itertools.chain.from_iterable(classes), MOST_DIFFERENT + 1)
+            classes = [Peers((range(peer, peer + 1),)) for peer in each]
+        if len(classes) > MOST_DIFFERENT:
+            what = f"more than {MOST_DIFFERENT} peers that differ, in their place in a graph or at the start,"
+            raise ApcError(Mistake("E804", Place(exchange.scene), f"{what} can't be linearized pair by pair"))
+        classes.sort(key=lambda peers: peers.first)
+        starting = StartClasses(instance, classes)
+        listened = [starting.listen(g) for g in range(len(classes))]
+        places, classes = _merged(starting, listened, classes)
+        heard = [*listened]
+    groups = [exchange.group_of(peers.first) for peers in classes]
+    built = [instance.sites[group] for group in groups]
     check_size(built, exchange)
     return tuple(
         build_group(
-            g,
-            _together(joined[g]),
-            sites.vectors[g],
-            site,
-            linearize(site, sites.vectors[g], listened[g][0]),
-            sites.schedules[g],
-            exchange,
-            listening=listened[g][0],
-            gains=listened[g][1],
+            *(place, peers, _numbers_of(peers.first, instance), site, instance.schedules[group], exchange),
+            listening=heard[place][0],
+            gains=heard[place][1],
         )
-        for g, site in zip(first, built, strict=True)
+        for place, peers, site, group in zip(places, classes, built, groups, strict=True)
     )
+
+
+def _merged(
+    starting: StartClasses, heard: Sequence[tuple[Listening, Gains]], classes: Sequence[Peers]
+) -> tuple[list[int], list[Peers]]:
+    """Join peers apart in the graph that turned out alike, and weigh all others alike; of each the first."""
+    alike = all(len(gain) == 1 for _, gains in heard for gain in gains.values())
+    members: dict[tuple[Any, ...], list[int]] = {}
+    for g, (listening, gains) in enumerate(heard):
+        same = (
+            *(
+                id(starting.sites[g]),
+                starting.exchange.role(starting.groups[g]),
+                starting.vectors[g].tobytes(),
+            ),
+            *(listening, tuple(gains.items()), g if not alike else 0),
+        )
+        members.setdefault(same, []).append(g)
+    return [listed[0] for listed in members.values()], [
+        _joined(run for g in listed for run in classes[g].runs) for listed in members.values()
+    ]
+
+
+def _joined(runs: Iterable[range]) -> Peers:
+    """Return the peers of some runs, in order."""
+    return Peers(tuple(sorted(runs, key=lambda run: run.start)))
+
+
+def _numbers_of(peer: int, instance: Instance) -> Floats:
+    """Return the parameters (n_p,) of a peer."""
+    group = instance.exchange.group_of(peer)
+    row = instance.numbers.rows[group][peer - instance.exchange.starts[group]]
+    return np.asarray(instance.numbers.parameters[group][row])
+
+
+def _classes(instance: Instance, *, by_matrices: bool) -> list[Peers]:
+    """Return the peers of equal matrices, or of equal numbers, that have the same kind and role."""
+    numbers, exchange = instance.numbers, instance.exchange
+    classes: dict[tuple[int, int, bytes], list[range]] = {}
+    for place, group in enumerate(instance.system.groups):
+        vectors, start = numbers.parameters[place], int(exchange.starts[place])
+        rows = linearize_rows(instance.sites[place], vectors) if by_matrices else vectors + 0.0
+        keys = [(group.kind, exchange.role(place), row.tobytes()) for row in rows]
+        number = {key: count for count, key in enumerate(dict.fromkeys(keys))}
+        if len(number) == 1:
+            classes.setdefault(keys[0], []).append(range(start, start + group.count))
+            continue
+        of_peer = np.array([number[key] for key in keys])[numbers.rows[place]]
+        ends = np.append(np.flatnonzero(np.diff(of_peer)) + 1, len(of_peer))
+        listed = list(number)
+        for first, end in zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True):
+            classes.setdefault(listed[of_peer[first]], []).append(range(start + first, start + end))
+    return [Peers(tuple(runs)) for runs in classes.values()]
 
 
 def more_differ(instance: Instance, states: int) -> bool:
@@ -535,41 +505,15 @@ def more_differ(instance: Instance, states: int) -> bool:
     if sum(count * size for count, size in zip(different, sizes, strict=True)) <= states:
         return False
     # Peers that are all alike are a few systems of one peer's size, however large that is.
-    most, keys = max(1, states // max(sizes)), set[_Key]()
-    for place, parameters in enumerate(instance.numbers.parameters):
-        for start in range(0, len(parameters), PEEK):
-            keys.update(_keys(instance, place, parameters[start : start + PEEK]))
-            if len(keys) > most:  # mostly the first ones tell
-                return True
-    return False
+    return len(_classes(instance, by_matrices=True)) > max(1, states // max(sizes))
 
 
 def representatives(instance: Instance) -> list[PeerGroup]:
     """Return the first peer of each group of the scene, as many as there are peers in it."""
     result = []
     for place, (built, schedule) in enumerate(zip(instance.sites, instance.schedules, strict=True)):
+        start, end = instance.exchange.starts[place : place + 2].tolist()
         vector = instance.numbers.parameters[place][0]
-        parts = [(place, Runs((range(instance.system.groups[place].count),)))]
-        site = linearize(built, vector)
-        result.append(build_group(place, parts, vector, built, site, schedule, instance.exchange))
+        peers = Peers((range(start, end),))
+        result.append(build_group(place, peers, vector, built, schedule, instance.exchange))
     return result
-
-
-def _split(keys: Sequence[_Key], row_of: Integers) -> list[tuple[_Key, Peers]]:
-    """Return, for each different key, the peers (counted in their group) whose row has it."""
-    different = list(dict.fromkeys(keys))
-    if len(different) == 1:
-        return [(different[0], Runs((range(len(row_of)),)))]
-    number = {key: place for place, key in enumerate(different)}
-    of_peer = np.array([number[key] for key in keys])[row_of]
-    order = np.argsort(of_peer, kind="stable")
-    ends = np.cumsum(np.bincount(of_peer, minlength=len(different)))[:-1]
-    return list(zip(different, np.split(order, ends), strict=True))
-
-
-def _together(parts: Sequence[tuple[int, Peers]]) -> list[tuple[int, Peers]]:
-    """Join the parts of each group of the scene."""
-    result: dict[int, list[Peers]] = {}
-    for group, peers in parts:
-        result.setdefault(group, []).append(peers)
-    return [(group, joined(listed)) for group, listed in result.items()]

@@ -77,8 +77,8 @@ def state_space_of(system: CompiledSystem, *, cut: str = "", free: Sequence[str]
     values = dict(zip(frees, symbols, strict=True))
 
     def vector(group: PeerGroup) -> Any:
-        place = exchange.group_of(group.peers[0])
-        peer = int(group.peers[0] - exchange.starts[place])
+        place = exchange.group_of(group.peers.first)
+        peer = group.peers.first - int(exchange.starts[place])
         listed = free_values(system, system.groups[place], peer, values, symbolic)
         return casadi.vertcat(*map(casadi.SX, listed))
 

@@ -411,7 +411,7 @@ def peer_classes(hearing: Hearing) -> tuple[Loop, Coupling]:
         return complete_loops(groups, exchange)[0], couple(groups, exchange, one, degrees)
     whole = dense_loop(groups, exchange)
     common = split_exchangeable(whole, exchange)[0]
-    place = {int(group.peers[0]): number for number, group in enumerate(whole.sites)}
+    place = {group.peers.first: number for number, group in enumerate(whole.sites)}
     first = [place[int(site.peers[0])] for site in common.sites]
     last = [place[int(site.peers[-1])] for site in common.sites]
     weights = {

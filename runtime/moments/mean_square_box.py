@@ -131,7 +131,9 @@ def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question:
     memories = remembered_of(opened.at, hearing, wide)
     classes = classes_of(hearing)
     places = {
-        site.name: next(place for place, group in enumerate(hearing.groups) if site.peers[0] in group.peers)
+        site.name: next(
+            place for place, group in enumerate(hearing.groups) if site.peers.first in group.peers
+        )
         for site in classes.common.sites
     }
     return _Question(system, prepared, tuple(ranges), own, classes, frames, places, wide, memories)

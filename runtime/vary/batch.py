@@ -188,8 +188,8 @@ class BatchEvaluator:
 
     def first_peer(self, group: PeerGroup) -> tuple[int, int]:
         """Return which group of the scene the first of a group of like peers is of, and its number there."""
-        first = int(group.peers[0])
-        place = int(np.searchsorted(self.exchange.starts, first, side="right")) - 1
+        first = group.peers.first
+        place = self.exchange.group_of(first)
         return place, first - int(self.exchange.starts[place])
 
     def closed_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
