@@ -11,8 +11,8 @@ Gershgorin's discs of D⁻¹(T + G)D, whatever the positive diagonal D. Discs th
 eigenvalues as there are of them.
 
 A queue that runs empty is nearly a Jordan block at zero, whose vectors are hardly several. Where it leaves
-the spectral radius uncertain, X takes an orthonormal basis of what small eigenvalues span in the place of
-their vectors; T is Schur's triangular form there, and D makes what is above its diagonal small.
+the spectral radius uncertain, X takes an orthonormal basis of what small eigenvalues span, or all, in the
+place of their vectors; T is Schur's triangular form there, and D makes what is above its diagonal small.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ def _enclose_split(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure
     pairs = pairs.at(descending(pairs.values)[0])
     sizes = np.abs(pairs.values[0])
     low, high, errors = 0.0, np.inf, np.full(len(sizes), np.inf)
-    for limit in (0.0, CLUSTER):
+    for limit in (0.0, CLUSTER, np.inf):
         if high - low <= SHARP * max(low, 1.0):
             break
         form, basis, small = load_pool("scipy.linalg").schur(
