@@ -285,7 +285,7 @@ def moments_of(
             luck = channel.luck if channel else range(0)
             forms = _forms(kinds, apart, mean.misses, kind, channel)
             blocks.append(_block(mean.matrix, own, luck, forms, widths, kind.lucks if kind else ()))
-            moving.append(Moving(apart, mean.at, mean.offsets, kind and kind.heard))
+            moving.append(Moving(apart, mean.at, mean.offsets, kind.heard if kind else None))
             states = max(states, len(own))
     width, like = max(widths, default=0), blocks[0].matrix
     listed = np.zeros((len(widths), len(like), width, width))

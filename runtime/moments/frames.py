@@ -138,7 +138,7 @@ def held_frame(system: CompiledSystem, hearing: Hearing, *, alike: bool = False)
         if missed[:, luck].any():
             raise UnservedError("a packet follows from another one of its frame")
         missed = missed + value_of(channel.misses[0])
-        enters[c, :, : len(channel.luck)] = -matrix[np.ix_(rest, channel.luck)]
+        enters[c, :, : len(channel.luck)] = -matrix[rest][:, list(channel.luck)]
         misses[c, : len(channel.luck)] = missed[:, rest]
     ends = np.cumsum([first, *(len(channel.kept) for channel in means.channels)]).tolist()
     held = tuple(map(range, ends, ends[1:]))

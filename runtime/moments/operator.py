@@ -373,7 +373,7 @@ def _each(matrix: Matrix, numbers: Arithmetic) -> Matrix:
 
 def _one(matrices: Matrix, place: int, numbers: Arithmetic) -> Matrix:
     """Return one of several matrices."""
-    return np.take(matrices, place, axis=-3 if numbers is FLOATS else -4)
+    return np.asarray(np.take(matrices, place, axis=-3 if numbers is FLOATS else -4))
 
 
 def _weighted(weights: Floats, blocks: Matrix, numbers: Arithmetic) -> Matrix:
