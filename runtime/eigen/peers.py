@@ -64,6 +64,16 @@ class Peers:
         """The first of them."""
         return self.runs[0].start
 
+    @property
+    def last(self) -> int:
+        """The last of them."""
+        return self.runs[-1][-1]
+
+    @property
+    def others(self) -> Peers:
+        """All but the first of them."""
+        return Peers(tuple(run for run in (self.runs[0][1:], *self.runs[1:]) if run))
+
 
 # More states than this in one system are refused: at the cost of n³, its eigenvalues would take minutes, and
 # their error bounds would decide nothing.

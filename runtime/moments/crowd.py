@@ -23,7 +23,7 @@ from apc.analysis.analysis import lifted_groups
 from apc.compiler.compiled import Clock, CompiledSystem, Kind
 from apc.eigen.closing import Coupling, Loop, without_packets
 from apc.eigen.modes import complete_degrees, complete_loops, couple, dense_loop, split_exchangeable
-from apc.eigen.peers import PeerGroup, used_ways
+from apc.eigen.peers import PeerGroup, Peers, used_ways
 from apc.eigen.relative import Relative
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.exchange import Exchange
@@ -181,12 +181,14 @@ def classes_of(hearing: Hearing) -> Classes:
     common, weights = peer_classes(hearing)
     loops = []
     for which, own in enumerate(common.sites):
-        sites = [(which, replace(own, count=1, peers=own.peers[:1]), 1)]
+        alone = Peers((range(own.peers.first, own.peers.first + 1),))
+        sites = [(which, replace(own, count=1, peers=alone), 1)]
         for g, site in enumerate(common.sites):
             first = int(g == which)
             if count := site.count - first:
                 many = count if first else own.count
-                sites.append((g, replace(site, count=count, peers=site.peers[first:]), many))
+                others = site.peers.others if first else site.peers
+                sites.append((g, replace(site, count=count, peers=others), many))
         coupling = {
             way: tuple(
                 tuple(rows[g][h] * (to.count - (place == of)) for of, (h, to, _) in enumerate(sites))
@@ -412,8 +414,8 @@ def peer_classes(hearing: Hearing) -> tuple[Loop, Coupling]:
     whole = dense_loop(groups, exchange)
     common = split_exchangeable(whole, exchange)[0]
     place = {group.peers.first: number for number, group in enumerate(whole.sites)}
-    first = [place[int(site.peers[0])] for site in common.sites]
-    last = [place[int(site.peers[-1])] for site in common.sites]
+    first = [place[site.peers.first] for site in common.sites]
+    last = [place[site.peers.last] for site in common.sites]
     weights = {
         way: tuple(tuple(rows[g][last[k] if g == h else h] for k, h in enumerate(first)) for g in first)
         for way, rows in whole.coupling.items()

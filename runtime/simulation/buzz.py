@@ -11,6 +11,7 @@ The loads that the prediction needs are the mean pushes of the motion that was p
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -181,8 +182,8 @@ def _contacts(
     each = max(1, MOST_PEERS // len(groups))
     result = []
     for group, pushes in groups:
-        for peer in list(group.peers[:each]):
-            name = exchange.peer_name(int(peer))
+        for peer in itertools.islice(group.peers, each):
+            name = exchange.peer_name(peer)
             for push in pushes:
                 states = group.jacobians.kind.states
                 places = [k for k, state in enumerate(states) if state.unit == LENGTH and push.slopes[k]]
