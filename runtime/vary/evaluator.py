@@ -24,12 +24,12 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.modes import split
 from apc.eigen.peers import PeerGroup, states_of
-from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange
 from apc.frame.instance import Prepared
 from apc.frame.names import Free, is_named, parameter_of
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import free_rows, scope_of
+from apc.frame.radius import UNIT
 from apc.vary.batch import BatchEvaluator, batch_evaluator
 from apc.vary.wiring import reduced, wire
 
