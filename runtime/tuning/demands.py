@@ -122,6 +122,17 @@ class Demands:
         """All that has to be known of what hands feel: the demands, then the terms of the aim."""
         return (*self.felt, *(felt for _, felt in self.aim.terms if isinstance(felt, Felt)))
 
+    def at_frequency(self, frequency_hz: float) -> Demands:
+        """Return the same with what is largest over all frequencies at one of them."""
+
+        def there(felt: Felt) -> Felt:
+            return replace(felt, frequency_hz=frequency_hz) if felt.name == HINF else felt
+
+        terms = tuple(
+            (weight, there(felt) if isinstance(felt, Felt) else felt) for weight, felt in self.aim.terms
+        )
+        return replace(self, felt=tuple(map(there, self.felt)), aim=replace(self.aim, terms=terms))
+
     @property
     def over(self) -> tuple[Range, ...]:
         """All that has to be borne."""

@@ -103,7 +103,7 @@ def front(
     def felt(gains: Floats) -> float:
         """Return the largest that is felt in any scenario at gains (m,)."""
         points = ((scenario.setting, np.append(gains, scenario.point)[None]) for scenario in every)
-        return max(float(limits.measured(*point)[0, 0, 0]) for point in points)
+        return max(float(limits.measured(*point, limits.demands)[0, 0, 0]) for point in points)
 
     best = tune(system, demands, seconds=seconds, progress=progress)
     least = Aim(against.label, len(demands.free), False, FELT[against.name][0], ((1.0, against),))

@@ -34,7 +34,7 @@ from apc.frame.instance import Prepared
 from apc.frame.overrides import Override, apply
 from apc.hands.frequency_response import COUPLED, feel
 from apc.threads import load_pool
-from apc.tuning.demands import HINF, PLACE, SUBJECT, Demands, Felt
+from apc.tuning.demands import HINF, PLACE, SUBJECT, Aim, Demands, Felt
 from apc.vary.batch import BatchEvaluator, MatrixSource
 from apc.vary.delay_box import standing_delays
 from apc.vary.evaluator import evaluator_of_many
@@ -58,6 +58,10 @@ RESPONSES = {
 PART_OF = {"damping": "low_frequency", "error_h2": "h2", HINF: "hinf"}
 TINY = 1e-300
 
+# The lowest frequency in Hz at which the largest gain is looked for, the first; how much larger than at those
+# known it has to be, as a share, for its own to be one of them.
+SLOWEST, LARGER = 1e-3, 1e-6
+
 # Points of a grid along each range of a box; how near to the top of what limits gains there it is followed.
 GRID, POWELL = 5, {"xtol": 1e-5, "ftol": 1e-12}
 
@@ -78,12 +82,14 @@ class Rows:
     """Limits at one point of the columns: `values` (n,), below 0 where met, and `slopes` (n, m).
 
     A slope is that over the whole range of a column, or of a number of the box.
-    `eigenvalue` (n,) is that of each, NaN of what has none; `scenario` (n,) the place of its scenario.
+    `eigenvalue` (n,) is that of each, NaN of what has none; `frequency_hz` (n,) is where a gain is largest,
+    NaN of all else; `scenario` (n,) is the place of its scenario.
     """
 
     values: Floats
     slopes: Floats
     eigenvalue: Complexes
+    frequency_hz: Floats
     scenario: NDArray[np.intp]
 
 
@@ -97,7 +103,8 @@ class Limits:
     until: float = math.inf
     known: dict[int, MatrixSource] = field(default_factory=dict)
     samples: dict[Scenario, Floats] = field(default_factory=dict)
-    felt: dict[tuple[int, tuple[float, ...]], Floats] = field(default_factory=dict)
+    felt: dict[tuple[int, tuple[float, ...], int], Floats] = field(default_factory=dict)
+    frequencies: list[float] = field(default_factory=lambda: [SLOWEST])
 
     @cached_property
     def settings(self) -> list[tuple[tuple[Override, ...], CompiledSystem]]:
@@ -204,7 +211,34 @@ class Limits:
         point = low + np.clip(top.x, 0, 1) * (high - low)
         return Scenario(setting, tuple(point.tolist())), -float(top.fun) - self.allowed
 
-    def asked(self, setting: int, points: Floats, *, bounded: bool = False) -> Floats:
+    @property
+    def views(self) -> list[Demands]:
+        """The demands with what is largest over all frequencies at each of those known: smooth limits all."""
+        if all(felt.name != HINF for felt in self.demands.measured):
+            return [self.demands]
+        return [self.demands.at_frequency(frequency) for frequency in self.frequencies]
+
+    def heard(self, scenarios: Sequence[Scenario], chosen: Floats) -> bool:
+        """Add frequencies at which gains are larger, with columns (m,), than at those known; say if any are.
+
+        Notes
+        -----
+        The exchange method for a limit at every frequency (Hettich and Kortanek, SIAM Rev. 35 (1993) 380).
+        """
+        before = len(self.frequencies)
+        for scenario in scenarios:
+            point = np.append(chosen, scenario.point)[None]
+            values = np.max([self.asked(scenario.setting, point, view=view) for view in self.views], axis=0)
+            peaks = self.measured(scenario.setting, self._numbers(point), self.demands)[0, :, 2]
+            if (self.asked(scenario.setting, point) > values + LARGER).any():
+                named = zip(self.demands.measured, np.maximum(peaks, SLOWEST).tolist(), strict=True)
+                new = [peak for felt, peak in named if felt.name == HINF]
+                self.frequencies.extend(peak for peak in new if peak not in self.frequencies)
+        return len(self.frequencies) > before
+
+    def asked(
+        self, setting: int, points: Floats, *, bounded: bool = False, view: Demands | None = None
+    ) -> Floats:
         """Return how far points (k, m + b) are from the demands on what is felt, and the level (k, q).
 
         Parameters
@@ -215,66 +249,59 @@ class Limits:
             The columns and the box (k, m + b).
         bounded
             Whether they are so far at least, with what rounding leaves open of what is felt.
+        view
+            One of `views`, which takes the largest gain at one frequency; without it, at all.
         """
-        aim, count = self.demands.aim, len(self.demands.felt)
-        felt = self.measured(setting, self._numbers(points))
+        demands = view or self.demands
+        aim = demands.aim
+        felt = self.measured(setting, self._numbers(points), demands)
         off = felt[..., 1] if bounded else np.zeros(felt.shape[:2])
+        count = len(demands.felt)
         values = np.log(np.maximum(felt[:, :count, 0] + off[:, :count], TINY))
-        values -= np.log([felt.most for felt in self.demands.felt])
+        values -= np.log([felt.most for felt in demands.felt])
         if aim.level:
             weights = [abs(weight) for weight, item in aim.terms if isinstance(item, Felt)]
-            sums = self._sums(felt[:, count:, 0], points)
-            short = (-1 if aim.larger else 1) * (sums - points[:, len(self.demands.free)])
+            sums = _sums(aim, felt[:, count:, 0], points)
+            short = (-1 if aim.larger else 1) * (sums - points[:, len(demands.free)])
+            beyond = short + off[:, count:] @ weights
             # Far beyond by its logarithm: gains beside a resonance are large, and slopes still lead away.
-            far = (short + off[:, count:] @ weights) / aim.scale
+            far = beyond / aim.scale
             far = np.where(far > 1, 1 + np.log(np.maximum(far, 1)), far)
             values = np.column_stack([values, far])
         values = np.nan_to_num(values, nan=BEYOND, posinf=BEYOND, neginf=NONE)
         return np.asarray(np.maximum(values, NONE))
 
-    def _sums(self, felt: Floats, points: Floats) -> Floats:
-        """Return the weighted sum that is the aim (k,), of what is felt of it (k, f) at points (k, m + b)."""
-        of_hands = iter(felt.T)
-        terms = self.demands.aim.terms
-        parts = [w * (next(of_hands) if isinstance(item, Felt) else points[:, item]) for w, item in terms]
-        total = np.asarray(np.sum(parts, axis=0))
-        return np.where(np.isfinite(total), total, np.nan)
-
     def sums(self, scenarios: Sequence[Scenario], chosen: Floats) -> Floats:
-        """Return the aim's weighted sum in each scenario (s, k) with columns (k, m); NaN of none."""
+        """Return the aim's weighted sum in each scenario (s, k) with columns (k, m), NaN of none."""
         count, sums = len(self.demands.felt), []
         for scenario in scenarios:
             points = np.hstack([chosen, np.tile(scenario.point, (len(chosen), 1))])
-            felt = self.measured(scenario.setting, self._numbers(points))
-            sums.append(self._sums(felt[:, count:, 0], points))
+            felt = self.measured(scenario.setting, self._numbers(points), self.demands)
+            sums.append(_sums(self.demands.aim, felt[:, count:, 0], points))
         return np.array(sums)
 
-    def measured(self, setting: int, numbers: Floats) -> Floats:
+    def measured(self, setting: int, numbers: Floats, view: Demands) -> Floats:
         """Return what is felt with gains and box (k, n), what it may be off by, and at how many Hz (k, q, 3).
 
         It is infinite where nothing is felt, or nothing can be said.
         """
-        asked = self.demands.measured
+        views = (self.demands, *self.views)
+        asked = list(dict.fromkeys(felt for demands in views for felt in demands.measured))
         values = np.full((len(numbers), len(asked), 3), np.inf)
         _, scene = self.settings[setting]
         free = [interval.free for interval in (*self.demands.free, *self.demands.box)]
         for place, point in enumerate(map(tuple, numbers.tolist()) if asked else ()):
-            if (setting, point) not in self.felt:
+            row = values[place]
+            if (setting, point, len(asked)) not in self.felt:
                 if place and self.late:
                     break
                 pairs = zip(free, map(Fraction, point), strict=True)
                 with contextlib.suppress(ApcError):
                     changed = apply(scene, [Override(*pair) for pair in pairs])
-                    values[place] = felt_in(changed, asked, self.prepared)
-                self.felt[setting, point] = values[place].copy()
-            values[place] = self.felt[setting, point]
-        return values
-
-    def peak_hz(self, setting: int, points: Floats) -> float:
-        """Return at how many Hz the largest gain that is asked for is largest at a point (1, m + b)."""
-        felt = self.measured(setting, self._numbers(points))[0]
-        peaks = [row[2] for row, item in zip(felt, self.demands.measured, strict=True) if item.name == HINF]
-        return float(peaks[0])
+                    row[:] = felt_in(changed, asked, self.prepared)
+                self.felt[setting, point, len(asked)] = row.copy()
+            row[:] = self.felt[setting, point, len(asked)]
+        return values[:, [asked.index(felt) for felt in view.measured]]
 
     def sampled(self, scenario: Scenario, chosen: Floats) -> Floats:
         """Return the largest value in a scenario (k,) with columns (k, m), the same whenever it is asked."""
@@ -287,7 +314,10 @@ class Limits:
         ranges = [*self.demands.columns, *self.demands.box]
         along = np.diag([float(interval.high - interval.low) for interval in ranges])
         along = along if wide else along[: len(chosen)]
-        parts: list[tuple[Floats, Floats, Complexes, int]] = []
+        parts: list[tuple[Floats, Floats, Complexes, float, int]] = []
+        aim = [felt for _, felt in self.demands.aim.terms if isinstance(felt, Felt)]
+        peaks = [felt.name == HINF for felt in self.demands.felt]
+        peaks += [any(felt.name == HINF for felt in aim)] * bool(self.demands.aim.terms)
         for place, scenario in enumerate(scenarios):
             point = np.append(chosen, scenario.point)
             family = self.family(scenario.setting)
@@ -299,20 +329,33 @@ class Limits:
                 distinct, which = np.unique(self._numbers(moved), axis=0, return_inverse=True)
                 roots = np.array([family.parts(item) for item in distinct.tolist()])[which.reshape(-1)]
                 grown = np.nan_to_num(np.log(np.maximum(roots, TINY)), nan=BEYOND) - self.allowed
-                parts.append((*_differences(grown, inwards), place))
+                parts.append((*_differences(grown, inwards), math.nan, place))
             else:
                 at = np.tile(self._numbers(point), (len(along), 1))
                 for pair in family.slopes(at, self._numbers(along)):
                     values, slopes, result = _largest(*pair)
-                    parts.append((values - self.allowed, slopes, result, place))
-            parts.append((*_differences(self.asked(scenario.setting, moved), inwards), place))
+                    parts.append((values - self.allowed, slopes, result, math.nan, place))
+            still = self.asked(scenario.setting, moved)[:, np.logical_not(peaks)]
+            parts.append((*_differences(still, inwards), math.nan, place))
+            for frequency, view in zip(self.frequencies, self.views if any(peaks) else (), strict=False):
+                asked = self.asked(scenario.setting, moved, view=view)[:, peaks]
+                parts.append((*_differences(asked, inwards), frequency, place))
         counts = [len(values) for values, *_ in parts]
         return Rows(
             np.concatenate([values for values, *_ in parts]),
             np.concatenate([slopes for _, slopes, *_ in parts]),
-            np.concatenate([values for *_, values, _ in parts]),
+            np.concatenate([values for *_, values, _, _ in parts]),
+            np.repeat([frequency for *_, frequency, _ in parts], counts),
             np.repeat([place for *_, place in parts], counts),
         )
+
+
+def _sums(aim: Aim, felt: Floats, points: Floats) -> Floats:
+    """Return the weighted sum that is an aim (k,), of what is felt of it (k, f) at points (k, m + b)."""
+    of_hands = iter(felt.T)
+    terms = [w * (next(of_hands) if isinstance(item, Felt) else points[:, item]) for w, item in aim.terms]
+    total = np.asarray(np.sum(terms, axis=0))
+    return np.where(np.isfinite(total), total, np.nan)
 
 
 def felt_in(
@@ -355,7 +398,10 @@ def felt_in(
                 raise ApcError(Mistake("E996", PLACE, what, hint="feel.error_h2"))
             for mode in (mode for mode in felt_response.hinf if mode.of == "error"):
                 peak = mode.sampled_data
-                value, off, hz = max((value, off, hz), (peak.norm, peak.error, peak.frequency_hz))
+                own = (peak.norm, peak.error, peak.frequency_hz)
+                if not math.isnan(felt.frequency_hz):
+                    own = (float(mode.gains[hertz.index(felt.frequency_hz)]), peak.error, felt.frequency_hz)
+                value, off, hz = max((value, off, hz), own)
         if value == 0:
             raise ApcError(Mistake("E996", SUBJECT, f"of {felt.label} nothing is felt in this scene"))
         result.append((value, off, hz))

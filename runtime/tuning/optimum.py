@@ -7,7 +7,7 @@ Does not: prove that nothing is better: so many points were looked at, and none 
 
 Points spread evenly over the ranges say where to start. From there SciPy's SLSQP goes downhill; several modes
 that limit at once are limits each, so that a corner of the stable region is an ordinary optimum. Where
-limits i bind, v_i(x) = 0 and ∇f + Σ μ_i ∇v_i = 0 hold there, whose root (MINPACK's hybrd) is the answer.
+limits i bind, ∇f + Σ μ_i ∇v_i = 0 holds there: the multipliers μ say what each of them costs.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,10 +115,6 @@ class Search:
         """How nearly a descent is followed to its end."""
         return ROUGHER if self.limits.demands.measured else ROUGH if self.limits.slow else FINE
 
-    def _inner(self, shares: Floats) -> NDArray[np.bool_]:
-        """Say which shares are not at an end."""
-        return np.asarray((shares > self._ends[0] + OPEN) & (shares < self._ends[1] - OPEN))
-
     def gains(self, shares: Floats) -> Floats:
         """Return gains (…, m) of shares of their ranges."""
         return np.asarray(self._low + self._width * np.clip(shares, *self._ends))
@@ -134,7 +129,7 @@ class Search:
 
     def at(self, start: Floats) -> Optimum:
         """Return what there is at shares of the ranges, as if it were the best."""
-        return self._optimum(start, self._remembered({}), 0.0)
+        return self._optimum(start, self.limits.rows(self.scenarios, self.gains(start)))
 
     def start(self, present: Floats, every: Sequence[Scenario], than: Optimum | None = None) -> list[Floats]:
         """Return where to go downhill from, shares of the ranges: the best of points spread evenly.
@@ -235,7 +230,7 @@ class Search:
             slopes = -rows_of(z[:size]).slopes
             return np.column_stack([slopes, np.ones(len(slopes))]) if spare else slopes
 
-        best, reach = self._optimum(start, rows_of, 0.0), 1.0
+        best, reach = self._optimum(start, rows_of(start)), 1.0
         try:
             while reach > NEAREST:
                 near = np.clip([here[:size] - reach, here[:size] + reach], *self._ends).T.tolist()
@@ -248,19 +243,19 @@ class Search:
                     constraints=[{"type": "ineq", "fun": left, "jac": moves}],
                     options={"ftol": self._near, "maxiter": STEPS},
                 )
-                rough = np.clip(np.nan_to_num(ended.x[:size], nan=0.5), *self._ends)
+                shares = np.clip(np.nan_to_num(ended.x[:size], nan=0.5), *self._ends)
                 for end in self._ends:
-                    rough = np.where(np.abs(rough - end) < OPEN, end, rough)
-                optimum = self._optimum(rough, rows_of, 0.0)
+                    shares = np.where(np.abs(shares - end) < OPEN, end, shares)
+                optimum = self._optimum(shares, rows_of(shares))
                 (unmet, value), known_rank = self._rank(optimum), self._rank(best)
                 far = (unmet, value + max(OPEN, self._near)) < known_rank
                 if (unmet, value) < known_rank:
-                    best, here = optimum, np.append(rough, ended.x[size:])
+                    best, here = optimum, np.append(shares, ended.x[size:])
                 if far and ended.success and reach == 1:
                     break
                 reach *= 1.0 if far and reach < 1 else SHORTER
         except TimeUp:
-            seen = [self._optimum(np.frombuffer(key), rows_of, 0.0) for key in known]
+            seen = [self._optimum(np.frombuffer(key), rows) for key, rows in known.items()]
             best = min(best, *seen, key=self._rank)
         return replace(best, looked=len(known))
 
@@ -277,40 +272,28 @@ class Search:
 
         return rows_of
 
-    def _aim(self) -> Floats:
-        """Return how what is to be small follows the shares (m,)."""
-        values = np.zeros(len(self._low))
-        if self.column is not None:
-            values[self.column] = -self.sign
-        return values
-
-    def _value(self, shares: Floats, rows_of: Callable[[Floats], Rows]) -> float:
-        """Return the value of the aim: a gain, or the largest ln |λ| of a frame."""
-        if self.column is not None:
-            return float(self.gains(shares)[self.column])
-        return float(rows_of(shares).values.max()) + self.limits.allowed
-
-    def _optimum(self, shares: Floats, rows_of: Callable[[Floats], Rows], error: float) -> Optimum:
+    def _optimum(self, shares: Floats, rows: Rows) -> Optimum:
         """Return an optimum with what its limits cost: the multipliers that best balance the aim."""
-        rows = rows_of(shares)
         worst = float(rows.values.max(initial=-np.inf))
-        level = worst if self.column is None else 0.0
+        inner = (shares > self._ends[0] + OPEN) & (shares < self._ends[1] - OPEN)
+        if self.column is None:  # the largest ln |λ| of a frame: weights of one
+            value, level, scale = worst + self.limits.allowed, worst, 1.0
+            aim, weights = np.append(np.zeros(inner.sum()), 1.0), np.ones((len(rows.values), 1))
+        else:
+            value, level = float(self.gains(shares)[self.column]), 0.0
+            scale = float(self._width[self.column])
+            aim, weights = np.zeros(len(shares)), np.ones((len(rows.values), 0))
+            aim[self.column] = self.sign
+            aim = aim[inner]
         near = np.flatnonzero(rows.values >= level - BINDS * 100)
-        inner = self._inner(shares)
-        slopes = rows.slopes[near][:, inner].T
-        balance: Any = (slopes, -self._aim()[inner])
-        if self.column is None:  # weights of one
-            balance = (np.vstack([slopes, np.ones(len(near))]), np.append(balance[1], 1.0))
+        slopes = np.hstack([rows.slopes[:, inner], weights])[near].T
         multipliers = np.zeros(len(rows.values))
-        if len(near) and len(balance[1]):
-            multipliers[near] = load_pool("scipy.optimize").nnls(*balance)[0]
-        value = self._value(shares, rows_of)
-        if not error:  # what limits that don't quite bind leave open
-            scale = 1.0 if self.column is None else float(self._width[self.column])
-            error = scale * float(multipliers @ np.abs(rows.values - level))
-        error = max(error, LEAST * abs(value))
+        if slopes.size:
+            multipliers[near] = load_pool("scipy.optimize").nnls(slopes, aim)[0]
+        # What limits that don't quite bind leave open.
+        error = max(scale * float(multipliers @ np.abs(rows.values - level)), LEAST * abs(value))
         if self.limits.slow and self.column is not None:
-            error = max(error, 10 * self._near * float(self._width[self.column]))
+            error = max(error, 10 * self._near * scale)
         return Optimum(tuple(self.scenarios), self.gains(shares), value, error, worst, rows, multipliers, 0)
 
 

@@ -7,8 +7,8 @@ what is not, is said not to be.
 Does not: prove that no other gains are better, but of at most three that a nominal network limits, by 2 %.
 
 Gains are first the best of a few scenarios. Where another corner, number of peers or delay limits them more,
-it is one of the scenarios from then on. They are rounded to where there is most room beside them, and go back
-step by step as long as the proof leaves anything open.
+it is one of the scenarios from then on. They are rounded to as few digits as bear the scenarios, and what is
+to be best goes back step by step as long as the proof leaves anything open.
 """
 
 from __future__ import annotations
@@ -298,6 +298,8 @@ class _Work:
             search = Search(self.limits, self.scenarios, column, sign)
             if not starts:
                 starts = begun = search.start(self.present, self.every)
+                for start in starts:
+                    self.limits.heard(self.scenarios, search.gains(start))
             optimum = search.best(starts)
             self.looked += optimum.looked
             bound = optimum.rows.scenario[optimum.multipliers > 0]
@@ -305,7 +307,7 @@ class _Work:
                 self.scenarios = [scenario for place, scenario in enumerate(self.scenarios) if place in bound]
             level = max(optimum.worst, 0.0 if column is not None else -math.inf)
             starts = [search.shares(optimum)]
-            if self._added(optimum.gains, level):
+            if self._added(optimum.gains, level) or self.limits.heard(self.scenarios, optimum.gains):
                 if not self.late:
                     continue
                 return search.at(begun[0]) if begun else optimum
@@ -335,7 +337,7 @@ class _Work:
     def _settled(self, optimum: Optimum) -> tuple[list[Fraction], list[Proved], Scenario | None]:
         """Return gains as they are typed, what is proved of them, and a scenario that they don't bear."""
         column = self.demands.aim.column
-        shares = BACK if self._unproved or not self.demands.over else BACK_IN_BOX
+        shares: tuple[float, ...] = BACK if self._unproved or not self.demands.over else BACK_IN_BOX
         if column is None:
             shares = (0.0,)
         elif not optimum.multipliers.any():  # the end of a range, which leaves room
@@ -360,9 +362,16 @@ class _Work:
         aim, free = self.demands.aim, self.demands.free
         best = self.limits.worst(self.scenarios, optimum.gains[None]).max()
         room = 0.0 if aim.column is not None else best + NEARLY * abs(best)
+        values, binds = optimum.gains.copy(), optimum.multipliers > 0
+        if aim.column is not None and binds.any():
+            # As far inside of all that binds at once, which costs the aim this share.
+            width = np.array([float(interval.high - interval.low) for interval in self.demands.columns])
+            inwards = np.linalg.lstsq(optimum.rows.slopes[binds], -np.ones(binds.sum()), rcond=None)[0]
+            cost = float(width[aim.column] * optimum.multipliers.sum())
+            values += share * abs(values[aim.column]) / cost * width * inwards
         gains: list[Fraction] = []
         for digits in range(DIGITS if self.late else 1, DIGITS + 1):
-            gains = [_decimal(value, digits) for value in optimum.gains.tolist()]
+            gains = [_decimal(value, digits) for value in values.tolist()]
             if aim.column is not None:
                 gains[aim.column] = self._back(float(optimum.gains[aim.column]), share)
             pairs = zip(gains, free, strict=False)
@@ -612,9 +621,8 @@ class _Work:
                 for interval, value in zip(self.demands.box, scenario.point, strict=True)
             ]
             shape, frequency = self._mode(optimum, scenario, complex(rows.eigenvalue[place]))
-            if math.isnan(frequency) and any(felt.name == HINF for felt in self.demands.measured):
-                point = np.append(optimum.gains, scenario.point)[None]
-                frequency = self.limits.peak_hz(scenario.setting, point)
+            if not math.isnan(rows.frequency_hz[place]):
+                frequency = float(rows.frequency_hz[place])
             bindings.append(Binding(tuple(where), shape, frequency, tuple(buys)))
         return bindings
 
