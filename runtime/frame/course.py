@@ -260,7 +260,7 @@ def _angles(phases: NDArray[Any]) -> Floats:
     """
     turned = phases[1:] * phases[:-1].conj()
     angles = np.arctan2(turned.imag, turned.real)
-    return np.where(angles <= HALF_TURN_BACK, angles + 2 * np.pi, angles)
+    return np.asarray(np.where(angles <= HALF_TURN_BACK, angles + 2 * np.pi, angles))
 
 
 def _directions(phases: NDArray[Any], size: Floats) -> NDArray[Any]:
