@@ -49,10 +49,10 @@ DOUBLINGS, ENDLESS = 60, 1e100
 NEAR, WIDER, NOTHING = 1e-9, 4.0, 1e-9
 
 # How near the radius is near enough, relatively.
-CLOSE = 1e-14
+CLOSE = 1e-13
 
 # How near the radius is enclosed at first, relatively, how much farther each time and how far at last.
-FIRST_WIDTH, WIDER_BOUNDS, LAST_WIDTH = 1e-12, 2.0, 1e-3
+FIRST_WIDTH, WIDER_BOUNDS, LAST_WIDTH = 2e-12, 2.0, 1e-3
 
 # Parts of the way from 1 to what means grow by at which a Y is tried for a whole cell.
 SHARES = (0.7, 0.3, 0.05, 0.0)
