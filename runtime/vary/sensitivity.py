@@ -221,7 +221,7 @@ def network_sensitivities(system: CompiledSystem, prepared: Prepared) -> Sensiti
     Parameters
     ----------
     system, prepared
-        The compiled scene, and what `instance.prepare` made of it.
+        The compiled scene, and what `analysis.prepare` made of it.
     """
     with (
         part("sensitivities"),
