@@ -11,6 +11,7 @@ as often as makes the scene's own Aτ small: for numbers up to `SPAN` times as l
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -25,10 +26,11 @@ from apc.analysis.analysis import prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.plain import symbolic
-from apc.eigen.peers import PeerGroup
+from apc.eigen.peers import PeerGroup, Peers
 from apc.exports.identifiers import Port, words
 from apc.exports.lifted import Numbers, StateSpace, lifted, peers_of, state_space, steps_in_floats
 from apc.frame.devices import Push
+from apc.frame.exchange import Exchange
 from apc.frame.instance import prepare
 from apc.frame.linearize import site_of_entries
 from apc.frame.names import Free, find, unit_of
@@ -73,7 +75,7 @@ def state_space_of(system: CompiledSystem, *, cut: str = "", free: Sequence[str]
         what = "where the scene is linearized does not follow from its numbers alone"
         raise ApcError(Mistake("E954", Place(OPTION), what, hint=f"no {OPTION}"))
     groups, exchange = peers_of(system, prepared=prepared)
-    groups = tuple(part for group in groups for part in _by_groups(group, exchange.starts))
+    groups = tuple(part for group in groups for part in _by_groups(group, exchange))
     values = dict(zip(frees, symbols, strict=True))
 
     def vector(group: PeerGroup) -> Any:
@@ -106,13 +108,11 @@ def _frees(system: CompiledSystem, names: Sequence[str]) -> list[Free]:
     return frees
 
 
-def _by_groups(group: PeerGroup, starts: Any) -> list[PeerGroup]:
+def _by_groups(group: PeerGroup, exchange: Exchange) -> list[PeerGroup]:
     """Return equal peers apart by the scene's groups: a group's own number may be free."""
-    peers = np.array(list(group.peers), np.int64)
-    of = np.searchsorted(starts, peers, side="right")
-    return [
-        replace(group, peers=peer, count=len(peer)) for item in np.unique(of) for peer in [peers[of == item]]
-    ]
+    runs = itertools.groupby(group.peers.runs, key=lambda run: exchange.group_of(run.start))
+    parts = [Peers(tuple(inside)) for _, inside in runs]
+    return [replace(group, peers=peers, count=len(peers)) for peers in parts]
 
 
 def _numbers(vector: Callable[[PeerGroup], Any]) -> Numbers:
