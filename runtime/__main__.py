@@ -17,6 +17,8 @@ from contextlib import suppress
 # Every file a command reads or writes has its own message; these can only come from the terminal or a pipe.
 OUTPUT_ERRORS = (errno.ENOSPC, errno.EIO, errno.EDQUOT, errno.EFBIG)
 
+STOPPED = 130  # the exit code of what Ctrl-C ends: 128 and the number of its signal
+
 # Columns that lines are wrapped to on a narrower terminal, where nothing could be read otherwise.
 NARROWEST = 40
 
@@ -28,10 +30,15 @@ BETWEEN_COLLECTIONS = 100_000
 def main() -> None:
     """Run the command line and exit."""
     gc.set_threshold(BETWEEN_COLLECTIONS)
-    from apc.memory import hold_to_memory
+    try:
+        from apc.memory import hold_to_memory
 
-    hold_to_memory()
-    _end(run(sys.argv[1:]))
+        hold_to_memory()
+        code = run(sys.argv[1:])
+    except KeyboardInterrupt:  # while what a command needs is loaded
+        sys.stderr.write("stopped\n")
+        code = STOPPED
+    _end(code)
 
 
 def _end(code: int) -> None:
@@ -71,7 +78,7 @@ def run(arguments: list[str]) -> int:
         return 2
     except (click.Abort, KeyboardInterrupt):
         click.echo("stopped", err=True)
-        return 130
+        return STOPPED
     except SystemExit:
         # click's answer to a broken pipe, and to nothing else here: whoever reads our output has gone.
         return 0

@@ -45,7 +45,11 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
         hints = _hints(function)
-        for name, value in signature.bind(*args, **kwargs).arguments.items():
+        try:
+            bound = signature.bind(*args, **kwargs)
+        except TypeError as error:
+            raise TypeError(f"apc.{function.__name__}: {error}") from None
+        for name, value in bound.arguments.items():
             if name in hints and not _fits(value, hints[name]):
                 wants = re.sub(r"\w+\.", "", inspect.formatannotation(hints[name]))
                 got = f"{type(value).__name__}: {value!r:.80}"
@@ -74,11 +78,12 @@ def _fits(value: Any, hint: Any) -> bool:
         return isinstance(value, str)
     if origin is Mapping:
         return isinstance(value, Mapping) and all(
-            _fits(item, inner[1]) for item in value.values() if isinstance(item, list | tuple)
+            _fits(key, inner[0]) and (_fits(item, inner[1]) or not isinstance(item, list | tuple))
+            for key, item in value.items()
         )
     if origin is tuple:
         return isinstance(value, tuple | list) and len(value) == len(inner) and all(map(_fits, value, inner))
     if origin in (Sequence, Iterable):
-        listed = isinstance(value, Iterable) and not isinstance(value, Mapping | bytes)
+        listed = isinstance(value, Iterable) and not isinstance(value, Mapping | bytes | str)
         return listed and (origin is Iterable or all(_fits(item, inner[0]) for item in value))
     return isinstance(value, WIDER.get(hint, hint if hint is not None else type(None)))

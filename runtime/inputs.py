@@ -167,8 +167,8 @@ def open_scene(
     overrides = [parse_override(system, text) for text in settings]
     for place, override in enumerate(overrides):
         if any(override.free == other.free for other in overrides[:place]):
-            what = f"{override.free.label} is set twice"
-            raise ApcError(Mistake("E621", OVERRIDE, what, "one value", hint=f'--set "{settings[place]}"'))
+            what, hint = f"{override.free.label} is set twice", f'--set "{settings[place]}"'
+            raise ApcError(Mistake("E621", OVERRIDE, what, hint=hint))
     if notify is not None:
         for note in notes_for_all_groups(system, [override.free for override in overrides]):
             notify(note)

@@ -135,6 +135,6 @@ def _refuse_control_characters(text: str, lines: Lines) -> None:
     before = re.split(r"\r\n|\n|\r", text[: search.start()])
     character = search.group()
     name = unicodedata.name(character, "a control character")
-    got = f"U+{ord(character):04X} ({name})" + (": is this a binary file" if character == "\0" else "")
+    got = f"U+{ord(character):04X} ({name})" + (", as in a binary file" if character == "\0" else "")
     place = lines.place(len(before) - 1, len(before[-1]))
     raise ApcError(Mistake("E107", place, "a YAML file", "visible text", got))

@@ -46,7 +46,10 @@ from apc.network.nominal import left_out, unreliable
 from apc.result import Look, Result
 from apc.threads import single_threaded
 
-NOT_LINEAR = "left out: the scene is not linear, and this holds near its start values only"
+NOT_LINEAR = (
+    "left out: the scene is not linear, and this holds near its start values only: of contacts and limits "
+    "those that act there"
+)
 
 SETTLED = 0.02  # of where it began: a motion counts as settled
 

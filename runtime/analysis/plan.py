@@ -95,8 +95,9 @@ def make_plan(instance: Instance, method: str = "auto") -> Plan:
         E804 a system of too many states for its matrix, E850 a method that can't serve this scene; and those
         of `refuse_varying` and `peers.peer_groups`.
     """
-    assert method in METHODS and method != PAPER, f"no such method: {method}"
     system, exchange = instance.system, instance.exchange
+    if method not in METHODS or method == PAPER:
+        raise cannot_serve(system, method, f"the methods are {', '.join(METHODS)}")
     refuse_varying(system, instance.jacobians)
     can = method in ("auto", "determinant") and not not_populations(system, instance.jacobians)
     if can and ((method == "determinant" and _prompt(instance)) or more_differ(instance, FEW_STATES)):

@@ -208,7 +208,8 @@ def _play_one(system: CompiledSystem, how: Settings, kept: _Kept, *, as_json: bo
     print_result(played, as_json=as_json, written=[out, plot, kept.still], before="  ")
     if interrupted:
         until = f"{summary.end:g} s of {float(how.duration):g} s"
-        tell(f"stopped at {until}; what was done is kept", err=True)
+        what = "what was done is kept" if out or not kept.out else f"{kept.out} was not begun"
+        tell(f"stopped at {until}; {what}", err=True)
         raise click.Abort
 
 
@@ -245,4 +246,4 @@ def _play_into(
         if recording is not None:
             recording.discard()
         raise
-    return summary, interrupted, recording.path if recording is not None else None
+    return summary, interrupted, recording.path if recording is not None and recording.rows else None

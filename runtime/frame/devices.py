@@ -665,7 +665,7 @@ def published(name: str) -> dict[str, tuple[str, str, str]]:
     }
     if name not in result:
         listed = (*HANDS, *result)
-        got = f"{name[:40]} are no hands" if name.strip() else "no hands are named"
+        got = f"there are no hands {name[:40]!r}" if name.strip() else "no hands are named"
         what = f"{got} ({', '.join(listed)})"
         near = nearest(name, listed)
         raise ApcError(Mistake("E930", Place("--hands"), what, hint=f"--hands {near or CLAMPED}"))

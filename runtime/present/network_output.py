@@ -23,7 +23,9 @@ if TYPE_CHECKING:
     from apc.network.recorded import NetworkRecording, Share
 
 _WORDS = {
-    "stable in mean square": "Over the network as it is, the mean square of every motion dies out.",
+    "stable in mean square": (
+        "Over the network as it is, the mean square of every motion dies out that something holds back."
+    ),
     "unstable in mean square": "Over the network as it is, the mean square of some motion grows.",
     "undecided": "The growth of mean squares lies nearer to 1 than its error bound.",
 }

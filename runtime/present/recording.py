@@ -129,6 +129,11 @@ class Recording:
             self._drop()
             raise
 
+    @property
+    def rows(self) -> int:
+        """How many rows are written, whole."""
+        return self._writer.whole_rows
+
     def take(self, block: Block) -> None:
         """Write one block: all of it, or as many of its rows as there is room for."""
         done, step = 0, len(block.time)

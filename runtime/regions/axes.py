@@ -66,8 +66,10 @@ def parse_axes(
         try:
             axis = parse_axis(system, name, f"{span}:2")
         except ApcError as error:
-            mistakes = [replace(mistake, place=Place(f"--{letter}")) for mistake in error.mistakes]
-            raise ApcError(mistakes) from None
+            raise ApcError(
+                replace(mistake, place=Place(f"--{letter}"), hint=mistake.hint.removesuffix(":2"))
+                for mistake in error.mistakes
+            ) from None
         _refuse_period(system, axis.free)
         low, high = axis.values[0], axis.values[-1]
         least = NARROWEST * max(abs(low), abs(high))

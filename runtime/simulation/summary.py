@@ -322,7 +322,7 @@ def _overshoot(extents: Sequence[Extent]) -> tuple[str, float] | None:
     beyonds = []
     for extent in extents:
         way = extent.last - extent.first
-        if abs(way) > LEAST_WAY * (extent.high - extent.low):
+        if way and abs(way) > LEAST_WAY * (extent.high - extent.low):
             beyond = extent.high - extent.last if way > 0 else extent.last - extent.low
             beyonds.append((extent.name, beyond / abs(way)))
     return max(beyonds, key=lambda pair: pair[1], default=None)

@@ -206,7 +206,8 @@ def critical(
             return stable_of(system)
 
         chosen = _chosen(result, present, stable_now)
-        verdict = "" if chosen else _everywhere(result, present, stable_now, chosen_criterion)
+        near = near_start(system, prepared)
+        verdict = "" if chosen else _everywhere(result, present, stable_now, chosen_criterion, near)
     return Critical(
         topology=system.name,
         parameter=free.label,
@@ -224,7 +225,7 @@ def critical(
         verdict=verdict,
         system=system,
         left_out=(
-            *near_start(system, prepared),
+            *near,
             *left_out(system, network=chosen_criterion != MEAN_SQUARE, varied=[free]),
             *(replaced_hands(system) if chosen_criterion == PASSIVE else ()),
         ),
@@ -235,7 +236,13 @@ def critical(
     )
 
 
-def _everywhere(search: Search, present: float, stable_now: Callable[[], bool | None], criterion: str) -> str:
+def _everywhere(
+    search: Search,
+    present: float,
+    stable_now: Callable[[], bool | None],
+    criterion: str,
+    near: Sequence[str],
+) -> str:
     """Return the one verdict of all values, where none was found at which it changes."""
     side = search.stable[0] if search.stable else None
     if search.scanned[0] <= present <= search.scanned[1]:
@@ -246,7 +253,8 @@ def _everywhere(search: Search, present: float, stable_now: Callable[[], bool | 
         return f"{words} at every value scanned"
     if criterion == PASSIVE and side is False:
         return f"{words} whatever its value: apc analyze --hands passive says why"
-    return f"{words} whatever its value: nothing that decides stability depends on it"
+    where = " where the scene starts" if near else ""
+    return f"{words} whatever its value: nothing that decides stability{where} depends on it"
 
 
 def _line(system: CompiledSystem, free: Free, ends: Ends, prepared: Prepared) -> Line:

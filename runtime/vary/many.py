@@ -269,8 +269,8 @@ def analyze_many(system: CompiledSystem, values: Mapping[str, Any]) -> Analyses:
         arrays = np.broadcast_arrays(*listed)
     except ValueError:
         shapes = " and ".join(str(values.shape) for values in listed)
-        what = "values of shapes that can't be broadcast"
-        raise ApcError(Mistake("E881", PLACE, what, "equal shapes", shapes)) from None
+        what = f"values of the shapes {shapes} can't be broadcast against one another"
+        raise ApcError(Mistake("E881", PLACE, what)) from None
     varied, places = [], []
     for free, array in zip(frees, arrays, strict=True):
         numbers, which = np.unique(array.ravel(), return_inverse=True)

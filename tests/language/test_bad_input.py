@@ -85,7 +85,7 @@ FILES: list[tuple[str | bytes, str]] = [
     (nested("{a: ", "}", 200), "18:256: E115 this is nested deeper than 64 levels."),
     (f"a: &a {'[' * 40}{']' * 40}\nb: {'[' * 30}*a{']' * 30}", "2:34: E115 this is nested deeper than 64"),
     ("x: 'a\u2028'", f"1:6: {NO_TEXT}U+2028 (LINE SEPARATOR)."),
-    (b"a: \x00", f"1:4: {NO_TEXT}U+0000 (a control character): is this a binary file."),
+    (b"a: \x00", f"1:4: {NO_TEXT}U+0000 (a control character), as in a binary file."),
     (b"\x7fELF\x02\x01\x01\x00\x00", f"1:1: {NO_TEXT}U+007F"),
     (b"\x89PNG\r\n\x1a\n", "1:1: E106 a YAML file wants UTF-8 text, got byte 0x89 at offset 0."),
     (b"a: 1\nb: \xe4\n", "2:4: E106 a YAML file wants UTF-8 text, got byte 0xe4 at offset 8."),

@@ -204,7 +204,7 @@ def test_the_result_is_a_table_a_text_and_plain_data() -> None:
         ),
         (
             {"contact.stiffness": [1.0, 2.0], "device.mass": [1.0, 2.0, 3.0]},
-            "E881 values of shapes that can't be broadcast wants equal shapes, got (2,) and (3,).",
+            "E881 values of the shapes (2,) and (3,) can't be broadcast against one another.",
         ),
         (
             {"contact.stiffness": 1.0, "couplers.contact.stiffness": 2.0},
