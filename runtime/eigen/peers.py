@@ -165,31 +165,28 @@ class PeerGroup:
 
 
 def build_group(
+    instance: Instance,
     place: int,
     peers: Peers,
-    vector: Floats,
-    built: SiteJacobians,
-    schedule: Schedule,
-    exchange: Exchange,
-    *,
     listening: Listening | None = None,
     gains: Gains | None = None,
 ) -> PeerGroup:
-    """Put a site together with what is known of its peers.
+    """Return peers that move alike as a group.
 
     Parameters
     ----------
+    instance
+        The scene.
     place
         What the `gains` call the group.
     peers
-        Its peers.
-    vector, built, schedule
-        The parameters (n_p,) of the first of them, its kind's Jacobians, its schedule.
-    exchange
-        The links.
+        Its peers; the first one stands for all.
     listening, gains
         What it hears at the start and weighs each sender by, where that matters.
     """
+    exchange = instance.exchange
+    group, vector = exchange.group_of(peers.first), _numbers_of(peers.first, instance)
+    built, schedule = instance.sites[group], instance.schedules[group]
     check_packets(schedule)
     site = linearize(built, vector, listening)
 
@@ -211,7 +208,7 @@ def build_group(
         schedule=schedule,
         lifting=functools.cache(lifting),
         peers=peers,
-        role=exchange.role(exchange.group_of(peers.first)),
+        role=exchange.role(group),
         place=place,
         listening=listening,
         gains=gains or {},
@@ -442,16 +439,10 @@ def _peer_groups(instance: Instance) -> tuple[PeerGroup, ...]:
         listened = [starting.listen(g) for g in range(len(classes))]
         places, classes = _merged(starting, listened, classes)
         heard = [*listened]
-    groups = [exchange.group_of(peers.first) for peers in classes]
-    built = [instance.sites[group] for group in groups]
-    check_size(built, exchange)
+    check_size([instance.sites[exchange.group_of(peers.first)] for peers in classes], exchange)
     return tuple(
-        build_group(
-            *(place, peers, _numbers_of(peers.first, instance), site, instance.schedules[group], exchange),
-            listening=heard[place][0],
-            gains=heard[place][1],
-        )
-        for place, peers, site, group in zip(places, classes, built, groups, strict=True)
+        build_group(instance, place, peers, *heard[place])
+        for place, peers in zip(places, classes, strict=True)
     )
 
 
@@ -520,10 +511,5 @@ def more_differ(instance: Instance, states: int) -> bool:
 
 def representatives(instance: Instance) -> list[PeerGroup]:
     """Return the first peer of each group of the scene, as many as there are peers in it."""
-    result = []
-    for place, (built, schedule) in enumerate(zip(instance.sites, instance.schedules, strict=True)):
-        start, end = instance.exchange.starts[place : place + 2].tolist()
-        vector = instance.numbers.parameters[place][0]
-        peers = Peers((range(start, end),))
-        result.append(build_group(place, peers, vector, built, schedule, instance.exchange))
-    return result
+    runs = itertools.pairwise(instance.exchange.starts.tolist())
+    return [build_group(instance, place, Peers((range(*run),))) for place, run in enumerate(runs)]
