@@ -33,8 +33,9 @@ from apc.compiler.weights import exact_weight
 from apc.eigen.closing import ClosedSystem, Coupling, Loop, close_loop
 from apc.eigen.graph_loops import common_graph, graph_loop, graph_scale
 from apc.eigen.graph_modes import graph_modes
-from apc.eigen.peers import MOST_STATES, PeerGroup, Peers, group_name, states_of, too_large, used_ways
+from apc.eigen.peers import MOST_STATES, PeerGroup, group_name, states_of, too_large, used_ways
 from apc.frame.exchange import Exchange, check_mean
+from apc.frame.instance import Peers
 from apc.frame.schedule import Way
 
 # The shape of modes of peers that differ.

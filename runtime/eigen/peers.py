@@ -1,8 +1,7 @@
 """The groups of peers that move alike: one site each, linearized and lifted once for all of them.
 
 Takes: an `Instance` of a scene.
-Gives: `PeerGroup`, `peer_groups`, `representatives`, `more_differ`; `used_ways`, `states_of`; `too_large`;
-`Peers`.
+Gives: `PeerGroup`, `peer_groups`, `representatives`, `more_differ`; `used_ways`, `states_of`; `too_large`.
 Guarantees: as few groups as there are peers of different dynamics, found in a time that grows with the number
 of peers, not with its square; peers that follow one another take no memory, however many they are. A site
 that is not affine is linearized at its own start values, hearing the others at theirs. A group's matrices are
@@ -15,7 +14,7 @@ from __future__ import annotations
 import bisect
 import functools
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
@@ -24,55 +23,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.weights import exact_weight
-from apc.frame.exact import evaluate_exact
-from apc.frame.exchange import Exchange, check_mean
+from apc.frame.exchange import Exchange
 from apc.frame.finite_equations import at_its_part
-from apc.frame.instance import Instance
-from apc.frame.jacobians import SiteJacobians, edge_name
+from apc.frame.instance import Instance, Peers
+from apc.frame.jacobians import SiteJacobians
 from apc.frame.lift import FrameMap, check_packets, lift
 from apc.frame.linearize import (
     Listening,
     linearize,
     linearize_exact,
     linearize_rows,
-    start_sends,
-    start_values,
 )
-from apc.frame.parameters import exact_numbers
 from apc.frame.schedule import Schedule, Way
 from apc.frame.site import LinearSite, rational_floats
+from apc.frame.start_classes import Gains, StartClasses
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
-
-
-@dataclass(frozen=True, slots=True)
-class Peers:
-    """Peers of a scene by number, in rising runs, each of a group: a billion equal peers take no memory."""
-
-    runs: tuple[range, ...]
-
-    def __len__(self) -> int:
-        return sum(map(len, self.runs))
-
-    def __iter__(self) -> Iterator[int]:
-        return itertools.chain.from_iterable(self.runs)
-
-    @property
-    def first(self) -> int:
-        """The first of them."""
-        return self.runs[0].start
-
-    @property
-    def last(self) -> int:
-        """The last of them."""
-        return self.runs[-1][-1]
-
-    @property
-    def others(self) -> Peers:
-        """All but the first of them."""
-        return Peers(tuple(run for run in (self.runs[0][1:], *self.runs[1:]) if run))
 
 
 # More states than this in one system are refused: at the cost of n³, its eigenvalues would take minutes, and
@@ -81,9 +48,6 @@ MOST_STATES = 1000
 
 # Names of peers written out in the name of a group that is part of a scene's group.
 MOST_NAMED = 4
-
-# What a receive weighs each sender's channel by, by (edge, channel): one for all senders, or one a group.
-Gains = Mapping[tuple[str, str], tuple[Fraction, ...]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -185,7 +149,7 @@ def build_group(
         What it hears at the start and weighs each sender by, where that matters.
     """
     exchange = instance.exchange
-    group, vector = exchange.group_of(peers.first), _numbers_of(peers.first, instance)
+    group, vector = exchange.group_of(peers.first), instance.vector(peers.first)
     built, schedule = instance.sites[group], instance.schedules[group]
     check_packets(schedule)
     site = linearize(built, vector, listening)
@@ -259,140 +223,6 @@ def too_large(exchange: Exchange, what: str, states: int, *, auto: bool = False)
             hint=f"fewer peers that differ{spared}",
         )
     )
-
-
-class StartClasses:
-    """Classes of peers that start alike at the start of time, each hearing the others where they start."""
-
-    def __init__(self, instance: Instance, classes: Sequence[Peers]) -> None:
-        self.exchange = exchange = instance.exchange
-        self.counts = list(map(len, classes))
-        self.peers = [peers.first for peers in classes]
-        self.groups = list(map(exchange.group_of, self.peers))
-        self.vectors = [_numbers_of(peer, instance) for peer in self.peers]
-        self.sites = [instance.sites[group] for group in self.groups]
-        self.schedules = [instance.schedules[group] for group in self.groups]
-        exact: dict[tuple[int, bytes], tuple[list[Fraction], dict[str, list[Fraction]]]] = {}
-        self.parameters: list[list[Fraction]] = []
-        self.sent: list[dict[str, list[Fraction]]] = []
-        for site, vector in zip(self.sites, self.vectors, strict=True):
-            key = (id(site), vector.tobytes())
-            if key not in exact:
-                parameters = exact_numbers(site.kind, vector)
-                exact[key] = parameters, start_sends(site, parameters)
-            self.parameters.append(exact[key][0])
-            self.sent.append(exact[key][1])
-        class_of = {peer: g for g, peer in enumerate(self.peers)}
-        self.arcs: dict[str, dict[int, list[tuple[int, Fraction]]]] = {}
-        for name in exchange.links:
-            if not exchange.is_complete(name) and len(class_of) == exchange.peers:
-                hears: dict[int, list[tuple[int, Fraction]]] = {}
-                pairs, weights = exchange.arcs(name)
-                for (sender, receiver), weight in zip(pairs.tolist(), weights.tolist(), strict=True):
-                    hears.setdefault(class_of[receiver], []).append((class_of[sender], exact_weight(weight)))
-                self.arcs[name] = hears
-        self._edges: dict[tuple[Any, ...], list[Fraction]] = {}
-
-    def _senders(self, link: str, g: int) -> list[tuple[int, Fraction, int]]:
-        """Return the classes a peer of class g hears over a link: (class, weight together, number)."""
-        if link in self.arcs:
-            return [(h, weight, 1) for h, weight in self.arcs[link].get(g, ()) if link in self.sent[h]]
-        counts = [count - (1 if g == h else 0) for h, count in enumerate(self.counts)]
-        return [(h, Fraction(n), n) for h, n in enumerate(counts) if n and link in self.sent[h]]
-
-    def listen(self, g: int) -> tuple[Listening, Gains]:
-        """Return what class g hears at the start, and what its edge functions weigh each sender by."""
-        site, schedule = self.sites[g], self.schedules[g]
-        values: list[Fraction] = []
-        own: list[tuple[Fraction, ...] | None] = []
-        gains: dict[tuple[str, str], tuple[Fraction, ...]] = {}
-        for p, partition in enumerate(site.kind.clocks):
-            for place, receive in enumerate(partition.receives):
-                senders = self._senders(receive.link, g)
-                ways = schedule.ways(p, place)
-                name = edge_name(partition, receive)
-                if not name:
-                    heard = [
-                        (weight, self.sent[h][receive.link][receive.channel]) for h, weight, _ in senders
-                    ]
-                    norm = self._norm(receive.operator, g, receive.link, senders) if ways else Fraction(1)
-                    values.append(sum((weight * value for weight, value in heard), Fraction(0)) / norm)
-                    own.append(None)
-                elif not ways:  # nothing that matters depends on it
-                    values.append(Fraction(0))
-                    own.append(None)
-                else:
-                    value, part, slopes = self._over_edges(g, p, place, senders)
-                    values.append(value)
-                    own.append(part)
-                    channels = list(dict.fromkeys(channel for _, channel in ways))
-                    rows = site.pattern.ticks[p].channels[place]
-                    for row, channel in zip(rows, channels, strict=True):
-                        listed = tuple(
-                            slopes[h][row] if h in slopes else Fraction(0) for h in range(len(self.counts))
-                        )
-                        heard_ones = {listed[h] for h, _, _ in senders}
-                        gains[name, channel] = tuple(heard_ones) if len(heard_ones) == 1 else listed
-        return Listening(tuple(values), tuple(own)), gains
-
-    def _norm(
-        self, operator: str, g: int, link: str, senders: Sequence[tuple[int, Fraction, int]]
-    ) -> Fraction:
-        """Return what a mean is divided by, 1 for all else."""
-        if operator != "mean":
-            return Fraction(1)
-        total = sum((weight for _, weight, _ in senders), Fraction(0))
-        check_mean(self.exchange, self.peers[g], link, operator, bool(senders), total)
-        return total
-
-    def _over_edges(
-        self, g: int, p: int, place: int, senders: Sequence[tuple[int, Fraction, int]]
-    ) -> tuple[Fraction, tuple[Fraction, ...], dict[int, list[Fraction]]]:
-        """Return a receive's value, its slopes over its own (x, u, m), and over each sender's channels."""
-        site = self.sites[g]
-        receive, edge = site.kind.clocks[p].receives[place], site.edges[p, place]
-        x, u, m = start_values(site, self.parameters[g])
-        inside = len(x) + len(u) + len(m[p])
-        result = {}
-        for h, _, _ in senders:
-            sent = self.sent[h][receive.link][: edge.function.numel_in(3)]
-            key = (id(edge), self.vectors[g].tobytes(), tuple(sent))
-            if key not in self._edges:
-                arguments = [x, u, m[p], sent, self.parameters[g], [Fraction(0)]]
-                self._edges[key] = [Fraction(value) for value in evaluate_exact(edge.function, arguments)[0]]
-            result[h] = self._edges[key]
-        norm = self._norm(receive.operator, g, receive.link, senders)
-        if receive.operator in ("sum", "mean"):
-            taken = [(h, weight / norm) for h, weight, _ in senders]
-        else:
-            taken = [
-                (self._extreme(g, receive.name, receive.operator, receive.link, senders, result), Fraction(1))
-            ]
-        value = sum((weight * result[h][0] for h, weight in taken), Fraction(0))
-        own = tuple(
-            sum((weight * result[h][1 + i] for h, weight in taken), Fraction(0)) for i in range(inside)
-        )
-        return value, own, {h: result[h][1 + inside :] for h, _ in taken}
-
-    def _extreme(
-        self,
-        g: int,
-        name: str,
-        operator: str,
-        link: str,
-        senders: Sequence[tuple[int, Fraction, int]],
-        result: Mapping[int, Sequence[Fraction]],
-    ) -> int:
-        """Return the class of the one sender that is the largest, or smallest."""
-        check_mean(self.exchange, self.peers[g], link, operator, bool(senders), Fraction(1))
-        best = (max if operator == "max" else min)(result[h][0] for h, _, _ in senders)
-        winners = [(h, number) for h, _, number in senders if result[h][0] == best]
-        if sum(number for _, number in winners) > 1:
-            peer = self.exchange.peer_name(self.peers[g])
-            what = f"{name} of {peer}: {operator} over equal peers has no linearization"
-            hint = "start values that differ from peer to peer"
-            raise ApcError(Mistake("E803", Place(self.exchange.scene), what, hint=hint))
-        return winners[0][0]
 
 
 # More different peers than this are refused where each has to be looked at with each other: the slopes of
@@ -470,13 +300,6 @@ def _merged(
 def _joined(runs: Iterable[range]) -> Peers:
     """Return the peers of some runs, in order."""
     return Peers(tuple(sorted(runs, key=lambda run: run.start)))
-
-
-def _numbers_of(peer: int, instance: Instance) -> Floats:
-    """Return the parameters (n_p,) of a peer."""
-    group = instance.exchange.group_of(peer)
-    row = instance.numbers.rows[group][peer - instance.exchange.starts[group]]
-    return np.asarray(instance.numbers.parameters[group][row])
 
 
 def _classes(instance: Instance, *, by_matrices: bool) -> list[Peers]:

@@ -26,12 +26,12 @@ from apc.analysis.analysis import prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.plain import symbolic
-from apc.eigen.peers import PeerGroup, Peers
+from apc.eigen.peers import PeerGroup
 from apc.exports.identifiers import Port, words
 from apc.exports.lifted import Numbers, StateSpace, lifted, peers_of, state_space, steps_in_floats
 from apc.frame.devices import Push
 from apc.frame.exchange import Exchange
-from apc.frame.instance import prepare
+from apc.frame.instance import Peers, prepare
 from apc.frame.linearize import site_of_entries
 from apc.frame.names import Free, find, unit_of
 from apc.frame.parameters import free_values

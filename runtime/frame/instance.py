@@ -1,16 +1,20 @@
 """A scene with numbers put in: what analyses of it share, and what one of them starts from.
 
 Takes: a `CompiledSystem`.
-Gives: `Prepared`, `prepare`, `prepared_at`, `starting`; `Instance`, `instance`.
+Gives: `Prepared`, `prepare`, `prepared_at`, `starting`; `Instance`, `instance`; `Peers`.
 Guarantees: what does not follow from the numbers is built once for all of them.
 Does not: put peers together, or analyse (see `peers`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
@@ -22,6 +26,8 @@ from apc.frame.names import Free
 from apc.frame.parameters import Numbers, resolve
 from apc.frame.schedule import ORDER, Schedule
 from apc.frame.scheduling import build_schedules
+
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +47,34 @@ class Prepared:
 
 
 @dataclass(frozen=True, slots=True)
+class Peers:
+    """Peers of a scene by number, in rising runs, each of a group: a billion equal peers take no memory."""
+
+    runs: tuple[range, ...]
+
+    def __len__(self) -> int:
+        return sum(map(len, self.runs))
+
+    def __iter__(self) -> Iterator[int]:
+        return itertools.chain.from_iterable(self.runs)
+
+    @property
+    def first(self) -> int:
+        """The first of them."""
+        return self.runs[0].start
+
+    @property
+    def last(self) -> int:
+        """The last of them."""
+        return self.runs[-1][-1]
+
+    @property
+    def others(self) -> Peers:
+        """All but the first of them."""
+        return Peers(tuple(run for run in (self.runs[0][1:], *self.runs[1:]) if run))
+
+
+@dataclass(frozen=True, slots=True)
 class Instance:
     """A system at its numbers: Jacobians (one a kind), schedules (one a group), parameters, and the links."""
 
@@ -54,6 +88,12 @@ class Instance:
     def sites(self) -> tuple[SiteJacobians, ...]:
         """The Jacobians of each group's kind."""
         return tuple(self.jacobians[group.kind] for group in self.system.groups)
+
+    def vector(self, peer: int) -> Floats:
+        """Return the parameters (n_p,) of a peer of the scene."""
+        group = self.exchange.group_of(peer)
+        row = self.numbers.rows[group][peer - self.exchange.starts[group]]
+        return np.asarray(self.numbers.parameters[group][row])
 
     @property
     def affine(self) -> bool:

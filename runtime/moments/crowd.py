@@ -23,11 +23,11 @@ from apc.analysis.analysis import lifted_groups
 from apc.compiler.compiled import Clock, CompiledSystem, Kind
 from apc.eigen.closing import Coupling, Loop, without_packets
 from apc.eigen.modes import complete_degrees, complete_loops, couple, dense_loop, split_exchangeable
-from apc.eigen.peers import PeerGroup, Peers, used_ways
+from apc.eigen.peers import PeerGroup, used_ways
 from apc.eigen.relative import Relative
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.exchange import Exchange
-from apc.frame.instance import Prepared
+from apc.frame.instance import Peers, Prepared
 from apc.frame.lift import FrameMap
 from apc.frame.parameters import resolve
 from apc.frame.radius import radius_of, value_of

@@ -1,0 +1,159 @@
+"""What peers hear where they start, each the others where these start, and what their edge functions weigh.
+
+Takes: an `Instance` of a scene, and its peers in classes that start alike.
+Gives: `StartClasses`, `Gains`.
+Guarantees: exact rationals.
+Does not: choose the classes, or linearize (see `peers`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
+from typing import Any
+
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.weights import exact_weight
+from apc.frame.exact import evaluate_exact
+from apc.frame.exchange import check_mean
+from apc.frame.instance import Instance, Peers
+from apc.frame.jacobians import edge_name
+from apc.frame.linearize import Listening, start_sends, start_values
+from apc.frame.parameters import exact_numbers
+
+# What a receive weighs each sender's channel by, by (edge, channel): one for all senders, or one a group.
+Gains = Mapping[tuple[str, str], tuple[Fraction, ...]]
+
+
+class StartClasses:
+    """Classes of peers that start alike at the start of time, each hearing the others where they start."""
+
+    def __init__(self, instance: Instance, classes: Sequence[Peers]) -> None:
+        self.exchange = exchange = instance.exchange
+        self.counts = list(map(len, classes))
+        self.peers = [peers.first for peers in classes]
+        self.groups = list(map(exchange.group_of, self.peers))
+        self.vectors = list(map(instance.vector, self.peers))
+        self.sites = [instance.sites[group] for group in self.groups]
+        self.schedules = [instance.schedules[group] for group in self.groups]
+        exact: dict[tuple[int, bytes], tuple[list[Fraction], dict[str, list[Fraction]]]] = {}
+        self.parameters: list[list[Fraction]] = []
+        self.sent: list[dict[str, list[Fraction]]] = []
+        for site, vector in zip(self.sites, self.vectors, strict=True):
+            key = (id(site), vector.tobytes())
+            if key not in exact:
+                parameters = exact_numbers(site.kind, vector)
+                exact[key] = parameters, start_sends(site, parameters)
+            self.parameters.append(exact[key][0])
+            self.sent.append(exact[key][1])
+        class_of = {peer: g for g, peer in enumerate(self.peers)}
+        self.arcs: dict[str, dict[int, list[tuple[int, Fraction]]]] = {}
+        for name in exchange.links:
+            if not exchange.is_complete(name) and len(class_of) == exchange.peers:
+                hears: dict[int, list[tuple[int, Fraction]]] = {}
+                pairs, weights = exchange.arcs(name)
+                for (sender, receiver), weight in zip(pairs.tolist(), weights.tolist(), strict=True):
+                    hears.setdefault(class_of[receiver], []).append((class_of[sender], exact_weight(weight)))
+                self.arcs[name] = hears
+        self._edges: dict[tuple[Any, ...], list[Fraction]] = {}
+
+    def _senders(self, link: str, g: int) -> list[tuple[int, Fraction, int]]:
+        """Return the classes a peer of class g hears over a link: (class, weight together, number)."""
+        if link in self.arcs:
+            return [(h, weight, 1) for h, weight in self.arcs[link].get(g, ()) if link in self.sent[h]]
+        counts = [count - (1 if g == h else 0) for h, count in enumerate(self.counts)]
+        return [(h, Fraction(n), n) for h, n in enumerate(counts) if n and link in self.sent[h]]
+
+    def listen(self, g: int) -> tuple[Listening, Gains]:
+        """Return what class g hears at the start, and what its edge functions weigh each sender by."""
+        site, schedule = self.sites[g], self.schedules[g]
+        values: list[Fraction] = []
+        own: list[tuple[Fraction, ...] | None] = []
+        gains: dict[tuple[str, str], tuple[Fraction, ...]] = {}
+        for p, partition in enumerate(site.kind.clocks):
+            for place, receive in enumerate(partition.receives):
+                senders = self._senders(receive.link, g)
+                ways = schedule.ways(p, place)
+                name = edge_name(partition, receive)
+                if not name:
+                    heard = [
+                        (weight, self.sent[h][receive.link][receive.channel]) for h, weight, _ in senders
+                    ]
+                    norm = self._norm(receive.operator, g, receive.link, senders) if ways else Fraction(1)
+                    values.append(sum((weight * value for weight, value in heard), Fraction(0)) / norm)
+                    own.append(None)
+                elif not ways:  # nothing that matters depends on it
+                    values.append(Fraction(0))
+                    own.append(None)
+                else:
+                    value, part, slopes = self._over_edges(g, p, place, senders)
+                    values.append(value)
+                    own.append(part)
+                    channels = list(dict.fromkeys(channel for _, channel in ways))
+                    rows = site.pattern.ticks[p].channels[place]
+                    for row, channel in zip(rows, channels, strict=True):
+                        listed = tuple(
+                            slopes[h][row] if h in slopes else Fraction(0) for h in range(len(self.counts))
+                        )
+                        heard_ones = {listed[h] for h, _, _ in senders}
+                        gains[name, channel] = tuple(heard_ones) if len(heard_ones) == 1 else listed
+        return Listening(tuple(values), tuple(own)), gains
+
+    def _norm(
+        self, operator: str, g: int, link: str, senders: Sequence[tuple[int, Fraction, int]]
+    ) -> Fraction:
+        """Return what a mean is divided by, 1 for all else."""
+        if operator != "mean":
+            return Fraction(1)
+        total = sum((weight for _, weight, _ in senders), Fraction(0))
+        check_mean(self.exchange, self.peers[g], link, operator, bool(senders), total)
+        return total
+
+    def _over_edges(
+        self, g: int, p: int, place: int, senders: Sequence[tuple[int, Fraction, int]]
+    ) -> tuple[Fraction, tuple[Fraction, ...], dict[int, list[Fraction]]]:
+        """Return a receive's value, its slopes over its own (x, u, m), and over each sender's channels."""
+        site = self.sites[g]
+        receive, edge = site.kind.clocks[p].receives[place], site.edges[p, place]
+        x, u, m = start_values(site, self.parameters[g])
+        inside = len(x) + len(u) + len(m[p])
+        result = {}
+        for h, _, _ in senders:
+            sent = self.sent[h][receive.link][: edge.function.numel_in(3)]
+            key = (id(edge), self.vectors[g].tobytes(), tuple(sent))
+            if key not in self._edges:
+                arguments = [x, u, m[p], sent, self.parameters[g], [Fraction(0)]]
+                self._edges[key] = [Fraction(value) for value in evaluate_exact(edge.function, arguments)[0]]
+            result[h] = self._edges[key]
+        norm = self._norm(receive.operator, g, receive.link, senders)
+        if receive.operator in ("sum", "mean"):
+            taken = [(h, weight / norm) for h, weight, _ in senders]
+        else:
+            taken = [
+                (self._extreme(g, receive.name, receive.operator, receive.link, senders, result), Fraction(1))
+            ]
+        value = sum((weight * result[h][0] for h, weight in taken), Fraction(0))
+        own = tuple(
+            sum((weight * result[h][1 + i] for h, weight in taken), Fraction(0)) for i in range(inside)
+        )
+        return value, own, {h: result[h][1 + inside :] for h, _ in taken}
+
+    def _extreme(
+        self,
+        g: int,
+        name: str,
+        operator: str,
+        link: str,
+        senders: Sequence[tuple[int, Fraction, int]],
+        result: Mapping[int, Sequence[Fraction]],
+    ) -> int:
+        """Return the class of the one sender that is the largest, or smallest."""
+        check_mean(self.exchange, self.peers[g], link, operator, bool(senders), Fraction(1))
+        best = (max if operator == "max" else min)(result[h][0] for h, _, _ in senders)
+        winners = [(h, number) for h, _, number in senders if result[h][0] == best]
+        if sum(number for _, number in winners) > 1:
+            peer = self.exchange.peer_name(self.peers[g])
+            what = f"{name} of {peer}: {operator} over equal peers has no linearization"
+            hint = "start values that differ from peer to peer"
+            raise ApcError(Mistake("E803", Place(self.exchange.scene), what, hint=hint))
+        return winners[0][0]
