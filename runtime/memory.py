@@ -14,7 +14,7 @@ What commands take beside the 60 to 120 MB of the program, at most and within a 
 | `analyze`: k different peers of n states | 100 n² k | `large.populations` |
 | `feel`: n states together, frequencies in blocks | 30 MB, or 150 n² if that is more | `hands.response` |
 | `simulate`: numbers of a frame of all peers | 64 each | `simulation.simulation` |
-| the same: a way of an unreliable link; a packet on it | 200; 4, ordered 12 | `network.timetable` |
+| the same: a way of an unreliable link; a packet on it | 200; 100 | `network.timetable` |
 | `simulate` in Python, `--plot`: rows × signals | 16 each | `simulation.trajectory` |
 | `simulate --out`: a signal; a number of a block | 2,000 (Parquet 24,000); 150 | `present.recording` |
 | the same: a number of all rows | MAT 32; Parquet 500 a signal and block | `present.recording` |

@@ -1,8 +1,8 @@
 """Is it stable, and by how much: the whole road from a compiled system to its spectrum.
 
 Takes: a `CompiledSystem`.
-Gives: `Analysis`, `analyze`; `Prepared`, `prepare`, `timed` and `prepare_at_start` for many analyses of one
-system; `near_start`.
+Gives: `Analysis`, `analyze`; `prepare_at_start` for many analyses of one system; `lifted_groups`;
+`near_start`.
 Guarantees: the cost grows with the number of different peers, not of peers, and not with the length of a
 delay; of equal input comes equal output.
 Does not: read files, or draw.

@@ -39,7 +39,6 @@ from apc.frame.site import LinearSite, rational_floats
 from apc.frame.start_classes import Gains, StartClasses
 
 Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 
 # More states than this in one system are refused: at the cost of n³, its eigenvalues would take minutes, and
@@ -279,7 +278,7 @@ def _peer_groups(instance: Instance) -> tuple[PeerGroup, ...]:
 def _merged(
     starting: StartClasses, heard: Sequence[tuple[Listening, Gains]], classes: Sequence[Peers]
 ) -> tuple[list[int], list[Peers]]:
-    """Join peers apart in the graph that turned out alike, and weigh all others alike; of each the first."""
+    """Return the classes that start alike joined: the place of the first of each, and all its peers."""
     alike = all(len(gain) == 1 for _, gains in heard for gain in gains.values())
     members: dict[tuple[Any, ...], list[int]] = {}
     for g, (listening, gains) in enumerate(heard):

@@ -6,7 +6,7 @@ of number.
 Guarantees: every event within a frame is in it, exactly but for rounding; its eigenvalues are those that
 `analyze` finds, and 0 for each force that nothing else remembers until the frame ends. Cut open and closed
 again by u = −y it is the closed loop.
-Does not: write files (see `files`), or keep equal peers apart from different ones.
+Does not: write files (see `state_space_files`), or keep equal peers apart from different ones.
 
     x⁺ = A x + B u      y = C x + D u      once a frame
 

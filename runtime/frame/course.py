@@ -34,7 +34,8 @@ Complexes = NDArray[np.complex128]
 Integers = NDArray[np.int64]
 
 # Points from one event to the next: at least so many, and this many in a turn of what swings fastest; how
-# often they are doubled until two counts agree: of many sites half as many nearly always are enough.
+# often they are doubled until every motion is followed closely enough: of many sites half as many nearly
+# always are.
 FEWEST, A_TURN = 4, 16
 ONE_SITE, MANY = (1, 9), (-1, 2)
 
@@ -56,7 +57,7 @@ FADED = 1e-14
 ROUNDED = np.pi * 2.0**-40
 HALF_TURN_BACK = ROUNDED - np.pi
 
-# What is real passes 0 along a line but for so much.
+# A real motion that passes 0 turns by half a turn, to within so many radians.
 NEAR_ZERO = 1e-6
 
 

@@ -2,9 +2,9 @@
 
 Takes: the matrices of dx/dt = A x + B u, exact, or of many sites at once in floats.
 Gives: `discretize`, `moved_together`, `refuse_many`; `exponential`, in any numbers; `step_balls`.
-Guarantees: every entry of `discretize` is right to the last digit but one, proved by ball arithmetic, whether
-a mode dies out in a nanosecond or never; where many states move together and it is off by no more than
-composing it rounds, it is had in floats. Every step comes with a bound.
+Guarantees: every entry of `discretize` of one site is right to the last digit but one, proved by ball
+arithmetic, whether a mode dies out in a nanosecond or never; of many sites at once, or of many states that
+move together, steps are taken in floats. Every step comes with a bound.
 Does not: know when anything happens (see `scheduling`).
 
     x(t + T) = F x(t) + G u        [F G; 0 I] = exp([A B; 0 0] T)
@@ -45,8 +45,10 @@ MOST_STATES = 1000
 # States that move together whose exponential is one of balls: of more, floats are looked at first, as balls
 # cost 30 times as much, and only up to so many are there balls where floats say too little: some seconds.
 FEW_TOGETHER, MOST_TOGETHER = 64, 250
+
 # How many times as much as composing rounds a step in floats may be off by, where balls are too many.
 DOUBTFUL = 1e4
+
 # Inputs beside fewer states: each is a row more of the exponential.
 FEWEST_INPUTS = 8
 
@@ -83,7 +85,6 @@ def discretize(a: Matrix, b: Matrix, durations: Sequence[Fraction]) -> tuple[Mat
     """
     *many, n_x, n_u = b.shape
     steps = np.zeros((len(durations), *many, 2, n_x, n_x + n_u))
-    radius_of(steps)[...] = np.finfo(np.float64).tiny
     sites = tuple(range(len(many)))
     filled = (np.asarray(matrix.astype(np.bool_).any(axis=sites)) for matrix in (a, b))
     for states, inputs in _pieces(*filled):
@@ -286,7 +287,10 @@ def _step(scaled: Any, n_x: int) -> Matrix:
             radius = np.array([[float(ball.rad()) for ball in row] for row in balls]).reshape(n_x, width)
             largest = float(np.abs(middle).max(initial=1.0))
             if np.isfinite(largest) and radius.max(initial=0.0) <= RADIUS * largest:
-                return with_radius(middle, UNIT * np.abs(middle) + radius + np.finfo(np.float64).tiny)
+                # What falls below the floats' range is off by the least of them; an exact 0 is not.
+                tiny = np.finfo(np.float64).tiny
+                least = np.array([[0.0 if ball.is_zero() else tiny for ball in row] for row in balls])
+                return with_radius(middle, UNIT * np.abs(middle) + radius + least.reshape(middle.shape))
     finally:
         flint.ctx.prec = precision
     raise ApcError(Mistake("E806", Place("the scene"), TOO_LARGE))

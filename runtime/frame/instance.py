@@ -1,7 +1,7 @@
 """A scene with numbers put in: what analyses of it share, and what one of them starts from.
 
 Takes: a `CompiledSystem`.
-Gives: `Prepared`, `prepare`, `prepared_at`, `starting`; `Instance`, `instance`; `Peers`.
+Gives: `Prepared`, `prepare`, `prepared_at`, `starting`, `hangs_on_heard`; `Instance`, `instance`; `Peers`.
 Guarantees: what does not follow from the numbers is built once for all of them.
 Does not: put peers together, or analyse (see `peers`).
 """
@@ -57,6 +57,9 @@ class Peers:
 
     def __iter__(self) -> Iterator[int]:
         return itertools.chain.from_iterable(self.runs)
+
+    def __contains__(self, peer: object) -> bool:
+        return any(peer in run for run in self.runs)
 
     @property
     def first(self) -> int:

@@ -95,8 +95,8 @@ class StartClasses:
                         listed = tuple(
                             slopes[h][row] if h in slopes else Fraction(0) for h in range(len(self.counts))
                         )
-                        heard_ones = {listed[h] for h, _, _ in senders}
-                        gains[name, channel] = tuple(heard_ones) if len(heard_ones) == 1 else listed
+                        distinct = {listed[h] for h, _, _ in senders}
+                        gains[name, channel] = tuple(distinct) if len(distinct) == 1 else listed
         return Listening(tuple(values), tuple(own)), gains
 
     def _norm(

@@ -30,7 +30,7 @@ from apc.eigen.relative import relative, relative_coordinates, relative_rows, wi
 from apc.frame.discretize import exponential
 from apc.frame.radius import RADII, UNIT, radius_of, value_of, with_radius
 from apc.hands.response import Pushed, Site, force_lanes
-from apc.moments.operator import stein
+from apc.moments.operator import congruence, stein
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
@@ -242,15 +242,10 @@ def noise_variance(
         return None
     through = RADII.multiply(RADII.multiply(read, loop.d), inputs)
     whole = RADII.add(
-        _around(seen[..., at.rest], moments), RADII.multiply(through, np.swapaxes(through, -1, -2))
+        congruence(seen[..., at.rest], moments, RADII), RADII.multiply(through, np.swapaxes(through, -1, -2))
     )
     value, off = (float(np.trace(matrix)) / len(ticks) for matrix in (value_of(whole), radius_of(whole)))
     return value, off + (len(ticks) + 4) * UNIT * value
-
-
-def _around(left: Matrix, inner: Matrix) -> Matrix:
-    """Return L X Lᵀ."""
-    return RADII.multiply(RADII.multiply(left, inner), np.swapaxes(left, -1, -2))
 
 
 def _lasting(matrix: Matrix, driven: Matrix) -> Matrix | None:
@@ -269,7 +264,9 @@ def _lasting(matrix: Matrix, driven: Matrix) -> Matrix | None:
         return None if moments is None else driven
     units = balance(np.abs(value)) ** 2
     shares = np.diagonal(moments) / units
-    weights = np.sqrt(units * np.maximum(shares, AT_REST * shares.max() or 1.0))
+    # Powers of two, so that what is divided and multiplied by them is exact.
+    sizes = np.sqrt(units * np.maximum(shares, AT_REST * shares.max() or 1.0))
+    weights = 2.0 ** np.round(np.log2(sizes))
     seed = np.diag(weights**2)
     held = stein(value, seed)
     if held is None:
@@ -291,6 +288,6 @@ def _lasting(matrix: Matrix, driven: Matrix) -> Matrix | None:
 def _left(matrix: Matrix, added: Matrix, guess: Floats, weights: Floats) -> float:
     """Return the largest sum of a row of B + M X̂ Mᵀ − X̂, over weights."""
     exact = RADII.exact(guess)
-    left = RADII.subtract(RADII.add(_around(matrix, exact), added), exact)
+    left = RADII.subtract(RADII.add(congruence(matrix, exact, RADII), added), exact)
     size = (np.abs(value_of(left)) + radius_of(left)) / np.outer(weights, weights)
     return float(size.sum(axis=-1).max() * (1 + (len(guess) + 8) * UNIT))

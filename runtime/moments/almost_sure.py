@@ -28,8 +28,6 @@ from apc.moments.frames import channels_of, held_frame, refuse_unheld
 from apc.moments.unserved import UnservedError
 from apc.network.channel import ChannelLaw
 
-Floats = NDArray[np.float64]
-
 # States of all peers and their channels in one matrix: ten equal peers of the paper's.
 MOST_STATES = 180
 

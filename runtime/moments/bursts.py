@@ -22,7 +22,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -119,7 +119,7 @@ class _Tagged:
         return self.shortened(tagged)
 
 
-@cache
+@lru_cache(maxsize=1 << 16)
 def _named(tags: Arcs, peers: int) -> tuple[Arcs, tuple[int, ...]]:
     """Return the set that stands for all like some tags, and which peers its peers 0, 1, … are in these."""
     touched, rest = _touched(tags, peers)

@@ -1,7 +1,7 @@
 """A link whose delay changes from packet to packet: a bound by which a scene stays stable whatever it does.
 
 Takes: a `CompiledSystem` and a range of the delay of one of its links.
-Gives: `small_gain`, `unstable_delays`.
+Gives: `loop_gain`, `unstable_delays`.
 Guarantees: with a gain below 1 the scene is exponentially stable however the delays of each way from peer to
 peer change within the range, the newest packet that has arrived being heard; proved, with every rounding
 bounded. Delays that come again and again are proved to make it unstable.
@@ -31,6 +31,7 @@ from apc.eigen.modes import loops_at_right_angles
 from apc.frame.instance import prepare
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
+from apc.frame.radius import UNIT
 from apc.moments.crowd import build_hearing
 from apc.moments.frames import refuse_unheld
 from apc.moments.small_gain import MOST_STATES, change_of_sent, felt_rows, ratios_of, weight_of
@@ -47,7 +48,7 @@ LONGEST = 8
 ABOVE = 1 + 1e-3
 
 
-def small_gain(system: CompiledSystem, delay: Free, low: Fraction, high: Fraction) -> float:
+def loop_gain(system: CompiledSystem, delay: Free, low: Fraction, high: Fraction) -> float:
     """Return the left side of the small gain theorem, proved from above; infinite if the middle is unstable.
 
     Parameters
@@ -108,7 +109,7 @@ def small_gain(system: CompiledSystem, delay: Free, low: Fraction, high: Fractio
         ticks = Counter(
             (g, rows[g][line].way, rows[g][line].channel) for g, lines, _ in off for line in lines
         )
-        gains.append(gain * math.sqrt(max(ticks.values(), default=0)) * ABOVE)
+        gains.append(gain * math.sqrt(max(ticks.values(), default=0)) * (1 + 8 * UNIT))
     return max(gains) * weight
 
 
@@ -120,7 +121,7 @@ def unstable_delays(
     Parameters
     ----------
     system, delay, low, high
-        As for `small_gain`; None where no such delays of at most `LONGEST` packets are proved unstable.
+        As for `loop_gain`; None where no such delays of at most `LONGEST` packets are proved unstable.
     """
     turns = ((first, total - first) for total in range(2, LONGEST + 1) for first in range(1, total))
     for first, then in turns:

@@ -4,7 +4,7 @@ Takes: a scene that is stable in mean square, and how its second moments move.
 Gives: `Forced`, `forced`, `Peer`; `moments_error`, `largest_error`.
 Guarantees: the peers move as before, and are pushed besides; positions are those at the start of a frame of
 the scene, whenever frames are said to begin.
-Does not: say whether the scene is stable (see `network`); bound rounding.
+Does not: say whether the scene is stable (see `network_verdict`); bound rounding.
 
 Every device is pushed by a force of its own of variance 1 N², drawn anew at each tick of the fastest clock as
 a frame begins; the error of a copy is its position less the mean of the others', as frames begin. Pushes add

@@ -5,7 +5,7 @@ Gives: `crowd`; `Classes`, `classes_of`, `moments_of`; `Hearing`, `build_hearing
 `peer_classes`, `remembered_of`, `standing_motions`, `instants`.
 Guarantees: equal peers on complete graphs cost the same, however many they are; peers that can change places
 are one class on any graph.
-Does not: say what it can't serve (see `network`).
+Does not: say what it can't serve (see `network_verdict`).
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
 Flags = NDArray[np.bool_]
 
+# No share lost is off by anything.
 EXACTLY: Mapping[str, tuple[float, ...]] = {}
 
 # A link on which every packet takes the nominal delay.
@@ -407,10 +408,10 @@ def peer_classes(hearing: Hearing) -> tuple[Loop, Coupling]:
     if all(exchange.is_complete(way.link) for way in used_ways(group.schedule for group in groups)):
         degrees = complete_degrees(groups, exchange)
 
-        def one(way: Way, g: int, h: int) -> Fraction:
+        def weight(way: Way, g: int, h: int) -> Fraction:
             return Fraction(groups[h].count > (1 if g == h else 0))
 
-        return complete_loops(groups, exchange)[0], couple(groups, exchange, one, degrees)
+        return complete_loops(groups, exchange)[0], couple(groups, exchange, weight, degrees)
     whole = dense_loop(groups, exchange)
     common = split_exchangeable(whole, exchange)[0]
     place = {group.peers.first: number for number, group in enumerate(whole.sites)}
@@ -443,7 +444,7 @@ def remembered_of(
         Whether every packet counts as on time.
     lost
         How far the share of packets that a link loses may be off, and how it changes over a cell, by the
-        link's name, as for `memory.memory_of`.
+        link's name, as for `packet_memory.memory_of`.
     """
     heard: dict[Route, list[Selected]] = {}
     for site, rows in zip(common.sites, hearing.of(common), strict=True):

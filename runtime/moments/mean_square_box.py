@@ -8,9 +8,8 @@ Does not: serve values that stand in, bursts or traces; leave a jitter open.
 
 The peers' frames are lifted over many cells of the box at once, and follow the parameters to first order
 with a radius for all the rest (`frame.taylor`), as does the share that each link loses; so do the loops of
-means closed of them, and the moments that luck drives (`gains.stein`). Where the largest eigenvalue of G(1)
-is below 1 all over a cell, and loops that no luck drives contract, the cell is proved. A cell where that
-fails is halved.
+means closed of them. A cell is proved where moments Y are found with Y − T(Y) ≻ 0 and Y ≻ 0 all over it
+(`operator.dies_out`); one where that fails is halved.
 """
 
 from __future__ import annotations
@@ -49,7 +48,6 @@ from apc.network.channel import channel_law
 from apc.network.nominal import channel_numbers, unreliable
 from apc.threads import single_threaded
 
-Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
 
 PLACE = Place("box")

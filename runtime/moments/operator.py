@@ -11,7 +11,7 @@ Second moments X_b of some motions move, with the covariances V_l of luck, by
 
 with w ≥ 0 and S ⪰ 0, so that T leaves the cone of X ⪰ 0 as it is. Let μ Y − T(Y) = Z ≻ 0. If Y ≻ 0, T has a
 spectral radius below μ. If Y ⪰ 0 does not hold, it has one of μ or more, as otherwise Y = Σ_k T^k(Z)/μ^{k+1}
-were the sum of what is in the cone. Y is that for Z = I in floats, in coordinates of one size.
+would be a sum of matrices of the cone. Y is that for Z = I in floats, in coordinates of one size.
 
 Let V grow by μ a frame. Moments answer to it by Stein equations, and of these follows V again: V = G(μ) V. G
 falls as μ rises, so second moments grow by the μ > ρ(M)² at which the largest eigenvalue of G is 1, or by
@@ -60,7 +60,7 @@ SHARES = (0.7, 0.3, 0.05, 0.0)
 # More than what eigenvalues of a symmetric matrix are off by, relatively.
 DOUBT = 1e-12
 
-# Roundings of a weight and of a symmetric part.
+# Roundings of a weight: those of a probability, and of how many peers it counts for.
 WEIGHT_ROUNDINGS = 18
 
 
@@ -155,10 +155,10 @@ class Operator:
         for block, moment in zip(self.blocks, moments, strict=True):
             if moment is None or not len(block.seen):
                 continue
-            formed = _around(block.seen, _each(moment, numbers), numbers)
+            formed = congruence(block.seen, _each(moment, numbers), numbers)
             for e, luck in enumerate(block.by if block.at_once is not None else ()):
                 assert block.at_once is not None
-                at_once = _around(block.at_once[:, e], _each(_one(drawn, luck, numbers), numbers), numbers)
+                at_once = congruence(block.at_once[:, e], _each(_one(drawn, luck, numbers), numbers), numbers)
                 formed = numbers.add(formed, at_once)
             result = numbers.add(result, _weighted(block.shares, formed, numbers))
         return np.multiply(result, self.spreads) if numbers is FLOATS else entrywise(result, self.spreads)
@@ -169,7 +169,7 @@ class Operator:
         for block in self.blocks:
             added = numbers.exact(np.zeros(block.matrix.shape[-2:]))
             for into, number in zip(block.into, block.by, strict=True):
-                added = numbers.add(added, _around(into, _one(luck, number, numbers), numbers))
+                added = numbers.add(added, congruence(into, _one(luck, number, numbers), numbers))
             result.append(added)
         return result
 
@@ -179,7 +179,7 @@ class Operator:
         for _ in self.spreads if any(block.at_once is not None for block in self.blocks) else ():
             luck = self.followed(moments, luck, numbers)
         pairs = zip(self.blocks, moments, strict=True)
-        after = [_around(block.matrix, moment, numbers) for block, moment in pairs]
+        after = [congruence(block.matrix, moment, numbers) for block, moment in pairs]
         return list(map(numbers.add, after, self.driven(luck, numbers)))
 
     @cached_property
@@ -226,7 +226,7 @@ class Operator:
             for block in of.blocks:
                 item = None
                 if luck in block.by:
-                    driven = _around(block.into[block.by.index(luck)], units, FLOATS)
+                    driven = congruence(block.into[block.by.index(luck)], units, FLOATS)
                     if (item := stein(block.matrix, driven, growth)) is None:
                         return None
                 moments.append(item)
@@ -361,7 +361,7 @@ def stein(matrix: Floats, driven: Floats, growth: float = 1.0) -> Floats | None:
     return None
 
 
-def _around(left: Matrix, inner: Matrix, numbers: Arithmetic) -> Matrix:
+def congruence(left: Matrix, inner: Matrix, numbers: Arithmetic) -> Matrix:
     """Return L X Lᵀ."""
     return numbers.multiply(numbers.multiply(left, inner), np.swapaxes(left, -1, -2))
 

@@ -73,13 +73,13 @@ class Receiver:
     shares: tuple[Matrix, ...]
 
 
-def quadrature(n: int, chance: float, most: int) -> tuple[Floats, Floats]:
-    """Return nodes and weights of a binomial distribution, exact for polynomials up to 2·most − 1.
+def quadrature(n: int, lost: float, most: int) -> tuple[Floats, Floats]:
+    """Return nodes and weights of how many packets arrive, exact for polynomials up to 2·most − 1.
 
     Parameters
     ----------
-    n, chance
-        So many trials, each succeeding so often.
+    n, lost
+        So many packets, each lost with this probability: a binomial distribution.
     most
         The number of nodes, unless all n + 1 outcomes are fewer.
 
@@ -89,11 +89,11 @@ def quadrature(n: int, chance: float, most: int) -> tuple[Floats, Floats]:
     """
     if n + 1 <= most:
         outcomes = np.arange(n + 1)
-        weights = [math.comb(n, k) * chance**k * (1 - chance) ** (n - k) for k in range(n + 1)]
+        weights = [math.comb(n, k) * (1 - lost) ** k * lost ** (n - k) for k in range(n + 1)]
         return outcomes.astype(np.float64), np.array(weights)
-    k = np.arange(most)
+    k, chance = np.arange(most), 1 - lost
     middle = n * chance + k * (1 - 2 * chance)
-    beside = np.sqrt(k[1:] * (n - k[1:] + 1.0) * chance * (1 - chance))
+    beside = np.sqrt(k[1:] * (n - k[1:] + 1.0) * chance * lost)
     nodes, vectors = np.linalg.eigh(np.diag(middle) + np.diag(beside, 1) + np.diag(beside, -1))
     return nodes, vectors[0] ** 2
 
@@ -106,7 +106,7 @@ def stand_in(system: CompiledSystem, hearing: Hearing) -> Moments:
     system
         The compiled scene.
     hearing
-        Its peers, of `crowd.hearing` with what stands in; packets are due as frames begin.
+        Its peers, of `crowd.build_hearing` with what stands in; packets are due as frames begin.
     """
     of = classes_of(hearing)
     receivers, offsets, _ = receivers_of(system, hearing, of.common, of.weights)
@@ -171,7 +171,7 @@ def receivers_of(
         own = {way: weight[h] for way, weight in weights.items()}
         ticks = len({(row.clock, row.tick) for row in rows})
         nodes = [
-            quadrature(n, 1 - law.mean_loss, ticks + 3)
+            quadrature(n, law.mean_loss, ticks + 3)
             if any(listed[g] for listed in own.values())
             else (np.zeros(1), np.ones(1))
             for g, n in enumerate(others)

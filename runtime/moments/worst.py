@@ -286,7 +286,7 @@ def _shaking(modes: Sequence[Mode], harmless: int) -> tuple[tuple[bool, ...] | N
             if not losses:
                 note = f"the {mode.name} mode grows with no packet lost"
             most = int(np.argmax(growth))
-            if growth[most] > growth[place] * (2 - 1 / ABOVE):
+            if growth[most] > growth[place] * ABOVE:
                 spelled = "".join("×" if lost else "·" for lost in pattern_of(words[most]))
                 note += f"; of at most {losses} losses in a row, the most met is "
                 note += f"{growth[most]:.8g} a frame, by {spelled}"

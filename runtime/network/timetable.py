@@ -401,8 +401,8 @@ def _groups(exchange: Exchange, pairs: Integers) -> tuple[list[tuple[int, int]],
     """Return the different pairs of groups of pairs of peers, and which of them each pair (M,) is."""
     groups = np.searchsorted(exchange.starts, pairs, side="right") - 1
     count = len(exchange.groups)
-    text, of_pair = np.unique(groups[:, 0] * count + groups[:, 1], return_inverse=True)
-    return [divmod(item, count) for item in text.tolist()], of_pair
+    distinct, of_pair = np.unique(groups[:, 0] * count + groups[:, 1], return_inverse=True)
+    return [divmod(item, count) for item in distinct.tolist()], of_pair
 
 
 def _highest(ticks: Integers, ways: Integers, when: Integers, ranks: Integers, first: Integers) -> Integers:

@@ -127,7 +127,7 @@ def compare_regions(
         Whether y is the effective gain: a scene that sums over its others is given y divided by their number,
         so that its coupling is as strong as that of a scene that takes their mean.
     cells, criterion, progress
-        See `region.region`.
+        See `stable_region.region`.
 
     Raises
     ------

@@ -76,7 +76,7 @@ CELLS = 12
 TOLERANCE = 1e-9
 
 # The same by a criterion of one number, whose slopes are differences: each of its values takes milliseconds.
-TOLERANCE_OF_GROWTH = 1e-6
+TOLERANCE_OF_DIFFERENCES = 1e-6
 
 # How often the straight lines of a boundary known by verdicts alone are halved, where it has no steps.
 HALVINGS = 3
@@ -255,9 +255,9 @@ def region(
         Into how many cells each side of the rectangle is divided to begin with.
     tolerance
         Largest distance between curves and boundary, relative to a coordinate; curves that could not be
-        followed so closely are `Region.coarse`. None: `TOLERANCE`, in mean square `TOLERANCE_OF_GROWTH`.
+        followed so closely are `Region.coarse`. None: `TOLERANCE`, in mean square `TOLERANCE_OF_DIFFERENCES`.
     criterion
-        "mean-square" or "nominal", see `critical.critical`.
+        "mean-square" or "nominal", see `critical_values.critical`.
     prepared
         From `instance.prepare`, of this system with any numbers.
     progress
@@ -280,7 +280,7 @@ def region(
     """
     free = tuple(axis.free for axis in axes)
     meant = criterion_of(system, criterion, PLACE, free)
-    tolerance = tolerance or (TOLERANCE_OF_GROWTH if meant in BY_GROWTH else TOLERANCE)
+    tolerance = tolerance or (TOLERANCE_OF_DIFFERENCES if meant in BY_GROWTH else TOLERANCE)
     for item in free:
         if meant == NOMINAL:
             refuse_channel_number(system, item, PLACE, instead=f"--in {MEAN_SQUARE}")
@@ -300,7 +300,7 @@ def region(
         if start is None or times:
             plane = _points_plane(system, free, rectangle, prepared, meant, stepped=bool(times))
             if meant == NOMINAL and not times:
-                tolerance = max(tolerance, TOLERANCE_OF_GROWTH)
+                tolerance = max(tolerance, TOLERANCE_OF_DIFFERENCES)
             if start is not None and len(times) == 1:
                 striped = trace_strips(
                     system, axes, times[0], start, cells=cells, tolerance=tolerance, progress=progress

@@ -105,7 +105,7 @@ def trace_strips(
     prepared
         From `instance.prepare`; all sites linear.
     cells, tolerance
-        As for `region.region`, of every strip.
+        As for `stable_region.region`, of every strip.
     progress
         Is told how far the work is.
 

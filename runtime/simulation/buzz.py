@@ -160,7 +160,7 @@ def buzz(system: CompiledSystem, *, prepared: Prepared | None = None) -> Buzz:
 
 
 def _seconds(system: CompiledSystem) -> Fraction:
-    """Return how long to play: until the swing has come to what it is, if that can be waited for."""
+    """Return how long to play, in whole seconds: `LONGEST`, or less of many peers."""
     timings = {timing.name: timing.value for timing in system.timings}
     tick = min(timings[clock.period] for clock in system.clocks)
     most = math.floor(MOST_PLAYED * tick / system.peers)

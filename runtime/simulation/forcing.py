@@ -3,7 +3,8 @@
 Takes: the `Rates` of a kind, a parameter vector, when intervals begin and how long they last.
 Gives: `SiteForcing`, `site_forcing`, `impulses`.
 Guarantees: an interval is split where a comparison of `time` switches (a step, a corner of a ramp, a row of
-a table), so that what is integrated is smooth; an impulse is right to `AGREE` of the largest of its chunk.
+a table), so that what is integrated is smooth; an impulse is right to `AGREE` of the largest of those
+integrated at once, and where a force jumps at an instant that is not known beforehand, to `LOST`.
 Does not: integrate what depends on the motion.
 
     c = ∫₀ᵀ e^{A u} g(t + T − u) du
@@ -156,7 +157,7 @@ def _integrated(site: SiteForcing, until: Floats, low: Floats, high: Floats) -> 
 
     def integrand(share: float) -> Floats:
         left = equal[0] + (equal[1] - equal[0]) * share
-        steps = exponential(left[:, None, None] * site.matrix, nothing, 1.0)
+        steps = exponential(site.matrix, nothing, left[:, None, None])
         g = _at(site.force, np.maximum(until - left[which], 0.0))
         moved = np.einsum("kxq,qk->kx", steps[..., list(site.pushed)][which], g)
         return np.asarray((high - low)[:, None] * moved)

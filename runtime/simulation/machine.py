@@ -40,7 +40,6 @@ OPERATORS = {"sum": 0, "mean": 0, "max": 1, "min": 2}
 HEAD = """\
 #include <math.h>
 #include <stdint.h>
-#include <string.h>
 typedef int64_t whole;
 #if defined(_WIN32)
 #define LIBRARY __declspec(dllexport)

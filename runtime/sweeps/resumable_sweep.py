@@ -149,7 +149,7 @@ def sweep(
     of
         What to compute, see `quantities.QUANTITIES`: `analyze`, …
     criterion
-        "mean-square" or "nominal", see `critical.critical`.
+        "mean-square" or "nominal", see `critical_values.critical`.
     out
         The file to write, .csv or .parquet. Finished parts are kept beside it until all is done, and the
         same sweep takes them up again. Without it the rows are only returned.
@@ -261,7 +261,7 @@ def _description(system: CompiledSystem, work: Work) -> dict[str, Any]:
 
 
 class _Memory:
-    """Parts that are nowhere but here, as `store.Parts` are on disk."""
+    """Parts that are nowhere but here, as `finished_parts.Parts` are on disk."""
 
     def __init__(self) -> None:
         self._cells: dict[int, Cells] = {}

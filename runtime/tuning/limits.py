@@ -3,7 +3,7 @@
 Takes: a `CompiledSystem` and `Demands`.
 Gives: `Scenario`, `Rows`, `Limits`.
 Guarantees: a value below 0 is a demand that is met, in floats; slopes are those of the values.
-Does not: choose scenarios, or prove (see `tune`).
+Does not: choose scenarios, or prove (see `tuner`).
 
 A scenario is a scene of its own, a number of peers and a delay (`settings`), and a point of the box. What
 limits gains there is how fast each of the largest modes grows, ln |λ| less what is allowed; over a lossy

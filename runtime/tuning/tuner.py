@@ -73,7 +73,7 @@ CORNERS = (
     "before rounding: the ends and the middle of each range in a box were looked at, and no point between"
 )
 
-# What is said where gains are none that meet all demands, as there was no time to look farther.
+# What is said where no gains that meet all demands were found in time.
 LATE = "the time was up: these gains are those that were looked at last"
 
 # Scenarios added at a time; how far above the others a limit is that counts.

@@ -52,7 +52,6 @@ from apc.vary.wiring import (
 
 Floats = NDArray[np.float64]
 Matrices = NDArray[Any]  # float64 or complex128
-Places = NDArray[np.intp]
 Wired = TypeVar("Wired", ClosedSystem, Loop)
 T = TypeVar("T")
 

@@ -18,7 +18,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.instance import prepare
 from apc.frame.names import Free, Range
-from apc.moments.changing_delay import small_gain, unstable_delays
+from apc.moments.changing_delay import loop_gain, unstable_delays
 from apc.moments.unserved import UnservedError
 from apc.vary.delays import delay_pieces, system_with_delay
 
@@ -95,7 +95,7 @@ def changing(system: CompiledSystem, delay: Range) -> ChangingDelay:
     low, width = delay.low, delay.high - delay.low
     try:
         ends = (low + part * width for part in PARTS)
-        proved = next((end for end in ends if small_gain(system, delay.free, low, end) < 1), None)
+        proved = next((end for end in ends if loop_gain(system, delay.free, low, end) < 1), None)
     except UnservedError as why:
         return ChangingDelay(None, None, f"left open, as {why}")
     beyond = None if proved == delay.high else unstable_delays(system, delay.free, low, delay.high)

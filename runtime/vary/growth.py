@@ -1,10 +1,10 @@
-"""The values of one parameter at which one number passes 1: in mean square, or with passive hands.
+"""The values of one parameter at which one number passes 1: a spectral radius, or a growth of its own.
 
 Takes: a `CompiledSystem` and the name of a parameter, or of what its links lose.
 Gives: `MEAN_SQUARE`, `NOMINAL`, `PASSIVE`, `BY_GROWTH`, `criterion_of`, `refuse_time`; `PointLine`,
 `line_points`, `BOUNDED`; `judge_at`, `allowed`; `RadiusEvaluator`.
 Guarantees: a verdict is by bounds on the growth of second moments, or on what hands can draw, which counts
-as a growth (see `passivity.passive_growth`).
+as a growth (see `passivity.passive_growth`); nominally, by the analysis itself.
 Does not: find two crossings between neighbouring samples; follow a delay, whose stretches are the nominal
 search's (see `line`).
 """
@@ -148,7 +148,7 @@ def judge_at(
         return verdict_of(analyze(changed, prepared=prepared))
     if criterion == NOMINAL:
         radius = abs(leading_in_floats(changed, prepared))
-        return Verdict(radius < 1, radius, math.nan, (), "")
+        return Verdict(radius < 1, radius, math.nan, (), "") if math.isfinite(radius) else OPEN
     # Each imported where it is asked for: most scenes need neither.
     if criterion == PASSIVE:
         from apc.hands.passivity import passive_growth
@@ -230,9 +230,9 @@ class RadiusEvaluator:
         way = np.where(self._allowed(values + 2 * moved), 1.0, -1.0)[:, None]
         item = values + np.where(at_end, way, -1.0) * moved
         other = values + np.where(at_end, 2 * way, 1.0) * moved
-        (here,), (first,), (second,) = (self.matrices(points) for points in (values, item, other))
-        inside = (4 * first - 3 * here - second) * way[:, None] / (2 * DIFFERENCE)
-        return ((here, np.where(at_end[:, None], inside, (second - first) / (2 * DIFFERENCE))),)
+        (present,), (first,), (second,) = (self.matrices(points) for points in (values, item, other))
+        inside = (4 * first - 3 * present - second) * way[:, None] / (2 * DIFFERENCE)
+        return ((present, np.where(at_end[:, None], inside, (second - first) / (2 * DIFFERENCE))),)
 
     def _allowed(self, values: Floats) -> NDArray[np.bool_]:
         """Say which values (k, m) are within what each parameter may be."""
@@ -245,8 +245,9 @@ class RadiusEvaluator:
     def errors(self, values: Floats) -> tuple[Floats, ...]:
         """Return bounds (k, 1, 1) on the errors of the number at values (k, m)."""
         verdicts = [self.verdict(value, bounded=True) for value in values.tolist()]
-        by = 1.0 if self.criterion == NOMINAL else 2.0
-        errors = [by * verdict.error / max(verdict.radius, LEAST) for verdict in verdicts]
+        # That of a root is half of what its square's is, divided by the root: at most this.
+        roots = [1.0 if self.criterion == NOMINAL else math.sqrt(verdict.radius) for verdict in verdicts]
+        errors = [verdict.error / max(root, LEAST) for verdict, root in zip(verdicts, roots, strict=True)]
         return (np.array(errors)[:, None, None],)
 
 

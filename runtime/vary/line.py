@@ -126,9 +126,9 @@ class MatrixLine(OneStretch):
 
     def point(self, value: float) -> Floats:
         """Return the point (m,) of a value."""
-        text = self.base.copy()
-        text[self.column] = value
-        return text
+        values = self.base.copy()
+        values[self.column] = value
+        return values
 
     def look(self, values: Floats) -> tuple[Complexes, Complexes]:
         """Return the eigenvalues of all systems (k, n) and their slopes at values (k,)."""

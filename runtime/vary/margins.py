@@ -276,7 +276,7 @@ def network_margins(
     Parameters
     ----------
     system, prepared
-        The compiled scene, and what `analysis.prepare` made of it.
+        The compiled scene, and what `instance.prepare` made of it.
     nominal
         The margins over the nominal network: how far to look from a value of 0.
     quick

@@ -189,7 +189,7 @@ def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -
         notes.append(f"{', '.join(names)} would move what was left out, and {are} not among these")
     if not rows and not notes:
         why = "no derivative is finite" if free else "there is no parameter to vary"
-        notes.append(f"what moves it most: not told: {why}")
+        notes.append(f"what moves it most: not known: {why}")
     rows.sort(key=lambda row: (-abs(row.relative), row.parameter, row.mode))
     return Sensitivities(radius, active, tuple(rows), "; ".join(notes))
 
@@ -221,7 +221,7 @@ def network_sensitivities(system: CompiledSystem, prepared: Prepared) -> Sensiti
     Parameters
     ----------
     system, prepared
-        The compiled scene, and what `analysis.prepare` made of it.
+        The compiled scene, and what `instance.prepare` made of it.
     """
     with (
         part("sensitivities"),
