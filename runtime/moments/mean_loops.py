@@ -73,9 +73,12 @@ class Remembered:
         columns = [*range(count), *range(first, first + sum(self.sizes))]
         inner = rows[..., columns]
         many = np.kron(np.eye(len(self.channels)), inner)
-        # Each channel's values first, then their luck.
+        # Each channel's values first, then their luck, slot by slot: what one packet holds is lost together.
         place = np.arange(many.shape[-1]).reshape(len(self.channels), -1)
-        return np.asarray(many[..., [*place[:, :count].ravel(), *place[:, count:].ravel()]])
+        slots = np.split(place[:, count:], np.cumsum(self.sizes)[:-1], axis=1)
+        return np.asarray(
+            many[..., [*place[:, :count].ravel(), *(item for slot in slots for item in slot.ravel())]]
+        )
 
 
 @dataclass(frozen=True, slots=True)

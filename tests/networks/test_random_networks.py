@@ -72,6 +72,7 @@ def laws(draw: st.DrawFn) -> Law:
 @given(scenes(), laws())
 @example(Scene(peers=2, kt=900.0, cube=0.3, comm=Fraction(12, 1000)), Law(0.03, 0.3, 0.9, 0.02, zero=True))
 @example(Scene(peers=2, haptic=3 * MS, network=2 * MS, comm=2 * MS, comp=MS), Law(0.1, 0.9))
+@example(Scene(peers=2, bt=3.0, network=MS / 2, comm=Fraction(0), comp=Fraction(0)), Law(0.5, 0.5))
 def test_verdicts_are_those_of_moments_followed_pattern_by_pattern(scene: Scene, law: Law) -> None:
     assume(arrivals_of(scene) == 1 or (law.independent and not law.zero))  # or it takes seconds
     said = f"loss: {{p: {law.p!r}, r: {law.r!r}, 1-h: {law.bad_loss!r}, 1-k: {law.good_loss!r}}}"
