@@ -131,6 +131,8 @@ def _peak(
         outputs[own, loop.reads[of][place]] = scale * seen
         if pushed == of:
             through[own, own] = scale * pushes / float(seconds) ** 0.5
+    if not all(np.isfinite(matrix).all() for matrix in (inputs, outputs, through)):  # beyond floats
+        return Peak(np.nan, np.nan, np.nan), np.full(len(frequency_hz), np.nan)
     c = outputs @ value_of(loop.c)
     if _shows(basis, c):
         return Peak(np.inf, 0.0, 0.0), np.full(len(frequency_hz), np.inf)

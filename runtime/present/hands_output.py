@@ -172,7 +172,8 @@ def feel_text(feel: Feel) -> Lines:
             if value is not None and off is not None
         ]
         yield ""
-        yield from notes(f"{', '.join(values) or 'it drifts'} (rms) for {what}, new at each tick")
+        spread = ", ".join(values) or "it drifts, or rounding hides that it does not"
+        yield from notes(f"{spread} (rms) for {what}, new at each tick")
 
 
 def _curves(feel: Feel) -> list[tuple[NDArray[np.complex128], Floats, float, bool, str]]:
@@ -205,7 +206,7 @@ def _extreme(extremes: Extremes) -> tuple[str, str]:
     """Return a norm and what it is of."""
     peak = extremes.sampled_data
     what, unit = ("velocity", "m/s/N") if extremes.of == "velocity" else ("copies apart", "m/N")
-    size = "without end: it drifts"
+    size = "not known: beyond floats" if np.isnan(peak.norm) else "without end: it drifts"
     if np.isfinite(peak.norm):
         norm = measured(peak.norm, peak.error + 1e-11 * peak.norm, unit)
         size = f"{norm} at {peak.frequency_hz:.5g} Hz"
