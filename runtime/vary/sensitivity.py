@@ -208,7 +208,8 @@ def _singly(system: CompiledSystem, prepared: Prepared, free: Sequence[Free]) ->
     if not now.modes:
         return Sensitivities(0.0, (), (), "nothing moves: there is no eigenvalue")
     most = now.spectral_radius - SHARED
-    active = tuple((mode.eigenvalue, mode.shape) for mode in now.modes if abs(mode.eigenvalue) >= most)
+    upper = (mode for mode in now.modes if mode.eigenvalue.imag >= -mode.error)  # of a conjugate pair one
+    active = tuple((mode.eigenvalue, mode.shape) for mode in upper if abs(mode.eigenvalue) >= most)
     if len(active) > 1:
         note = f"{len(active)} eigenvalues share the radius, which has no derivative there"
         return Sensitivities(now.spectral_radius, active, (), note)
