@@ -268,7 +268,7 @@ def _lasting(matrix: Matrix, driven: Matrix) -> Matrix | None:
     shares = np.diagonal(moments) / units
     # Powers of two, so that what is divided and multiplied by them is exact.
     sizes = np.sqrt(units * np.maximum(shares, AT_REST * shares.max() or 1.0))
-    weights = 2.0 ** np.round(np.log2(sizes))
+    weights = np.asarray(np.exp2(np.round(np.log2(sizes))), dtype=np.float64)
     seed = np.diag(weights**2)
     held = stein(value, seed)
     if held is None:
