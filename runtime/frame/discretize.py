@@ -210,7 +210,7 @@ def exponential(a: Matrix, b: Matrix, seconds: float | Matrix, numbers: Arithmet
         phi = numbers.add(exact, numbers.scaled(numbers.multiply(x, phi), 1 / (term + 1)))
     grown = np.concatenate([numbers.multiply(x, phi), numbers.multiply(phi, g)], axis=-1)
     for _ in range(squarings):
-        grown = numbers.add(2 * grown, numbers.multiply(grown[..., :n_x], grown))
+        grown = numbers.doubled(grown)
     return numbers.add(grown, numbers.exact(np.eye(n_x, n_x + n_u)))
 
 

@@ -42,7 +42,8 @@ class Arithmetic:
 
     `exact` writes what is exact, `bounded` what may be off by so much. `solve` gives X of M X = R, None where
     it can't be said, or where nobody asks it of such numbers; `vanishes` says that a matrix is zero. `scaled`
-    multiplies by a number that is off by one rounding, `size` is the largest that magnitudes can be.
+    multiplies by a number that is off by one rounding, `size` is the largest that magnitudes can be. `doubled`
+    gives [F G] − [I 0] (…, n, n + m) of twice the time.
     """
 
     multiply: Callable[[Matrix, Matrix], Matrix]
@@ -54,6 +55,7 @@ class Arithmetic:
     bounded: Callable[[Matrix, Matrix], Matrix] = lambda value, off: value
     scaled: Callable[[Matrix, float | Matrix], Matrix] = lambda matrix, factor: matrix * factor
     size: Callable[[Matrix], Matrix] = np.abs
+    doubled: Callable[[Matrix], Matrix] = lambda grown: 2 * grown + grown[..., : grown.shape[-2]] @ grown
 
 
 def common_shape(*shapes: tuple[int, ...]) -> tuple[int, ...]:
@@ -208,6 +210,29 @@ def _scaled(matrix: Matrix, factor: float | Matrix) -> Matrix:
     return values
 
 
+def _doubled(grown: Matrix) -> Matrix:
+    """Return [F G] − [I 0] of twice the time with its radii, over cells too.
+
+    Notes
+    -----
+    With E = F − I, E ← 2 E + E² and G ← 2 G + E G round by what E is, not by the 1 beside it. What E is off
+    by, Δ, goes on as F Δ + Δ F + Δ² though: it dies out with what F lets die out, where 2 Δ + |E| Δ + Δ |E|
+    would grow fourfold each time.
+    """
+    n = grown.shape[-2]
+    identity = np.eye(*grown.shape[-2:])
+    off, spread = radius_of(grown).real.copy(), spread_of(grown)
+    exact = grown.copy()
+    radius_of(exact)[...] = 0
+    result = _added(2 * exact, _multiply(exact[..., :n], exact), np.add)
+    step = np.abs(value_of(grown) + identity)
+    carried = (step[..., :n] + spread[..., :n]) @ off + off[..., :n] @ (step + spread + off)
+    carried[..., n:] += off[..., n:]
+    rounding = 1 + (n + 2 * grown.shape[-3] + 8) * UNIT
+    radius_of(result)[...] = (radius_of(result) + carried * rounding) * (1 + 2 * UNIT)
+    return result
+
+
 def _solve_floats(matrix: Matrix, right: Matrix) -> Matrix | None:
     try:
         return np.asarray(np.linalg.solve(matrix, right))
@@ -225,4 +250,5 @@ RADII = Arithmetic(
     bounded=with_radius,
     scaled=_scaled,
     size=_most,
+    doubled=_doubled,
 )
