@@ -42,8 +42,8 @@ class Arithmetic:
 
     `exact` writes what is exact, `bounded` what may be off by so much. `solve` gives X of M X = R, None where
     it can't be said, or where nobody asks it of such numbers; `vanishes` says that a matrix is zero. `scaled`
-    multiplies by a number that is off by one rounding, `size` is the largest that magnitudes can be. `doubled`
-    gives [F G] − [I 0] (…, n, n + m) of twice the time.
+    multiplies by a number that is off by one rounding, `size` is the largest that magnitudes can be.
+    `doubled` gives [F G] − [I 0] (…, n, n + m) of twice the time.
     """
 
     multiply: Callable[[Matrix, Matrix], Matrix]
