@@ -75,12 +75,26 @@ def eigenpairs(matrix: Matrix) -> Eigenpairs:
     """Return all eigenvalues of matrices (…, n, n), in no order, with their right and left vectors.
 
     Both come from one triangular form, so that a defective cluster spoils none but its own.
+
+    Notes
+    -----
+    By LAPACK's geev, as `scipy.linalg.eig` of one matrix does, which takes ten times as long around it. Of a
+    real matrix it gives the real and imaginary parts of a conjugate pair's vector in the places of the two.
     """
-    eig = load_pool("scipy.linalg").eig
+    geev = load_pool("scipy.linalg.lapack").get_lapack_funcs("geev", (matrix,))
     values = np.empty(matrix.shape[:-1], dtype=np.complex128)
     left, right = np.empty((2, *matrix.shape), dtype=np.complex128)
-    for place in np.ndindex(matrix.shape[:-2]):
-        values[place], left[place], right[place] = eig(matrix[place], left=True, check_finite=False)
+    for place in np.ndindex(matrix.shape[:-2] if matrix.size else 0):
+        *parts, left[place], right[place], failed = geev(matrix[place])
+        if failed:
+            raise np.linalg.LinAlgError("eigenvalues did not converge")
+        values[place] = parts[0] if len(parts) == 1 else parts[0] + 1j * parts[1]
+    if not np.iscomplexobj(matrix):
+        first, second = (side[..., None, :] for side in (values.imag > 0, values.imag < 0))
+        for vectors in (left, right):
+            after, before = np.roll(vectors, -1, axis=-1), np.roll(vectors, 1, axis=-1)
+            vectors += 1j * np.where(first, after, 0)
+            vectors[...] = np.where(second, before - 1j * vectors, vectors)
     return Eigenpairs(values, right, left.conj().swapaxes(-1, -2))
 
 
