@@ -419,15 +419,22 @@ def _crossing(
 
 
 def _root(stretch: Stretch, ends: Sequence[float], growth: Sequence[float], off: float) -> float:
-    """Return where floats see the largest magnitude pass 1, off by so much; by Newton's or Brent's method."""
+    """Return where floats see the largest magnitude pass 1 between ends that lie on two sides, off by so much.
+
+    By Newton's method and, where that leaves the ends or there are no slopes, Brent's.
+    """
+    known = {end: (height, math.nan) for end, height in zip(ends, growth, strict=True)}
 
     def at(value: float) -> tuple[float, float]:
-        result = _sampled(stretch, np.array([value]))
-        if not len(result.points):
-            return 0.0, math.nan  # no matrix: what is beside it is judged
-        largest = np.argmax(np.abs(result.values[0]))
-        rate = result.slopes[0, largest] / result.values[0, largest]
-        return float(result.growth[0]), float(rate.real)
+        if value not in known:
+            result = _sampled(stretch, np.array([value]))
+            if len(result.points):
+                largest = np.argmax(np.abs(result.values[0]))
+                rate = result.slopes[0, largest] / result.values[0, largest]
+                known[value] = float(result.growth[0]), float(rate.real)
+            else:  # no matrix: what is beside it is judged
+                known[value] = 0.0, math.nan
+        return known[value]
 
     (low, high), (at_low, at_high) = ends, growth
     value = low + (high - low) * at_low / (at_low - at_high)
@@ -439,8 +446,6 @@ def _root(stretch: Stretch, ends: Sequence[float], growth: Sequence[float], off:
         if abs(new - value) <= off * abs(new):
             return new
         value = new
-    if at(low)[0] * at(high)[0] >= 0:  # an end lies on the circle as far as floats know
-        return min(low, high, key=lambda end: abs(at(end)[0]))
     # Imported where Newton's method fails: it takes as long as an analysis.
     brentq = load_pool("scipy.optimize").brentq
     return float(brentq(lambda value: at(value)[0], low, high, xtol=5e-324, rtol=off / 100))
