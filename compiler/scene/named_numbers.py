@@ -171,7 +171,7 @@ class NamedNumbers:
         if not (isinstance(node, Scalar) and node.text.rstrip().endswith("Hz")):
             return self.read(node, what, SECOND, unit)
         rate = self.read(node, what, SECOND.power(-1), "Hz")
-        if rate.number == 0:
+        if rate.number <= 0:
             raise fault("E207", node.place, what, "a rate above 0 Hz", brief(node.text))
         return Value(1 / rate.number, SECOND, None, rate.place)
 
