@@ -38,6 +38,10 @@ Flags = NDArray[np.bool_]
 
 BLOCK = 4  # words of one counter
 
+# Packets of a way, and of all ways together, whose luck is drawn at a time: to find a way's place in its
+# stream takes longer than a hundred numbers of it.
+AHEAD, MOST_AHEAD = 64, 2**19
+
 # netem's Pareto table (iproute2, netem/pareto.c): shape 3, its mean 3/2 taken off, times 4/3, and no more
 # than 4, the largest number that the table can hold (32767/8192).
 PARETO_SHAPE = 3
@@ -174,6 +178,7 @@ class PacketSource:
         self._pairs = np.asarray(pairs, np.int64).reshape(-1, 2)
         self.ways = len(self._pairs)
         self._bad: Flags = self._uniforms(1, 1)[:, 0, 0] < law.bad
+        self._drawn = np.empty((self.ways, 0, BLOCK))  # of the packets next
 
     def take(self, count: int) -> Floats:
         """Return the delays (M, count) in seconds of the next packets, infinite for those that get lost."""
@@ -182,7 +187,11 @@ class PacketSource:
         if law.trace is not None:
             recorded = law.trace[np.arange(first, first + count) % law.trace.size]
             return np.broadcast_to(recorded, (self.ways, count))
-        uniforms = self._uniforms(first + 2, count)
+        drawn = self._drawn.shape[1]
+        if count > drawn:
+            more = max(count - drawn, min(AHEAD, MOST_AHEAD // max(self.ways, 1)))
+            self._drawn = np.concatenate([self._drawn, self._uniforms(first + drawn + 2, more)], axis=1)
+        uniforms, self._drawn = self._drawn[:, :count], self._drawn[:, count:]
         bad = self._states(uniforms[..., 0])
         lost = uniforms[..., 1] < np.where(bad, law.one_minus_h, law.one_minus_k)
         late = deviates(law.distribution, uniforms[..., 2], uniforms[..., 3]) if law.jitter else 0.0

@@ -253,7 +253,7 @@ def _everywhere(
         return f"{words} at every value scanned"
     if criterion == PASSIVE and side is False:
         return f"{words} whatever its value: apc analyze --hands passive says why"
-    where = " where the scene starts" if near else ""
+    where = " where the scene starts (--set may start it elsewhere)" if near else ""
     return f"{words} whatever its value: nothing that decides stability{where} depends on it"
 
 
