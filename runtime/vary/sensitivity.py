@@ -52,8 +52,10 @@ Complexes = NDArray[np.complex128]
 # they are all said to share the radius.
 SHARED = 1e-10
 
-# Eigenvalues nearer to one another than this are one cluster, whose vectors are hardly several.
-CLOSE = 1e-7
+# Eigenvalues nearer to one another than this, relatively, are one cluster: rounding mixes their vectors by a
+# millionth or more. Where even the vectors of such a cluster are worse conditioned than `SOUND`, it may be
+# part of one that rounding split, as the root of it.
+EQUAL, CLOSE, SOUND = 1e-9, 1e-7, 1e6
 
 # A cluster of vectors worse conditioned than this has no derivative worth the name.
 WORST = 1e8
@@ -386,19 +388,24 @@ def _of_system(name: str, matrix: Floats, slopes: Floats, still: NDArray[np.bool
     pairs = eigenpairs(matrix)
     sizes = np.abs(pairs.values)
     least = sizes.max() - SHARED * max(1.0, sizes.max()) - 2 * CLOSE * max(sizes.max(), CLOSE)
-    left_over = set(np.flatnonzero((pairs.values.imag >= 0) & (sizes >= least)).tolist())
+    left_over = sizes >= least
     result = []
     for place in np.argsort(-sizes, kind="stable").tolist():
-        if place not in left_over:
+        if not left_over[place] or pairs.values[place].imag < 0:
             continue
         value = pairs.values[place]
-        near = np.flatnonzero(np.abs(pairs.values - value) <= CLOSE * max(abs(value), CLOSE))
-        left_over -= set(near.tolist())
-        own = pairs.at(near)
-        product = own.left @ own.right
-        size = float(np.linalg.svd(product, compute_uv=False)[-1])
-        norms = float(np.linalg.norm(own.left, 2) * np.linalg.norm(own.right, 2))
-        condition = norms / size if size > 0 else np.inf
+        for reach in (EQUAL, CLOSE):
+            near = np.flatnonzero(
+                left_over & (np.abs(pairs.values - value) <= reach * max(abs(value), CLOSE))
+            )
+            own = pairs.at(near)
+            product = own.left @ own.right
+            size = float(np.linalg.svd(product, compute_uv=False)[-1])
+            norms = float(np.linalg.norm(own.left, 2) * np.linalg.norm(own.right, 2))
+            condition = norms / size if size > 0 else np.inf
+            if condition < SOUND:
+                break
+        left_over[near] = False
         rates = np.zeros((len(slopes), len(near), len(near)), np.complex128)
         if condition < WORST:
             rates = np.asarray(np.linalg.solve(product, own.left) @ slopes @ own.right, np.complex128)

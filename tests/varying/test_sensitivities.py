@@ -50,6 +50,10 @@ SCENE = {
     "held": replaced(MESH, GRAPH, OWN),
     "held without contact": replaced(MESH, GRAPH, OWN, ("1000 N/m", "0 N/m")),
     "held apart": replaced(MESH, GRAPH, OWN, ("500 N/m", "0 N/m")),
+    # Two of its modes are 4e-9 of themselves apart, and follow the coordination differently.
+    "modes close together": replaced(
+        MESH, GRAPH, ("500 N/m", "0.1 N/m"), ("0.1 kg", "0.01 kg"), ("1000 N/m", "60000 N/m")
+    ),
     **{f"settling {place}": UNCLOCKED.format(*numbers) for place, numbers in enumerate(SETTLING)},
 }
 
