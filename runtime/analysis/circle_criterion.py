@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from apc.analysis.opened import Matrix, OpenLoop
 from apc.eigen.dissipation import least_real, proves_positive
 from apc.frame.radius import RADII, UNIT, radius_of, value_of
+from apc.unserved import UnservedError
 
 Floats = NDArray[np.float64]
 
@@ -33,18 +34,23 @@ Floats = NDArray[np.float64]
 Weights = Mapping[tuple[str, str, int], tuple[float, float]]
 
 
-def weights_of(loops: Sequence[OpenLoop]) -> Weights | str:
-    """Return the weights that are free of what drifts, or why there are none.
+def weights_of(loops: Sequence[OpenLoop]) -> Weights:
+    """Return the weights that are free of what drifts.
 
     Parameters
     ----------
     loops
         All loops of a scene.
+
+    Raises
+    ------
+    UnservedError
+        Why there are none.
     """
     drifting = [loop for loop in loops if loop.seen]
     if len(drifting) > 1:
         names = " and ".join(open_loop.name for open_loop in drifting)
-        return f"with all contacts open, what may drift is of several modes: {names}"
+        raise UnservedError(f"with all contacts open, what may drift is of several modes: {names}")
     weights: dict[tuple[str, str, int], tuple[float, float]] = {}
     for open_loop in drifting:
         moved, off = value_of(open_loop.moved)[0], radius_of(open_loop.moved)[0]
@@ -52,11 +58,11 @@ def weights_of(loops: Sequence[OpenLoop]) -> Weights | str:
             open_loop.ports, open_loop.seen, open_loop.counts, moved, off, strict=True
         ):
             if not share:
-                return f"{port[1]} does not hold what may drift with all contacts open"
+                raise UnservedError(f"{port[1]} does not hold what may drift with all contacts open")
             by = -1 / (float(share) * count)
             weight, radius = by * m, abs(by) * (doubt + 8 * UNIT * abs(m))
             if not weight > radius:
-                return f"{port[1]} drives away what may drift with all contacts open"
+                raise UnservedError(f"{port[1]} drives away what may drift with all contacts open")
             weights[port] = weight, radius
     return weights
 

@@ -32,6 +32,7 @@ from apc.eigen.peers import PeerGroup
 from apc.eigen.spectrum import Spectrum, solve_spectrum
 from apc.frame.exchange import Exchange, build_exchange
 from apc.frame.parameters import resolve
+from apc.unserved import UnservedError
 
 # Gains tried between 0 and 1 on the way from 1 down, and how near the root of an equation is to be had.
 CELLS, NEAR = 32, 1e-15
@@ -71,8 +72,8 @@ def load_of(bias: float) -> float:
     return (math.sqrt(1 - bias * bias) + bias * (math.pi / 2 + math.asin(bias))) / math.pi
 
 
-def predict(system: CompiledSystem, groups: list[tuple[PeerGroup, tuple[Push, ...]]]) -> Predicted | str:
-    """Predict the buzz of a scene, or say why there is none to predict.
+def predict(system: CompiledSystem, groups: list[tuple[PeerGroup, tuple[Push, ...]]]) -> Predicted:
+    """Predict the buzz of a scene.
 
     Parameters
     ----------
@@ -80,6 +81,11 @@ def predict(system: CompiledSystem, groups: list[tuple[PeerGroup, tuple[Push, ..
         The compiled scene.
     groups
         From `opened.contact_groups`.
+
+    Raises
+    ------
+    UnservedError
+        Why there is none to predict.
     """
     exchange = build_exchange(system, resolve(system).timings)
 
@@ -94,14 +100,15 @@ def predict(system: CompiledSystem, groups: list[tuple[PeerGroup, tuple[Push, ..
     below = next((gain for gain in gains if (excess(gain) > 0) != unstable), None)
     if below is None:
         word = "unstable" if unstable else "stable"
-        return f"no buzz: with contacts of any part of their stiffness it is {word}"
+        raise UnservedError(f"no buzz: with contacts of any part of their stiffness it is {word}")
     gain = brentq(excess, below, below + 1 / CELLS, xtol=NEAR)
     spectrum = at(gain)
     frequency = max(
         (mode.frequency_hz for mode in spectrum.modes if abs(mode.magnitude - 1) < MARGINAL), default=0.0
     )
     if not frequency:
-        return f"no buzz: with contacts of {gain:.6g} of their stiffness it drifts away without swinging"
+        what = f"with contacts of {gain:.6g} of their stiffness it drifts away without swinging"
+        raise UnservedError(f"no buzz: {what}")
     bias = brentq(lambda item: gain_of(item) - gain, -1, 1, xtol=NEAR)
     return Predicted(frequency, gain, bias, 0.5 + math.asin(bias) / math.pi, unstable)
 

@@ -42,6 +42,7 @@ from apc.frame.parameters import resolve
 from apc.frame.ports import with_cuts
 from apc.frame.radius import RADII, radius_of, rounded, solve, value_of, with_radius
 from apc.frame.site import LinearSite
+from apc.unserved import UnservedError
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
@@ -91,10 +92,8 @@ class OpenLoop:
     jumps: str
 
 
-def contact_groups(
-    system: CompiledSystem, prepared: Prepared
-) -> list[tuple[PeerGroup, tuple[Push, ...]]] | str:
-    """Return the groups of equal peers with all contacts on, and what pushes at each; or why that can't be.
+def contact_groups(system: CompiledSystem, prepared: Prepared) -> list[tuple[PeerGroup, tuple[Push, ...]]]:
+    """Return the groups of equal peers with all contacts on, and what pushes at each.
 
     Parameters
     ----------
@@ -105,11 +104,13 @@ def contact_groups(
     ------
     ApcError
         E863 a part that takes too many decisions.
+    UnservedError
+        Why that can't be.
     """
     numbers = resolve(system)
     kinds_now = [site.kind for site in prepared.jacobians]
     if any(partition.variants for kind in kinds_now for partition in kind.clocks):
-        return "what is computed of what is heard changes with its age, from tick to tick"
+        raise UnservedError("what is computed of what is heard changes with its age, from tick to tick")
     switched = [find_switches(kind) for kind in kinds_now]
     parts = parts_of_kinds(system, switched, numbers)
     on = tuple(
@@ -119,11 +120,11 @@ def contact_groups(
     for place, group in enumerate(system.groups):
         vector = numbers.parameters[place][0]
         for part in parts[group.kind]:
-            push = push_of(switched[group.kind], part, prepared.jacobians[group.kind], vector)
-            if isinstance(push, str):
-                return push
+            push_of(switched[group.kind], part, prepared.jacobians[group.kind], vector)
         if not on[group.kind].parameters_suffice:
-            return f"some force at {group.name} is not linear, or looks at each of the others by itself"
+            raise UnservedError(
+                f"some force at {group.name} is not linear, or looks at each of the others by itself"
+            )
     scene = instance(system, replace(prepared, jacobians=on))
     kinds = {id(site_jacobians): kind for kind, site_jacobians in enumerate(on)}
     pairs = []
@@ -132,7 +133,7 @@ def contact_groups(
         pushes = (
             push_of(switched[kind], part, prepared.jacobians[kind], peers.parameters) for part in parts[kind]
         )
-        pairs.append((peers, tuple(push for push in pushes if isinstance(push, Push))))
+        pairs.append((peers, tuple(push for push in pushes if push)))
     return pairs
 
 
@@ -163,32 +164,26 @@ def _pushing(site: LinearSite, pushes: Sequence[Push], gain: Fraction) -> Linear
     return replace(site, ticks=tuple(ticks))
 
 
-def open_loops(system: CompiledSystem, prepared: Prepared) -> list[OpenLoop] | str:
-    """Cut all contacts open, or say why that can't be."""
-    groups = contact_groups(system, prepared)
-    if isinstance(groups, str):
-        return groups
+def open_loops(system: CompiledSystem, prepared: Prepared) -> list[OpenLoop]:
+    """Cut all contacts open; UnservedError says why that can't be."""
     opened: list[Opened] = []
-    for group, pushes in groups:
+    for group, pushes in contact_groups(system, prepared):
         for push in pushes:
             if push.sector and not push.shares:
-                return push.sector
+                raise UnservedError(push.sector)
         opened.append(_cut_open(group, pushes))
     of_site = {id(item.group.lifting): item for item in opened}
     exchange = build_exchange(system, resolve(system).timings)
     loops = loops_at_right_angles([item.group for item in opened], exchange, MOST_STATES)
-    if isinstance(loops, str):
-        return loops
     result = []
     for loop in loops:
         cut_groups = [of_site[id(site.lifting)] for site in loop.sites]
         size = loop.states + sum(len(opened.ticks) for opened in cut_groups)
         if size > MOST_STATES:
-            return f"{size:,} states and ticks of contacts move together, and {MOST_STATES} are the most"
-        one_open = _open_loop(loop, cut_groups)
-        if isinstance(one_open, str):
-            return one_open
-        result.append(one_open)
+            raise UnservedError(
+                f"{size:,} states and ticks of contacts move together, and {MOST_STATES} are the most"
+            )
+        result.append(_open_loop(loop, cut_groups))
     return result
 
 
@@ -211,11 +206,11 @@ def _cut_open(group: PeerGroup, pushes: Sequence[Push]) -> Opened:
     return Opened(bare, wide_map, len(bare.z_names), tuple(ticks), followed, plain, jumps)
 
 
-def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop | str:
-    """Close a loop whose contacts are cut open, or say why that can't be judged."""
+def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop:
+    """Close a loop whose contacts are cut open; UnservedError says why that can't be judged."""
     free = find_rigid_modes(close_loop(loop))
     if free.drifts:
-        return "with all contacts open, something drifts ever farther"
+        raise UnservedError("with all contacts open, something drifts ever farther")
     names = [(*item.group.z_names, *(f"{part}[{tick}]" for part, tick in item.ticks)) for item in opened]
     layout = lay_out(names, [site.schedule for site in loop.sites])
     closed = close_outside(
@@ -233,11 +228,11 @@ def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop | str:
     shares, moved = np.zeros(0, dtype=object), np.zeros((2, 1, len(ports)))
     if free.exact:
         if not all(item.plain for item in opened):
-            return _MORE
+            raise UnservedError(_MORE)
         motions = np.array(free.exact, dtype=object).T
         left = _left_vectors(a, motions, at.held)
         if left is None:
-            return "what moves with all contacts open can't be told from what drifts"
+            raise UnservedError("what moves with all contacts open can't be told from what drifts")
         rows = [(opened.slopes, np.searchsorted(own, offset)) for _, opened, offset in listed]
         followed = np.concatenate(
             [slopes @ motions[start : start + slopes.shape[1]] for slopes, start in rows], axis=0
@@ -249,7 +244,7 @@ def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop | str:
             pivot = int((first != 0).argmax())
             shares = followed[:, pivot] / first[pivot]
             if (followed != np.outer(shares, first)).any():
-                return _APART
+                raise UnservedError(_APART)
             drift = rounded(first[None].astype(np.float64))
             moved = RADII.multiply(drift, RADII.multiply(left, b))
     return OpenLoop(

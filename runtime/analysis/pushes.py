@@ -25,6 +25,7 @@ from apc.analysis.switches import SwitchedKind, SwitchingPart
 from apc.compiler.interpolation import jacobian
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.linearize import start_values
+from apc.unserved import UnservedError
 
 Floats = NDArray[np.float64]
 
@@ -58,10 +59,8 @@ class Push:
 
 def push_of(
     switched: SwitchedKind, part: SwitchingPart, site: SiteJacobians, parameters: Floats
-) -> Push | str | None:
-    """Return a part's force where it is on, or why it is none that is computed from tick to tick.
-
-    None where it is 0 whatever moves, as that of a spring without stiffness.
+) -> Push | None:
+    """Return a part's force where it is on; None where it is 0 whatever moves, as of no stiffness.
 
     Parameters
     ----------
@@ -71,6 +70,11 @@ def push_of(
         The kind's Jacobians.
     parameters
         The vector (n_p,) of a peer.
+
+    Raises
+    ------
+    UnservedError
+        Why it is no linear force that is computed from tick to tick.
     """
     symbols = [switched.decisions[place].symbol for place in part.decisions]
     touched = [
@@ -80,26 +84,26 @@ def push_of(
         if any(casadi.depends_on(function.output[row], symbol) for symbol in symbols)
     ]
     if any(item.where[0] == "derivative" for item, _ in touched):
-        return f"{part.name} acts at every moment, not from tick to tick"
+        raise UnservedError(f"{part.name} acts at every moment, not from tick to tick")
     if any(item.where[0] != "tick" for item, _ in touched):
-        return f"{part.name} depends on each of the others by itself"
+        raise UnservedError(f"{part.name} depends on each of the others by itself")
     if len(touched) > 1:
-        return f"{part.name} is more than one force"
+        raise UnservedError(f"{part.name} is more than one force")
     (opened, row), partition = touched[0], touched[0][0].where[1]
     *inputs, heard, p, t = opened.inputs
     moving = casadi.vertcat(*inputs)
     guards = [switched.decisions[place].guard for place in part.decisions]
     everything = casadi.vertcat(opened.output[row], *guards)
     if casadi.depends_on(everything, heard) or casadi.depends_on(everything, t):
-        return f"{part.name} depends on what is heard or on time"
+        raise UnservedError(f"{part.name} depends on what is heard or on time")
     slopes = jacobian(everything, moving)
     if casadi.depends_on(slopes, moving):
-        return f"{part.name} is not linear where it pushes"
+        raise UnservedError(f"{part.name} is not linear where it pushes")
     others = [
         decision.symbol for place, decision in enumerate(switched.decisions) if place not in part.decisions
     ]
     if any(casadi.depends_on(everything, other) for other in others):
-        return f"{part.name} depends on what another part decides"
+        raise UnservedError(f"{part.name} depends on what another part decides")
     decided = casadi.vertcat(*symbols)
     pieces = casadi.Function("pieces", [moving, p, decided], [everything, casadi.densify(slopes)])
     x, u, m = start_values(site, parameters.tolist())

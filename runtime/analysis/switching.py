@@ -29,6 +29,7 @@ from apc.compiler.errors import ApcError
 from apc.compiler.timings import part
 from apc.frame.instance import Prepared, prepare
 from apc.result import Result
+from apc.unserved import UnservedError
 
 STABLE, CANNOT, OPEN = "stable", "cannot be", "not decided"
 
@@ -81,18 +82,20 @@ def switching(system: CompiledSystem, modes: ContactModes, *, prepared: Prepared
         reason = f"not known when {' or '.join(unknown)}" if unknown else modes.notes[0]
         return Switching(system.name, OPEN, reason)
     try:
-        text = open_loops(system, prepared or prepare(system))
-        return Switching(system.name, OPEN, text) if isinstance(text, str) else _judge(system.name, text)
+        return _judge(system.name, open_loops(system, prepared or prepare(system)))
+    except UnservedError as why:
+        return Switching(system.name, OPEN, str(why))
     except ApcError as error:
         return Switching(system.name, OPEN, error.mistakes[0].sentence)
 
 
 def _judge(topology: str, loops: Sequence[OpenLoop]) -> Switching:
     """Prove the circle criterion of all loops, or say which fails."""
-    weights = weights_of(loops)
     jumps = next((loop.jumps for loop in loops if loop.jumps), "")
-    if isinstance(weights, str):
-        return Switching(topology, OPEN, weights, jumps=jumps)
+    try:
+        weights = weights_of(loops)
+    except UnservedError as why:
+        return Switching(topology, OPEN, str(why), jumps=jumps)
     least, worst = min(((least_of(loop, weights), loop.name) for loop in loops), default=(np.inf, ""))
     reach = float("inf") if least >= 0 else float(-1 / least)
     if not reach > 1:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import resource
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,7 +20,7 @@ from typing import TypeVar
 from apc.analysis.analysis import analyze
 from apc.benchmark.speed_and_error import reason_of
 from apc.benchmark.timing import median_time, timed
-from apc.benchmark.truth import Truth, spectral_truth
+from apc.benchmark.truth import spectral_truth
 from apc.compiler.compiled import LARGEST_COUNT, CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.pipeline import stages_of
@@ -28,6 +29,7 @@ from apc.compiler.source.source import parse_source, read_source
 from apc.compiler.words import counted
 from apc.processes import Patience, local_processes, results
 from apc.result import Result
+from apc.unserved import UnservedError
 
 Found = TypeVar("Found")
 
@@ -150,14 +152,16 @@ def _measure(path: Path, count: int) -> ScaleRow:
     compiled, system = timed(partial(with_count, path, count))
     analyzed, result = median_time(partial(analyze, system), REPEATS)
     memory = _memory()
-    truth = spectral_truth(system)
+    error = None
+    with suppress(UnservedError):
+        error = spectral_truth(system).error_of(result.spectral_radius)
     return ScaleRow(
         count=count,
         peers=system.peers,
         compile_s=compiled,
         analyze_s=analyzed,
         memory=memory,
-        error=truth.error_of(result.spectral_radius) if isinstance(truth, Truth) else None,
+        error=error,
         bound=result.spectral_radius_error,
         method=result.method,
         verdict=result.verdict,

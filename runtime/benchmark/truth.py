@@ -23,6 +23,7 @@ from apc.eigen.balls import frame_balls, precision, square, unprovable
 from apc.eigen.closing import ClosedSystem, Loop, close_loop
 from apc.eigen.modes import arrange, dense_loop
 from apc.frame.parameters import resolve
+from apc.unserved import UnservedError
 
 # What is asked of a reference, relative to the largest: far beyond what floats can be wrong by.
 DIGITS = 50
@@ -57,20 +58,19 @@ class Truth:
         return float(abs(Fraction(radius) - Fraction(self.digits)))
 
 
-def spectral_truth(system: CompiledSystem) -> Truth | str:
-    """Return the truth about one frame of a scene, or why there is none.
+def spectral_truth(system: CompiledSystem) -> Truth:
+    """Return the truth about one frame of a scene.
 
     Raises
     ------
     ApcError
         As `analysis.lifted_groups`.
+    UnservedError
+        Why there is none.
     """
-    loops = _loops(system)
-    if isinstance(loops, str):
-        return loops
-    systems = [close_loop(loop) for loop in loops]
+    systems = [close_loop(loop) for loop in _loops(system)]
     if reason := next(filter(None, map(unprovable, systems)), ""):
-        return reason
+        raise UnservedError(reason)
     last = None
     for bits in PRECISIONS:
         with precision(bits):
@@ -78,26 +78,27 @@ def spectral_truth(system: CompiledSystem) -> Truth | str:
             if last is not None and _agree(last, result):
                 return Truth(str(result.str(DIGITS, radius=False)) if result > LEAST else "0")
             last = result
-    return f"not certain to {DIGITS} digits at {PRECISIONS[-1]} bits"
+    raise UnservedError(f"not certain to {DIGITS} digits at {PRECISIONS[-1]} bits")
 
 
-def _loops(system: CompiledSystem) -> Sequence[Loop] | str:
-    """Return the systems that a scene falls into, each of weights known exactly, or why too large."""
+def _loops(system: CompiledSystem) -> Sequence[Loop]:
+    """Return the systems that a scene falls into, each of weights known exactly; refuse what is too large."""
     numbers = resolve(system)
     moving = sum(
         len(rows) * len(system.kinds[group.kind].states)
         for rows, group in zip(numbers.parameters, system.groups, strict=True)
     )
     if moving > MOST_STATES:
-        return f"{moving:,} states of motion of different peers {TOO_LONG}"
+        raise UnservedError(f"{moving:,} states of motion of different peers {TOO_LONG}")
     if system.peers > MOST_STATES and any(link.graph.shape not in SPLIT for link in system.links):
-        return f"{system.peers:,} peers on a graph {TOO_LONG}"
+        raise UnservedError(f"{system.peers:,} peers on a graph {TOO_LONG}")
     groups, exchange = lifted_groups(system)
     loops = arrange(groups, exchange).loops
     if any(doubt and way not in loop.surds for loop in loops for way, doubt in loop.doubts.items()):
         loops = (dense_loop(groups, exchange),)  # the eigenvalues of its graph are floats
     if sum(loop.states**3 for loop in loops) > MOST_STATES**3:
-        return f"eigenvalues of {max(loop.states for loop in loops):,} states together {TOO_LONG}"
+        most = max(loop.states for loop in loops)
+        raise UnservedError(f"eigenvalues of {most:,} states together {TOO_LONG}")
     return loops
 
 

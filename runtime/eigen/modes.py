@@ -37,6 +37,7 @@ from apc.eigen.peers import MOST_STATES, PeerGroup, group_name, states_of, too_l
 from apc.frame.exchange import Exchange, check_mean
 from apc.frame.instance import Peers
 from apc.frame.schedule import Way
+from apc.unserved import UnservedError
 
 # The shape of modes of peers that differ.
 COUPLED = "coupled"
@@ -103,10 +104,8 @@ def arrange(groups: Sequence[PeerGroup], exchange: Exchange) -> Arrangement:
     return Arrangement("dense", parts, (f"all peers as one system: {reason}",))
 
 
-def loops_at_right_angles(
-    groups: Sequence[PeerGroup], exchange: Exchange, most: int
-) -> tuple[Loop, ...] | str:
-    """Split a scene into loops at right angles to one another, all peers alike the first, or say why not.
+def loops_at_right_angles(groups: Sequence[PeerGroup], exchange: Exchange, most: int) -> tuple[Loop, ...]:
+    """Split a scene into loops at right angles to one another, all peers alike the first.
 
     Parameters
     ----------
@@ -114,6 +113,11 @@ def loops_at_right_angles(
         As for `split`.
     most
         How many peers on a graph that isn't complete are not too many.
+
+    Raises
+    ------
+    UnservedError
+        More peers on such a graph.
     """
     graphs = {way.link for way in used_ways(group.schedule for group in groups)}
     graphs = {link for link in graphs if not exchange.is_complete(link)}
@@ -121,7 +125,9 @@ def loops_at_right_angles(
         return complete_loops(groups, exchange)
     count = sum(group.count for group in groups)
     if count > most:
-        return f"{count:,} peers on a graph that is not complete are too many: {most} are the most"
+        raise UnservedError(
+            f"{count:,} peers on a graph that is not complete are too many: {most} are the most"
+        )
     if len(groups) == 1 and all(exchange.links[link].graph.shape == "ring" for link in graphs):
         arrangement = arrange(groups, exchange)
         if arrangement.method == "modes":

@@ -12,6 +12,7 @@ Does not: say with which hand it shakes: which motion of the devices takes energ
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,6 +34,7 @@ from apc.moments.network_verdict import Growth
 from apc.network.nominal import left_out
 from apc.result import Result
 from apc.threads import load_pool, single_threaded
+from apc.unserved import UnservedError
 
 Complexes = NDArray[np.complex128]
 
@@ -159,32 +161,37 @@ def passive_hands(
         return _together(parts, replaced_hands(of_scene))
     fixed = analyze(clamped(system, option=OPTION), certify=certify)
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        loops = port_loops(system, prepared, option=OPTION)
-        modes = () if isinstance(loops, str) else tuple(_judge(loop) for loop in loops)
-        why = loops if isinstance(loops, str) else CIRCULATES if any(map(circulates, loops)) else ""
+        loops: tuple[PortLoop, ...] = ()
+        felt = ""
+        try:
+            loops = port_loops(system, prepared, option=OPTION)
+        except UnservedError as why:
+            felt = str(why)
+        modes = tuple(_judge(loop) for loop in loops)
+        never = felt or (CIRCULATES if any(map(circulates, loops)) else "")
     linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
     stable: bool | None = None
-    joined = not isinstance(loops, str) and all(loop.joined for loop in loops)
+    joined = not felt and all(loop.joined for loop in loops)
     drawn = [mode.passive is False and (joined or mode.more is None) for mode in modes]
-    if isinstance(loops, str) or fixed.stable is False or any(drawn):
+    if felt or fixed.stable is False or any(drawn):
         stable = False
     elif all(mode.passive for mode in modes) and fixed.stable:
         stable = True
     verdict = {True: STABLE, False: UNSTABLE, None: UNDECIDED}[stable]
     of = ", of the linearization" if not linear else ""
     proof = "" if stable is None else f"{PROVED}{of}"
-    if certify and fixed.stable is False and not why:
+    if certify and fixed.stable is False and not never:
         proof = f"with its devices clamped it is unstable: {fixed.proof or PROVED}{of}"
     return PassiveHands(
         topology=system.name,
-        verdict=NEVER if why else verdict,
+        verdict=NEVER if never else verdict,
         stable=stable,
         clamped_stable=fixed.stable,
         clamped_radius=fixed.spectral_radius,
         clamped_error=fixed.spectral_radius_error,
         modes=modes,
         joined=joined,
-        why=why,
+        why=never,
         proof=proof,
         linearized=not linear,
         left_out=(
@@ -281,9 +288,9 @@ def loop_growths(system: CompiledSystem, prepared: Prepared, *, bounded: bool = 
         )
         return [growth for part in parts for growth in part]
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        loops = port_loops(system, prepared, option=OPTION)
         result, scale = [(-np.inf, -np.inf, -np.inf)], 1.0
-        if not isinstance(loops, str):
+        with suppress(UnservedError):
+            loops = port_loops(system, prepared, option=OPTION)
             result = [
                 _bounds(loop)[:3] if bounded else (-np.inf if circulates(loop) else _least(loop)[0],) * 3
                 for loop in loops

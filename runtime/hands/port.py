@@ -42,6 +42,7 @@ from apc.frame.ports import Ports, with_holds, with_ports
 from apc.frame.radius import RADII, UNIT, radius_of, solve, value_of, with_radius
 from apc.frame.schedule import Act, Propagate, Schedule, Send, Tick
 from apc.frame.site import LinearSite
+from apc.unserved import UnservedError
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
@@ -97,8 +98,8 @@ class PortLoop:
     frame_s: float
 
 
-def port_loops(system: CompiledSystem, prepared: Prepared, *, option: str) -> tuple[PortLoop, ...] | str:
-    """Return the modes of a scene in which hands move all devices; or why no device is ever passive.
+def port_loops(system: CompiledSystem, prepared: Prepared, *, option: str) -> tuple[PortLoop, ...]:
+    """Return the modes of a scene in which hands move all devices.
 
     Parameters
     ----------
@@ -112,6 +113,8 @@ def port_loops(system: CompiledSystem, prepared: Prepared, *, option: str) -> tu
     ApcError
         E931 no device, or none that can be cut out; E933 too many intervals or states, or a motion that
         nothing holds back.
+    UnservedError
+        Why no device is ever passive.
     """
     groups, exchange = lifted_groups(system, prepared=prepared)
     place, unit_of = (
@@ -136,9 +139,8 @@ def port_loops(system: CompiledSystem, prepared: Prepared, *, option: str) -> tu
             continue
         if isinstance(device, str):
             raise ApcError(Mistake("E931", place, f"{option}: {device}"))
-        felt = _felt_velocity(group, device, heard)
-        if felt:
-            return felt
+        if felt := _felt_velocity(group, device, heard):
+            raise UnservedError(felt)
         if touch := _other_touch(group, device):
             why, hint = touch
             raise ApcError(Mistake("E933", place, f"{option}: {why}", hint=hint))

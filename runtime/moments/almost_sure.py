@@ -25,8 +25,8 @@ from apc.compiler.compiled import CompiledSystem
 from apc.frame.instance import Prepared
 from apc.moments.crowd import build_hearing
 from apc.moments.frames import channels_of, held_frame, refuse_unheld
-from apc.moments.unserved import UnservedError
 from apc.network.channel import ChannelLaw
+from apc.unserved import UnservedError
 
 # States of all peers and their channels in one matrix: ten equal peers of the paper's.
 MOST_STATES = 180

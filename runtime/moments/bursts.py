@@ -31,8 +31,8 @@ from numpy.typing import NDArray
 from apc.eigen.relative import relative_rows
 from apc.moments.copies_apart import Peer, largest_error
 from apc.moments.frames import Arc, Arcs, LossyFrame
-from apc.moments.unserved import UnservedError
 from apc.threads import load_pool
+from apc.unserved import UnservedError
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.intp]

@@ -36,7 +36,7 @@ from apc.moments.crowd import build_hearing
 from apc.moments.frames import refuse_unheld
 from apc.moments.small_gain import MOST_STATES, change_of_sent, felt_rows, ratios_of, weight_of
 from apc.moments.traces import Packets, trace_radius
-from apc.moments.unserved import UnservedError
+from apc.unserved import UnservedError
 
 # What a link whose packets come late is like: the newest that has arrived is heard, until there is another.
 HOLDING = Channel(None, None, "uniform", "newest", "hold", None)
@@ -81,8 +81,6 @@ def loop_gain(system: CompiledSystem, delay: Free, low: Fraction, high: Fraction
     hearing = build_hearing(changing, prepare(changing))
     refuse_unheld(changing, hearing)
     loops = loops_at_right_angles(hearing.groups, hearing.exchange, MOST_STATES)
-    if isinstance(loops, str):
-        raise UnservedError(loops)
     packets = Packets(changing, hearing)
     lossy = frozenset(link.name for link in links if link.channel is not None)
     ratios, (weight, sizes) = ratios_of(loops[0].sites, lossy), weight_of(loops, lossy)

@@ -31,7 +31,7 @@ from apc.frame.ports import with_holds, with_ports
 from apc.frame.site import LinearSite
 from apc.moments.crowd import Hearing, Moments, instants
 from apc.moments.operator import settled
-from apc.moments.unserved import UnservedError
+from apc.unserved import UnservedError
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]

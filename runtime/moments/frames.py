@@ -32,8 +32,8 @@ from apc.frame.radius import value_of
 from apc.moments.crowd import Hearing, remembered_of, standing_motions
 from apc.moments.mean_loops import Listened, mean_loop, standing_state
 from apc.moments.stand_in import receivers_of
-from apc.moments.unserved import UnservedError
 from apc.network.channel import ChannelLaw, channel_law
+from apc.unserved import UnservedError
 
 Floats = NDArray[np.float64]
 

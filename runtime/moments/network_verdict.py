@@ -28,12 +28,12 @@ from apc.moments.operator import enclosed
 from apc.moments.packet_memory import is_memoryless
 from apc.moments.stand_in import stand_in
 from apc.moments.traces import trace_radius
-from apc.moments.unserved import UnservedError
 from apc.moments.worst import LossesInARow, worst_case
 from apc.network.channel import LATEST, ChannelLaw
 from apc.network.nominal import unreliable
 from apc.result import Result
 from apc.threads import single_threaded
+from apc.unserved import UnservedError
 
 STABLE = "stable in mean square"
 UNSTABLE = "unstable in mean square"

@@ -29,7 +29,7 @@ from apc.eigen.relative import Relative, relative, relative_coordinates, relativ
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.radius import RADII, UNIT, value_of
 from apc.frame.schedule import Heard, Way
-from apc.moments.unserved import UnservedError
+from apc.unserved import UnservedError
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]

@@ -44,8 +44,8 @@ from apc.moments.crowd import (
 )
 from apc.moments.mean_loops import Remembered, Site, standing_state, with_memory
 from apc.moments.operator import Block, Operator, mean_of, number_of
-from apc.moments.unserved import UnservedError
 from apc.network.channel import ChannelLaw, channel_law
+from apc.unserved import UnservedError
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]

@@ -33,8 +33,8 @@ from apc.frame.instance import Prepared
 from apc.frame.radius import RADII, radius_of, value_of, with_radius
 from apc.frame.schedule import Heard, Selected, Sent
 from apc.moments.crowd import Hearing, build_hearing, instants
-from apc.moments.unserved import UnservedError
 from apc.network.timetable import instant_of
+from apc.unserved import UnservedError
 
 Floats = NDArray[np.float64]
 Balls = NDArray[Any]  # of numbers with their radii

@@ -49,7 +49,7 @@ from apc.moments.small_gain import (
     weight_of,
 )
 from apc.moments.traces import Packets
-from apc.moments.unserved import UnservedError
+from apc.unserved import UnservedError
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
@@ -158,8 +158,6 @@ def _modes(system: CompiledSystem, prepared: Prepared) -> tuple[list[Mode], floa
     hearing = build_hearing(system, prepared)
     refuse_unheld(system, hearing)
     loops = loops_at_right_angles(hearing.groups, hearing.exchange, MOST_STATES)
-    if isinstance(loops, str):
-        raise UnservedError(loops)
     lossy = frozenset(link.name for link in system.links if link.channel is not None)
     packets = Packets(system, hearing)
     numbers = {row: packets.heard(row)[0] for row in packets.rows}

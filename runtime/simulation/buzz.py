@@ -33,6 +33,7 @@ from apc.frame.instance import Prepared, prepare
 from apc.frame.parameters import resolve
 from apc.result import Result
 from apc.simulation.trajectory import Trajectory, simulate
+from apc.unserved import UnservedError
 
 Floats = NDArray[np.float64]
 
@@ -139,9 +140,10 @@ def buzz(system: CompiledSystem, *, prepared: Prepared | None = None) -> Buzz:
     ApcError
         E864 no contact that pushes from tick to tick and never pulls; and those of `trajectory.simulate`.
     """
-    groups = contact_groups(system, prepared or prepare(system))
-    if isinstance(groups, str):
-        raise _refused(system, groups)
+    try:
+        groups = contact_groups(system, prepared or prepare(system))
+    except UnservedError as why:
+        raise _refused(system, str(why)) from None
     if not any(pushes for _, pushes in groups):
         raise _refused(system, "nothing touches")
     for _, pushes in groups:
@@ -149,11 +151,15 @@ def buzz(system: CompiledSystem, *, prepared: Prepared | None = None) -> Buzz:
             if not push.one_sided:
                 raise _refused(system, f"{push.part} pulls, too, or is limited")
     measured = _contacts(system, groups)
-    predicted = predict(system, groups)
+    predicted, reason = None, ""
+    try:
+        predicted = predict(system, groups)
+    except UnservedError as why:
+        reason = str(why)
     seconds = _seconds(system)
     names = [item.name for item in measured] + [state for item in measured for state in item.states]
     played = simulate(system, duration=seconds, signals=tuple(dict.fromkeys(names)))
-    result = _compare(system.name, predicted, played, measured)
+    result = _compare(system.name, predicted, reason, played, measured)
     if all(link.channel is None for link in system.links):
         return result
     return replace(result, notes=(*result.notes, BY_CHANCE))
@@ -203,10 +209,13 @@ def _contacts(
 
 
 def _compare(
-    topology: str, predicted: Predicted | str, played: Trajectory, measured: Sequence[_Measured]
+    topology: str,
+    predicted: Predicted | None,
+    reason: str,
+    played: Trajectory,
+    measured: Sequence[_Measured],
 ) -> Buzz:
-    """Lay what is predicted beside what was played."""
-    known = predicted if isinstance(predicted, Predicted) else None
+    """Lay what is predicted, or why nothing is, beside what was played."""
     first = len(played.time) - len(played.time) // MEASURED
     bounded = not played.summary.stopped
     time = played.time[first:]
@@ -224,7 +233,7 @@ def _compare(
             load_n=load,
             depth_m=float(np.ptp(depth)),
             in_contact=float((push > 0).mean()),
-            predicted_depth_m=known.peak_to_peak * load / item.stiffness if known else None,
+            predicted_depth_m=predicted.peak_to_peak * load / item.stiffness if predicted else None,
         )
         for item, load, depth, push in zip(measured, loads, depths, pushes, strict=True)
     )
@@ -234,14 +243,13 @@ def _compare(
     quiet = float(np.ptp(swing)) <= QUIET * size
     steady = bounded and (quiet or abs(halves[1] - halves[0]) <= SETTLED * max(halves))
     lines = _lines(time, swing) if steady and not quiet else ()
-    reason = "" if known else str(predicted)
     if bounded and max(contact.in_contact for contact in contacts) < TOUCHED:
         lines, steady = (), False
         notes: tuple[str, ...] = (LET_GO,)
     else:
-        notes = tuple(_notes(known, bounded=bounded, steady=steady, lines=lines))
+        notes = tuple(_notes(predicted, bounded=bounded, steady=steady, lines=lines))
     end = float(played.time[-1])
-    return Buzz(topology, known, reason, end, bounded, steady, lines, contacts, notes)
+    return Buzz(topology, predicted, reason, end, bounded, steady, lines, contacts, notes)
 
 
 def _notes(predicted: Predicted | None, *, bounded: bool, steady: bool, lines: Sequence[Line]) -> list[str]:

@@ -19,7 +19,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.instance import prepare
 from apc.frame.names import Free, Range
 from apc.moments.changing_delay import loop_gain, unstable_delays
-from apc.moments.unserved import UnservedError
+from apc.unserved import UnservedError
 from apc.vary.delays import delay_pieces, system_with_delay
 
 PLACE = Place("box")

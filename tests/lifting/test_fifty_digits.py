@@ -33,7 +33,6 @@ def _radius(scene: Scene, rigid: int) -> flint.arb:
 def test_what_bench_compares_with_is_the_truth_of_the_independent_engine(name: str) -> None:
     system = compile_topology(SCENES / f"{name}.yaml")
     found = of_balls(system)
-    assert not isinstance(found, str), found
     assert found.digits[:45] == _truth(system).digits[:45]
 
 

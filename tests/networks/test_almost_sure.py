@@ -9,7 +9,7 @@ import pytest
 
 from apc.frame.instance import prepare
 from apc.moments.almost_sure import AlmostSure, almost_sure
-from apc.moments.unserved import UnservedError
+from apc.unserved import UnservedError
 from tests.held_scenes import scene, system_of
 from tests.networks.test_loss import judged
 
