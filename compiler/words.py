@@ -104,7 +104,7 @@ def with_unit(number: str, unit: str) -> str:
 
 def in_hertz(frequency: float) -> str:
     """Return a frequency to four digits with its unit, `–` for one that can't be told (NaN)."""
-    return f"{frequency:.4g} Hz" if frequency == frequency else "–"
+    return "–" if math.isnan(frequency) else f"{frequency:.4g} Hz"
 
 
 def wrapped(text: str, first: str = "", later: str = "") -> list[str]:

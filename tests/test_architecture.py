@@ -63,6 +63,8 @@ def read(path: Path) -> Module:
             method, name = getattr(node.func, "attr", ""), getattr(node.func, "id", "")
             # `re.compile` and `apc.compile` are no Python `compile`.
             module.calls.append("" if name in defined or method == "compile" else method or name)
+        elif isinstance(node, ast.Compare):  # as of a comprehension that hides the variable meant
+            assert ast.dump(node.left) != ast.dump(node.comparators[0]), f"{path}:{node.lineno}"
         elif isinstance(node, ast.ClassDef) and "Result" in map(ast.unparse, node.bases):
             module.results.append(node.name)
     return module

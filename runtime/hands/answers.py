@@ -295,18 +295,18 @@ class Responses:
     @property
     def error(self) -> Weights:
         """How far the pushed peer's copy is from the mean of all others' of its name; nothing if none."""
-        copy = self.copies[self.own]
+        pushed = self.copies[self.own]
         others = {
             (place, copy[1]): self.members[place] - (place == self.own)
             for place, copy in enumerate(self.copies)
-            if copy and copy and copy[0] == copy[0]
+            if pushed and copy and copy[0] == pushed[0]
         }
         total = sum(others.values())
-        if copy is None or not total:
+        if pushed is None or not total:
             return {}, {}
         common = {place: (place[0] == self.own) - many / total for place, many in others.items()}
         return {place: weight for place, weight in common.items() if abs(weight) > UNIT}, {
-            (0, copy[1]): 1 + 1 / total
+            (0, pushed[1]): 1 + 1 / total
         }
 
 

@@ -249,6 +249,21 @@ def test_in_a_plane_a_hand_feels_along_each_axis_what_it_feels_on_a_line() -> No
             np.testing.assert_allclose(getattr(found, name), getattr(line, name), rtol=1e-9, atol=1e-12)
 
 
+def test_copies_of_another_object_are_none_of_those_that_a_copy_differs_from() -> None:
+    """Two pairs that nothing couples: each feels what it feels without the other."""
+    text = replaced(users(2, 300), (", shared: true", ""))
+    own = re.sub(r"(  (?:cube|contact|coordination):) *{", r"\1 {at: [user], ", text)
+    parts = "".join(line for line in own.splitlines(keepends=True) if "at: [user]" in line)
+    more = re.sub(r"cube|contact|coordination|lan\b", r"\g<0>_b", parts.replace("[user]", "[b]"))
+    both = replaced(own, ("{count: 2}", "{count: 2}\n  b: {count: 2}"))
+    for pair in zip(parts.splitlines(), more.splitlines(), strict=True):
+        both = replaced(both, (pair[0], "\n".join(pair)))
+    both = replaced(both, ("links:", "links:\n  lan_b: {clock: network, delay: 8 ms}"))
+    apart, together = (feel(compiled(item), [1.0, 10.0], beside=("h2",)) for item in (text, both))
+    np.testing.assert_allclose(together.error_per_force, apart.error_per_force, rtol=1e-9)
+    assert [item.error_m for item in together.h2] == pytest.approx([item.error_m for item in apart.h2])
+
+
 @pytest.mark.whole
 def test_the_command_line_says_what_python_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

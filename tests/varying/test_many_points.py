@@ -41,10 +41,8 @@ def as_alone(system: CompiledSystem, given: Mapping[str, Any], points: Any = Non
             assert found.verdict.ravel()[point] == f"error: {error.mistakes[0].code}"
             assert found.message.ravel()[point] == error.mistakes[0].sentence
             continue
-        assert (found.verdict.ravel()[point], found.rigid_modes.ravel()[point]) == (
-            one.verdict,
-            one.rigid_modes,
-        )
+        said = found.verdict.ravel()[point], found.rigid_modes.ravel()[point]
+        assert said == (one.verdict, one.rigid_modes)
         assert abs(radii[point] - one.spectral_radius) <= errors[point] + one.spectral_radius_error
         # A defective cluster, split by itself alone, costs a stack more.
         assert errors[point] <= 8 * one.spectral_radius_error + 1e-15

@@ -58,10 +58,6 @@ SCENE = {
 }
 
 
-def shipped(name: str) -> CompiledSystem:
-    return apc.compile(SCENES / f"{name}.yaml")
-
-
 def rates(found: Sensitivities) -> dict[str, float | None]:
     return {row.parameter: row.derivative for row in found.rows}
 
@@ -114,7 +110,7 @@ def changed(system: CompiledSystem, every: int) -> str:
 @pytest.mark.parametrize("every", [3, 1])
 @pytest.mark.parametrize("name", NAMES)
 def test_a_row_says_what_setting_its_name_does(name: str, every: int) -> None:
-    assert changed(shipped(name), every) == ""
+    assert changed(apc.compile(SCENES / f"{name}.yaml"), every) == ""
 
 
 def test_where_the_radius_is_large_it_is_differentiated_all_the_same() -> None:
@@ -147,7 +143,7 @@ def test_equal_groups_have_an_active_set_and_no_single_gradient() -> None:
 
 def test_a_damping_of_nothing_has_the_derivative_of_what_it_adds_up_with() -> None:
     """A finger's tip and the device it holds move as one: their dampings act as their sum, at 0 too."""
-    found = {row.parameter: row for row in apc.sensitivities(shipped("finger")).rows}
+    found = {row.parameter: row for row in apc.sensitivities(apc.compile(SCENES / "finger.yaml")).rows}
     nothing, whole = found["finger.tip.damping"], found["device.damping"]
     assert nothing.value == 0 and nothing.derivative == pytest.approx(whole.derivative, rel=1e-7)
 
