@@ -90,11 +90,11 @@ def eigenpairs(matrix: Matrix) -> Eigenpairs:
             raise np.linalg.LinAlgError("eigenvalues did not converge")
         values[place] = parts[0] if len(parts) == 1 else parts[0] + 1j * parts[1]
     if not np.iscomplexobj(matrix):
-        first, second = (side[..., None, :] for side in (values.imag > 0, values.imag < 0))
+        *where, first = np.nonzero(values.imag > 0)
+        upper, lower = (*where, slice(None), first), (*where, slice(None), first + 1)
         for vectors in (left, right):
-            after, before = np.roll(vectors, -1, axis=-1), np.roll(vectors, 1, axis=-1)
-            vectors += 1j * np.where(first, after, 0)
-            vectors[...] = np.where(second, before - 1j * vectors, vectors)
+            real, imaginary = vectors[upper], vectors[lower]
+            vectors[upper], vectors[lower] = real + 1j * imaginary, real - 1j * imaginary
     return Eigenpairs(values, right, left.conj().swapaxes(-1, -2))
 
 
