@@ -13,6 +13,8 @@ import click
 from click.core import ParameterSource
 
 from apc.cli.options import WholeNumber, command, note_aside, option, print_result, result_option
+from apc.cli.progress import at_work
+from apc.compiler.words import counted
 
 # The options that --frequencies takes the place of, by parameter.
 _SPANNED = {"low": "--from", "high": "--to", "points": "--points"}
@@ -68,13 +70,14 @@ def feel_command(
     if nyquist and (out is None or out.suffix.lower() not in FORMATS):
         raise click.UsageError(f"--nyquist is for a picture: --out with {', '.join(FORMATS)}")
     system = open_scene(file, settings, {"--out": out}, notify=note_aside)
-    result = feel(
-        system,
-        read_frequencies(system, frequencies, low, high, points),
-        at=at or first if colon else at,
-        between=second if colon else between,
-        unstable=unstable,
-    )
+    with at_work(f"what hands feel of {counted(system.peers, 'peer')}"):
+        result = feel(
+            system,
+            read_frequencies(system, frequencies, low, high, points),
+            at=at or first if colon else at,
+            between=second if colon else between,
+            unstable=unstable,
+        )
     if out is not None:
         write_result(out, result, lambda: result.plot(kind="nyquist" if nyquist else "bode"))
     print_result(result, as_json=as_json, written=[out])
