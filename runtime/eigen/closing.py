@@ -114,10 +114,10 @@ def lay_out(z_names: Sequence[Sequence[str]], schedules: Sequence[Schedule]) -> 
     for site, (z_name, schedule) in enumerate(zip(z_names, schedules, strict=True)):
         offsets.append(len(names))
         names += z_name
+        over, under = (schedule.quantum * 1000).as_integer_ratio()  # there are thousands of packets
         for row, depth in enumerate(schedule.depths):
             for lag in range(1, depth + 1):
-                quanta = schedule.sent_times[row] - lag * schedule.frame
-                when = float(quanta * schedule.quantum * 1000)
+                when = (schedule.sent_times[row] - lag * schedule.frame) * over / under
                 places[Packet(site, row, lag)] = len(names)
                 names.append(f"{schedule.sent_names[row]}({when:.6g} ms)")
     return StateLayout(tuple(offsets), tuple(names), places)
