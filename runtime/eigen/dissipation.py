@@ -29,8 +29,9 @@ Matrix = NDArray[Any]
 # Levels tried on the way to the extreme: each step squares the distance, so some four are needed.
 LEVELS = 40
 
-# Eigenvalues nearest to the circle, at whose angles a response is looked at first: it is large there.
-FIRST = 8
+# Angles at which a response is looked at first: so many evenly, those of so many eigenvalues nearest to the
+# circle, and on either side of these by what they lie within it, where their share is half real.
+EVENLY, NEAREST = 17, 8
 
 # How far above what is known a level is tried, relatively, and how near the axis, relatively, an eigenvalue
 # may be on it: two that meet there are off by the square root of their rounding.
@@ -139,8 +140,9 @@ def _lowest(
     scale = max(float(np.abs(d_c + weight).max()), abs(still), abs(fastest))
 
     best, where = -float(np.finfo(np.float64).max), 0.0
-    first = values[np.argsort(-np.abs(values))[:FIRST]]
-    angles = np.concatenate([[0.0, np.pi], np.abs(np.angle(-first if turn else first))])
+    first = values[np.argsort(-np.abs(values))[:NEAREST]]
+    at, apart = np.abs(np.angle(-first if turn else first)), 1 - np.abs(first)
+    angles = np.clip(np.concatenate([np.linspace(0, np.pi, EVENLY), at, at - apart, at + apart]), 0, np.pi)
     for _ in range(LEVELS):
         depths = -least(*turned, angles)
         place = int(np.argmax(depths))
