@@ -262,14 +262,7 @@ def _one_frame(
                         stiffness = number(scene.pairs[i, j])
                         owned += weight / share * (stiffness * x_o + p["bt"] * v_o)
                         others -= weight / share * (stiffness * one[1] + p["bt"] * one[2])
-                forces[i].append(
-                    (
-                        now,
-                        p["kc"] * (x - x_o) + p["bc"] * (v - v_o),
-                        owned,
-                        others,
-                    )
-                )
+                forces[i].append((now, p["kc"] * (x - x_o) + p["bc"] * (v - v_o), owned, others))
         duration = Fraction(following - now, per_second)
         for i in range(scene.peers):
             p = value[i]

@@ -61,7 +61,7 @@ def tuning_text(tuning: Tuning) -> Lines:
     if tuning.met or tuning.proofs:
         yield ""
     value = uncertain(tuning.best, tuning.error, tuning.unit)
-    if _is_felt(tuning):  # found without knowing how far any better one may be
+    if _is_felt(tuning) or math.isinf(tuning.error):  # nobody knows how far any better one may be
         value = quantity(tuning.best, tuning.unit, BUYS + 1)
     better = f"no gains in these ranges do better by {100 * float(SHARE):.3g} %"
     yield from labelled(
@@ -148,7 +148,7 @@ def _where(binding: Binding) -> str:
 def _binding_lines(tuning: Tuning, binding: Binding) -> Lines:
     other = "what is felt" if tuning.felt else tuning.aim if _is_felt(tuning) else "stability"
     mode = f"{binding.shape} mode" if binding.shape else "" if math.isnan(binding.frequency_hz) else other
-    mode += f" at {in_hertz(binding.frequency_hz)}" if mode else ""
+    mode += f" at {in_hertz(binding.frequency_hz)}" if mode and not math.isnan(binding.frequency_hz) else ""
     yield from wrapped(": ".join(filter(None, [_where(binding), mode])) or other, "    ", "      ")
     for label, value, unit, better in (
         binding.buys if tuning.met and tuning.aim not in (RADIUS, SETTLING) else ()

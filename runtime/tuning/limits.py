@@ -327,7 +327,11 @@ class Limits:
             moved = np.vstack([point, point + STEP * inwards])
             if isinstance(family, RadiusEvaluator):
                 distinct, which = np.unique(self._numbers(moved), axis=0, return_inverse=True)
-                roots = np.array([family.parts(item) for item in distinct.tolist()])[which.reshape(-1)]
+                parted = [family.parts(item) for item in distinct.tolist()]
+                # Where no loops are told apart, the one number stands for each.
+                most = max(map(len, parted))
+                alike = [each if len(each) == most else [max(each)] * most for each in parted]
+                roots = np.array(alike)[which.reshape(-1)]
                 grown = np.nan_to_num(np.log(np.maximum(roots, TINY)), nan=BEYOND) - self.allowed
                 parts.append((*_differences(grown, inwards), math.nan, place))
             else:

@@ -45,6 +45,13 @@ SHORTER, NEAREST = 0.25, 1e-3
 # Steps of a descent at most.
 STEPS = 200
 
+# A limit that rises by more than this, over a whole range, as a gain leaves the end of it, has no slope
+# there: a velocity is sampled from then on, say. Such a gain stays where it is.
+JUMPS = 1e5
+
+# What of an aim's slope, of 1, no limits balance where a descent has ended on its way.
+ASTRAY = 0.5
+
 # More than any aim is worth.
 HUGE = 1e9
 
@@ -62,8 +69,9 @@ BINDS, OPEN = 1e-6, 1e-8
 class Optimum:
     """The best gains (m,) found in some scenarios: the `value` of the aim, right to `error`, what limits it.
 
-    `worst` is the largest limit, above 0 where no gains meet them all. `multipliers` (n,) of `rows` say how
-    much of the aim each costs, per unit of ln |λ|; `looked` points were looked at.
+    The error is infinite where a descent ended on its way. `worst` is the largest limit, above 0 where no
+    gains meet them all. `multipliers` (n,) of `rows` say how much of the aim each costs, per unit of ln |λ|;
+    `looked` points were looked at.
     """
 
     scenarios: tuple[Scenario, ...]
@@ -219,6 +227,9 @@ class Search:
         known: dict[bytes, Rows] = {}
         rows_of = self._remembered(known)
         size, spare = len(start), self.column is None
+        at_end = (start == self._ends[0]) | (start == self._ends[1])
+        rises = (rows_of(start).slopes * np.where(start > self._ends[0], -1, 1)).max(axis=0)
+        held = at_end & (rises > JUMPS)
         here = np.append(start, rows_of(start).values.max()) if spare else start
         aim = np.zeros(len(here))
         aim[-1 if spare else self.column] = 1.0 if spare else -self.sign
@@ -227,13 +238,14 @@ class Search:
             return np.asarray((z[-1] if spare else 0.0) - rows_of(z[:size]).values)
 
         def moves(z: Floats) -> Floats:
-            slopes = -rows_of(z[:size]).slopes
+            slopes = np.where(held, 0.0, -rows_of(z[:size]).slopes)
             return np.column_stack([slopes, np.ones(len(slopes))]) if spare else slopes
 
         best, reach = self._optimum(start, rows_of(start)), 1.0
         try:
             while reach > NEAREST:
-                near = np.clip([here[:size] - reach, here[:size] + reach], *self._ends).T.tolist()
+                near = np.clip([here[:size] - reach, here[:size] + reach], *self._ends)
+                near = np.where(held, start, near).T.tolist()
                 ended = optimize.minimize(
                     lambda z: float(aim @ z),
                     here,
@@ -287,11 +299,12 @@ class Search:
             aim = aim[inner]
         near = np.flatnonzero(rows.values >= level - BINDS * 100)
         slopes = np.hstack([rows.slopes[:, inner], weights])[near].T
-        multipliers = np.zeros(len(rows.values))
+        multipliers, free = np.zeros(len(rows.values)), float(np.linalg.norm(aim))
         if slopes.size:
-            multipliers[near] = load_pool("scipy.optimize").nnls(slopes, aim)[0]
+            multipliers[near], free = load_pool("scipy.optimize").nnls(slopes, aim)
         # What limits that don't quite bind leave open.
         error = max(scale * float(multipliers @ np.abs(rows.values - level)), LEAST * abs(value))
+        error = error if free < ASTRAY else np.inf
         if self.limits.slow and self.column is not None:
             error = max(error, 10 * self._near * scale)
         return Optimum(tuple(self.scenarios), self.gains(shares), value, error, worst, rows, multipliers, 0)

@@ -130,10 +130,10 @@ class Tuning(Result):
     """The best gains, what was proved of them, and what binds.
 
     `value` is that of the aim with the gains as they are typed, `best` before they were rounded, right to
-    `error`; both are a spectral radius where that is the aim. `met` says whether any gains meet all demands
-    in floats; `proved` whether all was proved of these. `worst` is the largest limit (see `limits`), as how
-    much faster than allowed the fastest motion grows in a frame, ln |λ| less the `allowed`, below 0 if all
-    are met. `decay` is a factor a second.
+    `error` (infinite where nothing says); both are a spectral radius where that is the aim. `met` says
+    whether any gains meet all demands in floats; `proved` whether all was proved of these. `worst` is the
+    largest limit (see `limits`), as how much faster than allowed the fastest motion grows in a frame,
+    ln |λ| less the `allowed`, below 0 if all are met. `decay` is a factor a second.
     `scenes` are those of `binding`, or one if nothing binds. `looked` points were looked at.
     `bounded` is in how many cells it is proved that no gains of these ranges do better by `bound.SHARE`, None
     where it is not.

@@ -28,14 +28,7 @@ from apc.frame.overrides import Override, apply
 from apc.vary.sensitivity import Sensitivities, sensitivities
 from tests.bench.shapes import PARTS, draw_shape
 from tests.fifty_digits.events import Happening, build_peers, refusal
-from tests.fifty_digits.truth import (
-    RIGID,
-    _common_whom,
-    _difference_whom,
-    _from_state,
-    _to_state,
-    classes_of,
-)
+from tests.fifty_digits.truth import RIGID, _common_whom, _difference_whom, _from_state, _to_state, classes_of
 from tests.topologies import compiled
 
 BITS = 320

@@ -22,16 +22,7 @@ from apc.eigen.balls import precision, rational_ball
 from apc.frame.exchange import arcs
 from apc.frame.parameters import resolve
 from apc.simulation.simulation import ROW
-from tests.fifty_digits.events import (
-    Happening,
-    Number,
-    Peer,
-    Play,
-    Whom,
-    build_peers,
-    refusal,
-    ticks_between,
-)
+from tests.fifty_digits.events import Happening, Number, Peer, Play, Whom, build_peers, refusal, ticks_between
 
 # What is asked of a reference, relative to the largest: far beyond what floats can be wrong by.
 DIGITS = 50

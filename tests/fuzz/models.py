@@ -323,11 +323,7 @@ class Forgery:
 
 
 FORGERIES = {
-    "models": Forgery(
-        _forge_model,
-        lambda: ask(Path(FILE)),
-        _whole_models,
-    ),
+    "models": Forgery(_forge_model, lambda: ask(Path(FILE)), _whole_models),
     "recordings": Forgery(_forge_recording, _ask_recording, lambda: [_forge_recording("")]),
     "parts": Forgery(_forge_part, _ask_part, lambda: [_forge_part("")]),
 }

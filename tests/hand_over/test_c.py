@@ -65,10 +65,7 @@ def test_its_forces_are_those_of_simulate_to_the_last_bits(name: str, tmp_path: 
 
 
 @pytest.mark.whole
-@pytest.mark.parametrize(
-    "scene",
-    ["planar-users", "two-users-waves", "two-users-passivity", "client-server"],
-)
+@pytest.mark.parametrize("scene", ["planar-users", "two-users-waves", "two-users-passivity", "client-server"])
 def test_so_are_those_of_other_couplers(scene: str, tmp_path: Path) -> None:
     text = (SCENES / f"{scene}.yaml").read_text(encoding="utf-8").partition("\n")[2]
     device = "none" if scene == "client-server" else None

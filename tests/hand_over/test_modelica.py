@@ -23,8 +23,7 @@ needs_rumoca = pytest.mark.skipif(
 )
 
 APART = replaced(
-    AVERAGE,
-    ("{count: 3}", "{count: 3, set: {device.x: [3 mm, -1 mm, 0.5 mm], cube.x: [2 mm, -1 mm, 0 mm]}}"),
+    AVERAGE, ("{count: 3}", "{count: 3, set: {device.x: [3 mm, -1 mm, 0.5 mm], cube.x: [2 mm, -1 mm, 0 mm]}}")
 )
 # Nothing about its times is even: what is heard when, what acts when, from which instant clocks tick.
 TIMES = {
@@ -173,10 +172,7 @@ MEET = replaced(
         (LOSSY, r"E955 not in Modelica: packet loss \(2 %\) of lan"),
         (replaced(AVERAGE, ("8 ms}", "8 ms, jitter: 1 ms}")), r"E955 not in Modelica: jitter of lan"),
         (MEET, r"E955 not in Modelica: lan without delay to haptic: their ticks meet"),
-        (
-            replaced(AVERAGE, ("count: 3", "count: 1000")),
-            r"E955 .*: 1,000 peers, who hear 999,000",
-        ),
+        (replaced(AVERAGE, ("count: 3", "count: 1000")), r"E955 .*: 1,000 peers, who hear 999,000"),
         (
             replaced(AVERAGE, ("delay: 8 ms}", "delay: 0.0000000000123 s}")),
             r"E955 .*: a clock that counts to",

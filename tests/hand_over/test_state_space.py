@@ -222,10 +222,7 @@ def test_a_scenes_words_are_never_read_as_python(tmp_path: Path) -> None:
         (["--out", "x.npz", "--free", "lan.delay"], "--free: E954 lan.delay is a time"),
         (["--out", "x.npz", "--free", "device.mas"], "--free: E622 device.mas is no parameter"),
         (["--out", "x.npz", "--free", "device.mass", "--free", "device.mass"], "--free: E954 device.mass is"),
-        (
-            ["--out", "x.py", "--free", "device.mass"],
-            "--free: E953 --free means nothing to the format",
-        ),
+        (["--out", "x.py", "--free", "device.mass"], "--free: E953 --free means nothing to the format"),
         (["--out", "no/x.mat"], "no/x.mat: E601 can't be written"),
         (["--out", "scene.yaml", "--to", "npz"], "scene.yaml: E878"),
     ],

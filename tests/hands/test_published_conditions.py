@@ -70,10 +70,7 @@ def curve(words: str, *axes: tuple[str, float, float]) -> np.ndarray:
     ],
 )
 def test_a_curve_is_its_line_from_border_to_border(
-    words: str,
-    x: tuple[str, float, float],
-    y: tuple[str, float, float],
-    ends: list[tuple[float, float]],
+    words: str, x: tuple[str, float, float], y: tuple[str, float, float], ends: list[tuple[float, float]]
 ) -> None:
     found = curve(words, x, y)
     assert found[[0, -1]].tolist() == [pytest.approx(end) for end in ends]

@@ -14,14 +14,7 @@ from typing import Any
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.pipeline import compile_topology
 from apc.eigen.balls import precision
-from tests.fifty_digits.truth import (
-    RIGID,
-    Truth,
-    classes_of,
-    eigenvalues,
-    frame_matrices,
-    spectral_truth,
-)
+from tests.fifty_digits.truth import RIGID, Truth, classes_of, eigenvalues, frame_matrices, spectral_truth
 
 HERE = Path(__file__).resolve().parent
 TRUTHS = HERE / "truths.json"

@@ -22,8 +22,7 @@ EXACT = 1e-13  # a few roundings
 
 
 @pytest.mark.parametrize(
-    ("count", "more", "radius"),
-    [(1, "", math.exp(-3 / 2)), (4, ", shared: true", math.exp(-3 / (2 / 4)))],
+    ("count", "more", "radius"), [(1, "", math.exp(-3 / 2)), (4, ", shared: true", math.exp(-3 / (2 / 4)))]
 )
 def test_mass_coasts_to_rest_as_an_exponential(count: int, more: str, radius: float) -> None:
     """v falls to exp(−b T/m) in T = 1 s; a shared mass is divided among its copies, its damping is not."""

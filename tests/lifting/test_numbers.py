@@ -14,11 +14,7 @@ from apc.__main__ import run
 from apc.compiler.compiled import CompiledSystem, counts_peers
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
-from apc.frame.names import (
-    Free,
-    find,
-    is_named,
-)
+from apc.frame.names import Free, find, is_named
 from apc.frame.overrides import Override, apply, parse_override
 from apc.frame.parameters import resolve
 from apc.vary.many import analyze_many

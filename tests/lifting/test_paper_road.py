@@ -33,10 +33,7 @@ def test_rows_and_columns_are_named() -> None:
         *(f"user[{i}].{part}" for i in (1, 2, 3) for part in ("contact.f", "coordination.f own")),
         *(f"user[{i}].coordination.f received" for i in (1, 2, 3)),
     )
-    assert route.c.rows[-2:] == (
-        "user[3].mean(others.coordination.x)",
-        "user[3].mean(others.coordination.v)",
-    )
+    assert route.c.rows[-2:] == ("user[3].mean(others.coordination.x)", "user[3].mean(others.coordination.v)")
     assert (route.a_d.rows[0], route.a_d.rows[-1]) == ("user[1].device.x(-7 ms)", "user[3].cube.v(0 ms)")
     assert route.f_d.rows[6] == "user[1].contact.f(1 ms)"
     assert route.closed.columns[96] == "user[1].contact.f(-1 ms)"

@@ -73,10 +73,7 @@ SCENES: dict[str, tuple[Scene, str, float]] = {
         Scene(peers=4, weights=weights("ring", 4), users=masses(0.1, 0.2, 0.1, 0.3), **GAINS),
         *("modes", 1e-11),
     ),
-    "two kinds of five": (
-        Scene(peers=5, users=masses(0.1, 0.2, 0.1, 0.1, 0.2), **GAINS),
-        *("modes", 1e-11),
-    ),
+    "two kinds of five": (Scene(peers=5, users=masses(0.1, 0.2, 0.1, 0.1, 0.2), **GAINS), *("modes", 1e-11)),
     "a star of which the middle differs": (
         Scene(peers=6, weights=weights("star", 6), users=masses(0.25, *[0.1] * 5), **SOFT),
         *("modes", 1e-9),
@@ -114,8 +111,7 @@ def test_the_modes_are_the_whole_spectrum_of_all_peers(name: str) -> None:
 
 def test_groups_that_differ_in_nothing_that_moves_are_one() -> None:
     text = replaced(
-        AVERAGE,
-        ("  user: {count: 3}", "  left: {count: 2, set: {device.x: 1 mm}}\n  right: {count: 1}"),
+        AVERAGE, ("  user: {count: 3}", "  left: {count: 2, set: {device.x: 1 mm}}\n  right: {count: 1}")
     )
     one, other = apc.analyze(compiled(text)), apc.analyze(compiled(AVERAGE))
     assert {mode.shape for mode in one.modes} == {"common", "difference"}

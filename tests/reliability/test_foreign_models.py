@@ -104,15 +104,7 @@ def test_forged_files_of_every_sort_do_nothing_else_and_end() -> None:
 @pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("theirs", "mark"),
-    [
-        ("0", b""),
-        ("1", b""),
-        ("2", b""),
-        ("3", b""),
-        ("13", b"\xe9"),
-        ("23", b""),
-        ("123", b"0"),
-    ],
+    [("0", b""), ("1", b""), ("2", b""), ("3", b""), ("13", b"\xe9"), ("23", b""), ("123", b"0")],
 )
 def test_lines_of_somebody_else_run_nothing_and_stand_for_no_topology(
     theirs: str, mark: bytes, serialized: bytes, capsys: pytest.CaptureFixture[str]

@@ -95,10 +95,7 @@ def test_what_is_not_a_peers_changes_nothing_but_a_counter(secret: bytes) -> Non
 
 
 def played(
-    wire: Wire,
-    secret: bytes,
-    value: float,
-    replayed: Sequence[tuple[int, bytes, Address]] = (),
+    wire: Wire, secret: bytes, value: float, replayed: Sequence[tuple[int, bytes, Address]] = ()
 ) -> Loop:
     """Play a scene with two others; all that is replayed comes at once and when it came, twice."""
     loop, start = loop_at(wire, compiled(MOVING), DIGEST, secret), wire.time

@@ -18,14 +18,7 @@ from apc.__main__ import run
 from apc.cli.commands import apc as group
 from apc.compiler import files
 from apc.compiler.errors import ApcError
-from apc.compiler.files import (
-    RefusedError,
-    begin_file,
-    finish_file,
-    read_file,
-    write_file,
-    write_texts,
-)
+from apc.compiler.files import RefusedError, begin_file, finish_file, read_file, write_file, write_texts
 from tests.commands import Cli, folder, write
 from tests.topologies import AVERAGE, replaced, told
 

@@ -13,15 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from apc.tables import (
-    BLOCK,
-    Column,
-    blocks_of,
-    check_table_path,
-    keep_room,
-    read_table,
-    write_table,
-)
+from apc.tables import BLOCK, Column, blocks_of, check_table_path, keep_room, read_table, write_table
 from tests.topologies import told
 
 COLUMNS = (Column("x", "m"), Column("verdict", kind="text"), Column("modes", kind="count"))

@@ -129,10 +129,7 @@ def test_a_scheme_that_refuses_has_its_place_and_says_why(tmp_path: Path) -> Non
     one, other = json.loads(out.read_text(encoding="utf-8"))["schemes"]
     assert one["analysis"] is not None and not one["refused"]
     assert (other["analysis"], other["stiffness"], other["feel"], other["stable"]) == (None,) * 4
-    assert (other["verdict"], other["refused"]) == (
-        "refused",
-        "--hands held: user has a hand already, arm.",
-    )
+    assert (other["verdict"], other["refused"]) == ("refused", "--hands held: user has a hand already, arm.")
 
 
 @pytest.mark.whole
@@ -187,11 +184,7 @@ GUESTS = replaced(
         (FIVE, "ring", 2, 10),
         (FIVE, "star", 4, 8),
         (FIVE, "{edges: [[1, 2], [2, 3], [2, 4], [4, 5]]}", 3, 8),
-        (
-            FIVE,
-            "{arcs: [[1, 2, 0.5], [2, 1, 1], [2, 3, 1], [3, 4, 1], [4, 5, 1], [5, 1, 1]]}",
-            *(2, 6),
-        ),
+        (FIVE, "{arcs: [[1, 2, 0.5], [2, 1, 1], [2, 3, 1], [3, 4, 1], [4, 5, 1], [5, 1, 1]]}", *(2, 6)),
         (GUESTS, "complete", 2, 6),  # who have no coupler neither send nor hear
         (replaced(AVERAGE, ("count: 3", "count: 1000000000")), "complete", 10**9 - 1, 10**9 * (10**9 - 1)),
     ],

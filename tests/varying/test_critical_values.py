@@ -404,10 +404,7 @@ ORDER = "apc critical: E841 the command wants a parameter or delay, then the sce
         ("", "E622 an empty name is no parameter of"),
         ("contact.stiffness|--upper|900", "--upper: E204 contact.stiffness wants N/m, got 900 (no"),
         ("contact.stiffness|--upper|900", 'Write: --upper "900 N/m"'),
-        (
-            "contact.stiffness|--lower|9 N/m|--upper|3 N/m",
-            "E842 the range of contact.stiffness wants",
-        ),
+        ("contact.stiffness|--lower|9 N/m|--upper|3 N/m", "E842 the range of contact.stiffness wants"),
         ("contact.stiffness|--lower|-5 N/m", "E843 a limit of contact.stiffness wants at least 0"),
         (
             "scene.yaml|lan.delay",
@@ -422,9 +419,7 @@ def test_a_mistake_is_one_message(words: str, message: str, capsys: pytest.Captu
     assert message in written.err and written.out == ""
 
 
-def test_the_command_prints_one_document_or_lines_of_80_columns(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_command_prints_one_document_or_lines_of_80_columns(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["critical", STIFFNESS, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["value"] == pytest.approx(LIMIT, rel=1e-12) and document["unit"] == "N/m"

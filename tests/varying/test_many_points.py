@@ -130,8 +130,7 @@ FORMULAS = replaced(
     ("stiffness: 500 N/m", "stiffness: kt*share/(peers - 1), damping: (kt + share*kt)*lead"),
 )
 GROUPS = replaced(
-    AVERAGE,
-    ("  user: {count: 3}\n", "  one: {count: 1, set: {device.mass: 0.2 kg}}\n  other: {count: 2}\n"),
+    AVERAGE, ("  user: {count: 3}\n", "  one: {count: 1, set: {device.mass: 0.2 kg}}\n  other: {count: 2}\n")
 )
 
 

@@ -48,8 +48,7 @@ def answers(place: int) -> str:
 
 @pytest.mark.whole
 @pytest.mark.parametrize(
-    "place",
-    [pytest.param(k, marks=[] if k in FIRST else [pytest.mark.whole]) for k in range(len(SCENES))],
+    "place", [pytest.param(k, marks=[] if k in FIRST else [pytest.mark.whole]) for k in range(len(SCENES))]
 )
 def test_a_scene_after_others_is_told_as_it_is_alone(place: int) -> None:
     """Others are asked for first, in either order, and of other texts of as many states."""

@@ -83,6 +83,24 @@ def test_with_passive_hands_the_limit_is_colgates(damping: float, virtual: float
     assert found.proved
 
 
+PAIR = """\
+topology: pair
+clocks: {haptic: 1 ms, network: 2 ms}
+peers: {user: {count: 2}}
+masses: {device: {mass: 0.25 kg, damping: 2 N*s/m}}
+couplers:
+  coordination: {type: AveragePosition, object: device, stiffness: 50 N/m, clock: haptic, link: lan}
+links: {lan: {clock: network, delay: 40 ms}}
+"""
+
+
+def test_a_damping_beside_which_hands_get_any_force_for_nothing_stays_at_zero() -> None:
+    """k (40 ms + 1.5 ms, half a tick of either clock) < b, where no velocity is sampled."""
+    found = apc.tune(compiled(PAIR), {K: (1.0, 500.0), B: (0.0, 20.0)}, maximize=K, criterion="passive")
+    assert abs(found.best - 2 / 0.0415) <= found.error < 1e-4
+    assert found.gains[1].value == 0 and found.proved
+
+
 def test_a_front_is_the_best_of_a_gain_for_each_bound_on_what_is_felt() -> None:
     model = compiled(AVERAGE)
     demands = read_demands(model, [f"{K}=10 N/m:7000 N/m"], maximize=K)
