@@ -15,6 +15,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from apc.analysis.analysis import analyze
 from apc.analysis.switches import SwitchedKind, SwitchingPart, bind, find_switches, switching_parts
 from apc.compiler.compiled import CompiledSystem
@@ -114,7 +116,8 @@ def contact_modes(system: CompiledSystem, *, prepared: Prepared | None = None) -
         switched_kind.kind.name for switched_kind in switched if not switched_kind.walkable
     )
     notes = tuple(f"not looked into: {name}, which has a nonlinear loop" for name in hidden)
-    parts = parts_of_kinds(system, switched, resolve(system))
+    with np.errstate(all="ignore"):
+        parts = parts_of_kinds(system, switched, resolve(system))
     names = tuple(dict.fromkeys(part.name for listed in parts for part in listed))
     has = [frozenset(part.name for part in parts[group.kind]) for group in system.groups]
 

@@ -234,7 +234,7 @@ def _region(system: CompiledSystem, call: str) -> Section:
     if len(system.region) < 2:
         stiff = [free for free in coupler_parameters(system) if unit_of(system, free.name) in STIFFNESSES]
         if len(stiff) < 2:
-            why = "the scene has fewer than two stiffnesses, and says no studies: region:"
+            why = "all peers share fewer than two stiffnesses, and the scene says no studies: region:"
             return Section("region", "", refused=why)
         asked = [
             f"{free.label}=0 N/m:{FURTHER * parameter_of(system, free).value or 1000:g} N/m"

@@ -253,8 +253,9 @@ def _everywhere(
         return f"{words} at every value scanned"
     if criterion == PASSIVE and side is False:
         return f"{words} whatever its value: apc analyze --hands passive says why"
-    where = " where the scene starts (--set may start it elsewhere)" if near else ""
-    return f"{words} whatever its value: nothing that decides stability{where} depends on it"
+    if near:
+        return f"{words} where it starts, where nothing depends on it (--set may start the scene elsewhere)"
+    return f"{words} whatever its value: nothing that decides stability depends on it"
 
 
 def _line(system: CompiledSystem, free: Free, ends: Ends, prepared: Prepared) -> Line:

@@ -189,8 +189,11 @@ def coupler_parameters(system: CompiledSystem) -> list[Free]:
 def _delays(system: CompiledSystem) -> list[Free]:
     """Return the timings that a hold or link waits for, or the named time they all follow from."""
     waited = [hold.delay for kind in system.kinds for hold in kind.holds]
+    groups = system.groups
+    ways = {(one.name, other.name) for one in groups for other in groups if one is not other or one.count > 1}
     for link in system.links:
-        waited += [link.delay, *(pair.delay for pair in link.delays)]
+        usual = ways - {(pair.sender, pair.receiver) for pair in link.delays}
+        waited += [*[link.delay] * bool(usual), *(pair.delay for pair in link.delays)]
     free = {timing.name for timing in named_times(system) if timing.formula is None}
     return [Free(name) for name in dict.fromkeys(waited) if name in free]
 
@@ -296,7 +299,8 @@ def network_margins(
         from apc.moments.network_verdict import growth  # most scenes have an ideal network
 
         now = growth(system, prepared)
-        if why := not_varied(len(free), now):
+        why = not_varied(len(free), now)
+        if why and now.stable is not False:
             return Margins((), f"not looked for: {why}")
         if not now.stable:
             known = "stable" if now.stable is False else "proved stable"

@@ -117,7 +117,9 @@ def test_sections_that_a_scene_cannot_fill_say_why(cli: Cli) -> None:
     write("scene.yaml", LONE)
     report = apc.report("scene.yaml")
     why = {one.key: one.refused for one in report.scenes[0].sections if one.refused}
-    assert why["region"] == "the scene has fewer than two stiffnesses, and says no studies: region:"
+    assert (
+        why["region"] == "all peers share fewer than two stiffnesses, and the scene says no studies: region:"
+    )
     assert why["network"] == "loss: there is no link"
     text = html.unescape(report_page(report))
     assert all(f"Not here: {reason}" in text for reason in why.values())
