@@ -194,7 +194,7 @@ def _check_bounds(system: CompiledSystem) -> None:
         _check_columns(system, group, mistakes)
     periods = {clock.period for clock in system.clocks}
     for timing in system.timings:
-        got = f"{float(timing.value)} s"
+        got = f"{1000 * float(timing.value):g} ms"
         if timing.name in periods and timing.value <= 0:
             mistakes.add("E625", OVERRIDE, timing.name, expected="a time above 0 s", got=got)
         elif timing.value < 0:
@@ -202,7 +202,7 @@ def _check_bounds(system: CompiledSystem) -> None:
     seconds = {timing.name: timing.value for timing in system.timings}
     for clock in system.clocks:
         if not seconds[clock.phase] < seconds[clock.period] and seconds[clock.period] > 0:
-            got = f"{float(seconds[clock.phase])} s"
+            got = f"{1000 * float(seconds[clock.phase]):g} ms"
             mistakes.add("E625", OVERRIDE, clock.phase, expected="less than the clock's period", got=got)
     mistakes.raise_if_any()
 
