@@ -115,7 +115,7 @@ def test_a_point_at_fault_says_why_and_the_sweep_goes_on(tmp_path: Path) -> None
     found = sweep(compiled(text), {"tick.phase": "0,1.5 ms", "tick.period": "1,2 ms"}, out=target, jobs=1)
     assert list(found.column("verdict")) == ["stable", "stable", "error: E625", "stable"]
     assert math.isnan(found.column("spectral_radius")[2])
-    message = "tick.phase wants less than the clock's period, got 0.0015 s."
+    message = "tick.phase wants less than the clock's period, got 1.5 ms."
     assert found.column("message").tolist() == ["", "", message, ""]
     assert target.read_text(encoding="utf-8").splitlines()[3] == f'0.0015,0.001,error: E625,,,,,,"{message}"'
     assert f"at 1 of them: {message}" in str(found)
