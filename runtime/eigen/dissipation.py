@@ -141,8 +141,9 @@ def _lowest(
 
     best, where = -float(np.finfo(np.float64).max), 0.0
     first = values[np.argsort(-np.abs(values))[:NEAREST]]
-    at, apart = np.abs(np.angle(-first if turn else first)), 1 - np.abs(first)
-    angles = np.clip(np.concatenate([np.linspace(0, np.pi, EVENLY), at, at - apart, at + apart]), 0, np.pi)
+    angle, apart = np.abs(np.angle(-first if turn else first)), 1 - np.abs(first)
+    evenly = np.linspace(0, np.pi, EVENLY)
+    angles = np.clip(np.concatenate([evenly, angle, angle - apart, angle + apart]), 0, np.pi)
     for _ in range(LEVELS):
         depths = -least(*turned, angles)
         place = int(np.argmax(depths))

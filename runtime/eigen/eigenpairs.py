@@ -78,8 +78,9 @@ def eigenpairs(matrix: Matrix) -> Eigenpairs:
 
     Notes
     -----
-    By LAPACK's geev, as `scipy.linalg.eig` of one matrix does, which takes ten times as long around it. Of a
-    real matrix it gives the real and imaginary parts of a conjugate pair's vector in the places of the two.
+    By LAPACK's geev itself: `scipy.linalg.eig` calls it one matrix at a time, too, and takes ten times as
+    long around a small one. Of a real matrix it gives the real and imaginary parts of a conjugate pair's
+    vector in the places of the two.
     """
     geev = load_pool("scipy.linalg.lapack").get_lapack_funcs("geev", (matrix,))
     values = np.empty(matrix.shape[:-1], dtype=np.complex128)

@@ -192,8 +192,9 @@ def exponential(a: Matrix, b: Matrix, seconds: float | Matrix, numbers: Arithmet
     -----
     By scaling and squaring: with X = A T/2^s, ‖X‖ ≤ 1/2, and Y = φ₁(X) by Horner's rule, E = F − I = X Y and
     G = Y B T/2^s; then s times E ← 2 E + E² and G ← 2 G + E G. What is slow beside what is fast so keeps the
-    digits that 1 would take from it with each squaring. What the series leaves out is as if its last factor,
-    I + X/18 + …, were off by less than `LAST` where states move one another.
+    digits that 1 would take from it with each squaring; what it is off by goes on another way (see `radius`).
+    What the series leaves out is as if its last factor, I + X/18 + …, were off by less than `LAST` where
+    states move one another.
     """
     n_x, n_u = a.shape[-1], b.shape[-1]
     norm = float((numbers.size(a) * seconds).sum(axis=-2).real.max(initial=0.0))
@@ -209,8 +210,9 @@ def exponential(a: Matrix, b: Matrix, seconds: float | Matrix, numbers: Arithmet
     for term in range(TERMS, 0, -1):
         phi = numbers.add(exact, numbers.scaled(numbers.multiply(x, phi), 1 / (term + 1)))
     grown = np.concatenate([numbers.multiply(x, phi), numbers.multiply(phi, g)], axis=-1)
+    double = numbers.doubled or (lambda e: numbers.add(2 * e, numbers.multiply(e[..., :n_x], e)))
     for _ in range(squarings):
-        grown = numbers.doubled(grown)
+        grown = double(grown)
     return numbers.add(grown, numbers.exact(np.eye(n_x, n_x + n_u)))
 
 

@@ -194,7 +194,7 @@ def _check_bounds(system: CompiledSystem) -> None:
         _check_columns(system, group, mistakes)
     periods = {clock.period for clock in system.clocks}
     for timing in system.timings:
-        got = f"{1000 * float(timing.value):g} ms"
+        got = _in_ms(timing.value)
         if timing.name in periods and timing.value <= 0:
             mistakes.add("E625", OVERRIDE, timing.name, expected="a time above 0 s", got=got)
         elif timing.value < 0:
@@ -202,7 +202,7 @@ def _check_bounds(system: CompiledSystem) -> None:
     seconds = {timing.name: timing.value for timing in system.timings}
     for clock in system.clocks:
         if not seconds[clock.phase] < seconds[clock.period] and seconds[clock.period] > 0:
-            got = f"{1000 * float(seconds[clock.phase]):g} ms"
+            got = _in_ms(seconds[clock.phase])
             mistakes.add("E625", OVERRIDE, clock.phase, expected="less than the clock's period", got=got)
     mistakes.raise_if_any()
 
@@ -238,6 +238,10 @@ def check_bounds(
         out("at least", low)
     if high is not None and value > high:
         out("at most", high)
+
+
+def _in_ms(seconds: Fraction) -> str:
+    return f"{1000 * float(seconds):.9g} ms"
 
 
 def _check_columns(system: CompiledSystem, group: Group, mistakes: Mistakes) -> None:

@@ -43,7 +43,8 @@ class Arithmetic:
     `exact` writes what is exact, `bounded` what may be off by so much. `solve` gives X of M X = R, None where
     it can't be said, or where nobody asks it of such numbers; `vanishes` says that a matrix is zero. `scaled`
     multiplies by a number that is off by one rounding, `size` is the largest that magnitudes can be.
-    `doubled` gives [F G] − [I 0] (…, n, n + m) of twice the time.
+    `doubled`, where it isn't made of these, takes [F G] − [I 0] (…, n, n + m) of a time to that of twice the
+    time.
     """
 
     multiply: Callable[[Matrix, Matrix], Matrix]
@@ -55,7 +56,7 @@ class Arithmetic:
     bounded: Callable[[Matrix, Matrix], Matrix] = lambda value, off: value
     scaled: Callable[[Matrix, float | Matrix], Matrix] = lambda matrix, factor: matrix * factor
     size: Callable[[Matrix], Matrix] = np.abs
-    doubled: Callable[[Matrix], Matrix] = lambda grown: 2 * grown + grown[..., : grown.shape[-2]] @ grown
+    doubled: Callable[[Matrix], Matrix] | None = None
 
 
 def common_shape(*shapes: tuple[int, ...]) -> tuple[int, ...]:
@@ -222,9 +223,9 @@ def _doubled(grown: Matrix) -> Matrix:
     n = grown.shape[-2]
     identity = np.eye(*grown.shape[-2:])
     off, spread = radius_of(grown).real.copy(), spread_of(grown)
-    exact = grown.copy()
-    radius_of(exact)[...] = 0
-    result = _added(2 * exact, _multiply(exact[..., :n], exact), np.add)
+    without = grown.copy()
+    radius_of(without)[...] = 0
+    result = _added(2 * without, _multiply(without[..., :n], without), np.add)
     step = np.abs(value_of(grown) + identity)
     carried = (step[..., :n] + spread[..., :n]) @ off + off[..., :n] @ (step + spread + off)
     carried[..., n:] += off[..., n:]

@@ -162,18 +162,18 @@ def passive_hands(
     fixed = analyze(clamped(system, option=OPTION), certify=certify)
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         loops: tuple[PortLoop, ...] = ()
-        felt = ""
+        unserved = ""
         try:
             loops = port_loops(system, prepared, option=OPTION)
         except UnservedError as why:
-            felt = str(why)
+            unserved = str(why)
         modes = tuple(_judge(loop) for loop in loops)
-        never = felt or (CIRCULATES if any(map(circulates, loops)) else "")
+        never = unserved or (CIRCULATES if any(map(circulates, loops)) else "")
     linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
     stable: bool | None = None
-    joined = not felt and all(loop.joined for loop in loops)
+    joined = not unserved and all(loop.joined for loop in loops)
     drawn = [mode.passive is False and (joined or mode.more is None) for mode in modes]
-    if felt or fixed.stable is False or any(drawn):
+    if unserved or fixed.stable is False or any(drawn):
         stable = False
     elif all(mode.passive for mode in modes) and fixed.stable:
         stable = True

@@ -178,7 +178,7 @@ class PacketSource:
         self._pairs = np.asarray(pairs, np.int64).reshape(-1, 2)
         self.ways = len(self._pairs)
         self._bad: Flags = self._uniforms(1, 1)[:, 0, 0] < law.bad
-        self._drawn = np.empty((self.ways, 0, BLOCK))  # of the packets next
+        self._drawn = np.empty((self.ways, 0, BLOCK))  # luck drawn ahead, from packet `taken` on
 
     def take(self, count: int) -> Floats:
         """Return the delays (M, count) in seconds of the next packets, infinite for those that get lost."""

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.threads import load_pool
-from apc.tuning.limits import Limits, Rows, Scenario
+from apc.tuning.limits import STEP, Limits, Rows, Scenario
 
 Floats = NDArray[np.float64]
 
@@ -45,11 +45,12 @@ SHORTER, NEAREST = 0.25, 1e-3
 # Steps of a descent at most.
 STEPS = 200
 
-# A limit that rises by more than this, over a whole range, as a gain leaves the end of it, has no slope
-# there: a velocity is sampled from then on, say. Such a gain stays where it is.
-JUMPS = 1e5
+# A limit of differences that rises by more than this, over a whole range, as a gain leaves the end of it, has
+# jumped by a tenth: a velocity is sampled from then on, say. Such a gain stays where it is.
+JUMPS = 0.1 / STEP
 
-# What of an aim's slope, of 1, no limits balance where a descent has ended on its way.
+# The share of an aim's slope that limits may leave unbalanced at an optimum; where it is more, the descent
+# ended on its way.
 ASTRAY = 0.5
 
 # More than any aim is worth.
@@ -228,8 +229,11 @@ class Search:
         rows_of = self._remembered(known)
         size, spare = len(start), self.column is None
         at_end = (start == self._ends[0]) | (start == self._ends[1])
-        rises = (rows_of(start).slopes * np.where(start > self._ends[0], -1, 1)).max(axis=0)
-        held = at_end & (rises > JUMPS)
+        rows = rows_of(start)
+        rises = rows.slopes * np.where(start > self._ends[0], -1, 1)
+        level = rows.values.max() if spare else 0.0
+        binds = rows.values[:, None] + STEP * rises > level
+        held = at_end & self.limits.slow & ((rises > JUMPS) & binds).any(axis=0)
         here = np.append(start, rows_of(start).values.max()) if spare else start
         aim = np.zeros(len(here))
         aim[-1 if spare else self.column] = 1.0 if spare else -self.sign
@@ -304,7 +308,7 @@ class Search:
             multipliers[near], free = load_pool("scipy.optimize").nnls(slopes, aim)
         # What limits that don't quite bind leave open.
         error = max(scale * float(multipliers @ np.abs(rows.values - level)), LEAST * abs(value))
-        error = error if free < ASTRAY else np.inf
+        error = error if self.column is None or free < ASTRAY else np.inf
         if self.limits.slow and self.column is not None:
             error = max(error, 10 * self._near * scale)
         return Optimum(tuple(self.scenarios), self.gains(shares), value, error, worst, rows, multipliers, 0)

@@ -254,7 +254,8 @@ def _everywhere(
     if criterion == PASSIVE and side is False:
         return f"{words} whatever its value: apc analyze --hands passive says why"
     if near:
-        return f"{words} where it starts, where nothing depends on it (--set may start the scene elsewhere)"
+        elsewhere = "there nothing depends on this number (--set may start it elsewhere)"
+        return f"{words} where the scene starts: {elsewhere}"
     return f"{words} whatever its value: nothing that decides stability depends on it"
 
 

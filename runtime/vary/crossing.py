@@ -419,7 +419,7 @@ def _crossing(
 
 
 def _root(stretch: Stretch, ends: Sequence[float], growth: Sequence[float], off: float) -> float:
-    """Return where floats see the largest magnitude pass 1 between ends on two sides of it, off by so much.
+    """Return where floats see the largest magnitude pass 1 between ends on two sides, off by so much of it.
 
     By Newton's method and, where that leaves the ends or there are no slopes, Brent's.
     """

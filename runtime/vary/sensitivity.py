@@ -53,8 +53,8 @@ Complexes = NDArray[np.complex128]
 SHARED = 1e-10
 
 # Eigenvalues nearer to one another than this, relatively, are one cluster: rounding mixes their vectors by a
-# millionth or more. Where even the vectors of such a cluster are worse conditioned than `SOUND`, it may be
-# part of one that rounding split, as the root of it.
+# ten-millionth or more. Where even the vectors of such a cluster are worse conditioned than `SOUND`, it may
+# be part of one that rounding split, as the root of it.
 EQUAL, CLOSE, SOUND = 1e-9, 1e-7, 1e6
 
 # A cluster of vectors worse conditioned than this has no derivative worth the name.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from fractions import Fraction
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import apc
 from apc.analysis.contact_modes import ContactModes
 from apc.compiler.errors import ApcError
 from tests import bruteforce
-from tests.topologies import AVERAGE, MESH, SCENES, compiled, library, replaced
+from tests.topologies import AVERAGE, MESH, SCENES, compiled, library, replaced, wall
 
 EXPERIMENTS = {
     name: (SCENES / f"experiment-{name}.yaml").read_text(encoding="utf-8") for name in ("average", "mesh")
@@ -61,6 +62,8 @@ def test_the_experiment_with_the_mean_is_stable_in_contact_and_with_the_mesh_it_
         assert max(map(len, str(found).splitlines())) <= 80
     none = apc.contact_modes(compiled(AVERAGE))
     assert (none.parts, str(none)) == ((), "three-users-average: no part switches")
+    with warnings.catch_warnings(action="error"):  # of what is beyond floats
+        assert apc.contact_modes(wall(0.1, 1.0, 0.0, 1e200)).parts == ("it.push",)
 
 
 @pytest.mark.parametrize(

@@ -186,7 +186,9 @@ def by_region(system: CompiledSystem, limit: float) -> None:
 
 @pytest.mark.few(2)
 @pytest.mark.parametrize("way", [by_critical, by_certificate, by_sweep, by_region])
-def test_every_way_finds_what_others_found(way: Callable[[CompiledSystem, float], None]) -> None:
+def test_every_way_to_ask_finds_what_an_independent_program_found(
+    way: Callable[[CompiledSystem, float], None],
+) -> None:
     """Three users bear 458.24216 N/m with any passive hand."""
     way(users(3, 200), 458.24216)
 

@@ -21,7 +21,7 @@ from apc.vary.critical_values import Critical
 from apc.vary.margins import Margin
 from tests.bench import random_scans
 from tests.bruteforce import Scene, as_ball, frame_matrices, frame_matrix
-from tests.topologies import AVERAGE, MESH, ROOT, SCENES, compiled, replaced
+from tests.topologies import AVERAGE, MESH, ROOT, SCENES, compiled, replaced, wall
 from tests.truths import STORED
 from tests.varying.closed_forms import followers, late, sprung
 
@@ -378,6 +378,9 @@ def test_no_crossing_is_an_answer_in_words() -> None:
     assert not idle.enters and idle.value is None
     said = " ".join(str(idle).split())
     assert "stable whatever its value: nothing that decides stability depends on it" in said
+    apart = apc.set_parameters(wall(0.1, 1.0, 0.0, 100.0), {"device.x": "-1 mm", "it.x": "-1 mm"})
+    said = " ".join(str(apc.critical(apart, "it.stiffness")).split())
+    assert "where the scene starts: there nothing depends on this number" in said
 
 
 def test_a_delay_where_what_is_heard_at_the_start_decides_is_refused() -> None:

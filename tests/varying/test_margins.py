@@ -120,6 +120,18 @@ def test_a_delay_is_scanned_far_enough_or_said_not_to_be() -> None:
 
 
 @pytest.mark.whole
+def test_a_links_delay_that_no_way_has_is_no_margin() -> None:
+    text = replaced(
+        AVERAGE,
+        ("  user: {count: 3}", "  one: {count: 1}\n  two: {count: 1}"),
+        ("delay: 8 ms}", "delay: 8 ms, delays: {one: {two: 16 ms}, two: {one: 9 ms}}}"),
+    )
+    rows = {row.parameter for row in apc.margins(compiled(text)).rows}
+    assert {"lan.delays.one.two", "lan.delays.two.one"} <= rows and "lan.delay" not in rows
+    one_way = replaced(text, ("two: {one: 9 ms}", "two: {one: 8 ms}"), ("one: {two: 16 ms}, ", ""))
+    assert "lan.delay" in {row.parameter for row in apc.margins(compiled(one_way)).rows}
+
+
 def test_of_very_large_systems_delays_are_said_not_to_be_looked_for() -> None:
     notes = {one.parameter: one.note for one in rows_of(apc.compile(HARD / "very-long-delay.yaml")).values()}
     assert {notes[name] for name in ("contact.delay", "coordination.delay")} == {
