@@ -322,9 +322,10 @@ def _port_loop(
     at_once = whole[:, out[:, None], into]
     forces = RADII.add(multiply(felt, aside), multiply(at_once, exact(of)))
     first = np.argmax(of, axis=0)
-    many = reciprocal(forces[:, first], counts)
+    many, doubt = reciprocal(forces[:, first], counts)
     each = of @ many
-    felt, at_once, forces = (multiply(exact(np.diag(each)), values) for values in (felt, at_once, forces))
+    times = with_radius(np.diag(each), np.diag(of @ (many * doubt)))
+    felt, at_once, forces = (multiply(times, values) for values in (felt, at_once, forces))
     static = forces[:, first]
     b = RADII.subtract(multiply(placed, exact(sums)), multiply(aside, exact(of.T)))
     pole = multiply(multiply(exact(of), static), exact(of.T))
@@ -332,7 +333,7 @@ def _port_loop(
     dampings = np.array([float(site.damping) for site in sites])
     damping = np.diag(of @ dampings * each / seconds)
     units = exact(np.diag(np.sqrt(seconds / each)))
-    weight = RADII.subtract(with_radius(damping, 8 * UNIT * damping), half)
+    weight = RADII.subtract(with_radius(damping, np.diag(of @ doubt + 8 * UNIT) * damping), half)
     return PortLoop(
         name=loop.name,
         multiplicity=loop.multiplicity,
@@ -356,8 +357,10 @@ def _aside(a: Matrix, placed: Matrix, of: Floats) -> Matrix | None:
     return solve(still, RADII.multiply(placed, RADII.exact(of)))
 
 
-def reciprocal(static: Matrix, counts: Sequence[int]) -> Floats:
+def reciprocal(static: Matrix, counts: Sequence[int]) -> tuple[Floats, Floats]:
     """Return what the energies of devices are to be multiplied by for their stiffness to be that of springs.
+
+    And what each factor may be off by, relatively.
 
     Parameters
     ----------
@@ -373,7 +376,8 @@ def reciprocal(static: Matrix, counts: Sequence[int]) -> Floats:
     """
     value = value_of(static)
     felt = np.abs(value) > radius_of(static)
-    values = np.zeros(len(counts))
+    doubts = radius_of(static) / np.abs(value)
+    values, doubt = np.zeros((2, len(counts)))
     for start, count in enumerate(counts):
         if values[start]:
             continue
@@ -383,6 +387,10 @@ def reciprocal(static: Matrix, counts: Sequence[int]) -> Floats:
             for h in np.flatnonzero(felt[g] & felt[:, g] & (values == 0)).tolist():
                 ratio = value[g, h] / value[h, g]
                 values[h] = values[g] * ratio if ratio > 0 else counts[h]
+                off = 1.01 * (doubts[g, h] + doubts[h, g]) + 4 * UNIT  # of a quotient of small doubts
+                doubt[h] = 1.01 * (doubt[g] + off) if ratio > 0 else 0.0
                 waiting.append(h)
     even = values * counts[0] / values[0] / counts
-    return np.array(counts, dtype=np.float64) if np.abs(even - 1).max() <= EVEN else values
+    if np.abs(even - 1).max() <= EVEN:
+        return np.array(counts, dtype=np.float64), np.zeros(len(counts))
+    return values, doubt

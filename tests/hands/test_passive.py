@@ -295,6 +295,28 @@ links: {wan: {clock: network, delay: 16 ms}}
 """
 
 
+def test_a_star_of_unlike_users_is_passive_up_to_what_rounding_hides_of_its_symmetry() -> None:
+    """Its hub counts for as many as hear it; 3.0369563 N*s/m could be spared, by an independent program."""
+    text = replaced(
+        AVERAGE,
+        ("haptic: 1 ms", "haptic: 1 ms\n  fast: {period: 1/2 ms, phase: 1/6 ms}"),
+        ("network: 8 ms", "network: 3 ms"),
+        (
+            "user: {count: 3}",
+            "a: {count: 2}\n  b: {count: 2, set: {device.mass: 0.2258 kg, "
+            "contact.stiffness: 898.1 N/m, cube.damping: 1.075 N*s/m}}",
+        ),
+        ("mass: 0.1 kg, damping: 5", "mass: 0.09918 kg, damping: 3.279"),
+        ("mass: 0.6 kg, damping: 5", "mass: 1.577 kg, damping: 10.23"),
+        ("1000 N/m, clock: haptic, delay: 1 ms", "493 N/m, clock: fast"),
+        ("500 N/m, clock: haptic, delay: 1 ms", "57.48 N/m, damping: 2.065 N*s/m, clock: haptic"),
+        ("delay: 8 ms", "delay: 3 ms, graph: star"),
+    )
+    found = passive_hands(compiled(text))
+    assert found.stable and found.worst is not None
+    assert found.worst.more == pytest.approx(-3.036956311616, rel=1e-9)
+
+
 def test_two_devices_coupled_directly_are_held_each_at_its_only_mass() -> None:
     """Slow motions need (b₁ − K d)(b₂ − K d) ≥ (K D)², own forces d = 1.5 ms late, the other's D = 21 ms."""
     system = compiled(DIRECT)
