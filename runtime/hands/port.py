@@ -387,8 +387,9 @@ def reciprocal(static: Matrix, counts: Sequence[int]) -> tuple[Floats, Floats]:
             for h in np.flatnonzero(felt[g] & felt[:, g] & (values == 0)).tolist():
                 ratio = value[g, h] / value[h, g]
                 values[h] = values[g] * ratio if ratio > 0 else counts[h]
-                off = 1.01 * (doubts[g, h] + doubts[h, g]) + 4 * UNIT  # of a quotient of small doubts
-                doubt[h] = 1.01 * (doubt[g] + off) if ratio > 0 else 0.0
+                # (1 + a)/(1 − b) − 1 of a quotient, and (1 + d)(1 + q) − 1 of a product.
+                off = (doubts[g, h] + doubts[h, g]) / (1 - doubts[h, g]) + 8 * UNIT
+                doubt[h] = (doubt[g] + off + doubt[g] * off) * (1 + 8 * UNIT) if ratio > 0 else 0.0
                 waiting.append(h)
     even = values * counts[0] / values[0] / counts
     if np.abs(even - 1).max() <= EVEN:

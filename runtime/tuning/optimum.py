@@ -230,11 +230,11 @@ class Search:
         size, spare = len(start), self.column is None
         at_end = (start == self._ends[0]) | (start == self._ends[1])
         rows = rows_of(start)
+        worst = rows.values.max()
         rises = rows.slopes * np.where(start > self._ends[0], -1, 1)
-        level = rows.values.max() if spare else 0.0
-        binds = rows.values[:, None] + STEP * rises > level
+        binds = rows.values[:, None] + STEP * rises > (worst if spare else 0.0)
         held = at_end & self.limits.slow & ((rises > JUMPS) & binds).any(axis=0)
-        here = np.append(start, rows_of(start).values.max()) if spare else start
+        here = np.append(start, worst) if spare else start
         aim = np.zeros(len(here))
         aim[-1 if spare else self.column] = 1.0 if spare else -self.sign
 

@@ -187,13 +187,21 @@ def coupler_parameters(system: CompiledSystem) -> list[Free]:
 
 
 def _delays(system: CompiledSystem) -> list[Free]:
-    """Return the timings that a hold or link waits for, or the named time they all follow from."""
+    """Return the timings that a hold or link waits for, or the named time they all follow from.
+
+    A link's own delay is not among them where every two groups have one of theirs.
+    """
     waited = [hold.delay for kind in system.kinds for hold in kind.holds]
-    groups = system.groups
-    ways = {(one.name, other.name) for one in groups for other in groups if one is not other or one.count > 1}
+    ways = {
+        (sender.name, receiver.name)
+        for sender in system.groups
+        for receiver in system.groups
+        if sender is not receiver or sender.count > 1
+    }
     for link in system.links:
-        usual = ways - {(pair.sender, pair.receiver) for pair in link.delays}
-        waited += [*[link.delay] * bool(usual), *(pair.delay for pair in link.delays)]
+        if ways - {(pair.sender, pair.receiver) for pair in link.delays}:
+            waited.append(link.delay)
+        waited += [pair.delay for pair in link.delays]
     free = {timing.name for timing in named_times(system) if timing.formula is None}
     return [Free(name) for name in dict.fromkeys(waited) if name in free]
 
