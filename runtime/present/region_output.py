@@ -75,7 +75,7 @@ def _words(region: Region) -> str:
         closed = sum(curve.closed for curve in region.curves)
         pieces = "one piece" if len(region.curves) == 1 else f"{len(region.curves)} pieces"
         return f"the stable region has a boundary in {pieces}" + (f", {closed} closed" if closed else "")
-    return "stable in the whole rectangle" if region.corner else "stable nowhere in the rectangle"
+    return "stable in the whole rectangle" if region.corner else "stable nowhere inside the rectangle"
 
 
 def _row(region: Region, curve: Curve) -> tuple[str, ...]:

@@ -114,7 +114,7 @@ def draw_panel(ax: Any, title: str, panel: Panel) -> None:
         curves = [drawn_points(region, number) * [1, gain] for number in range(len(region.curves))]
         _draw(ax, region, gain, place, curves, name)
         if not curves:
-            said.append(f"{name}: stable {'everywhere' if region.corner else 'nowhere'}")
+            said.append(f"{name}: stable {'everywhere' if region.corner else 'nowhere inside'}")
             continue
         points = np.concatenate([_dense(curve / [1, gains[0]], regions[0]) for curve in curves])
         same = next((other for other, theirs in drawn if _are_one(points, theirs)), None)

@@ -442,7 +442,7 @@ def test_text_fits_a_terminal_and_json_is_the_contract(said: Callable[..., str])
     text = said("--x", X, "--y", Y)
     assert text.startswith("three-users-average: the stable region has a boundary in one piece\n")
     assert "difference  10.83 to 26.12" in text and max(map(len, text.splitlines())) <= 80
-    for span, words in (("10 N/m:50", "stable in the whole"), ("4000 N/m:5000", "stable nowhere in the")):
+    for span, words in (("10 N/m:50", "stable in the whole"), ("4000 N/m:5000", "stable nowhere inside the")):
         axes = [one.replace("10 N/m:3000", span) for one in (X, Y)]
         assert f"{words} rectangle" in said("--x", axes[0], "--y", axes[1])
     document = json.loads(said("--json"))
