@@ -21,8 +21,9 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.switches import SwitchedKind, SwitchingPart
+from apc.analysis.switches import SwitchingPart
 from apc.compiler.interpolation import jacobian
+from apc.frame.decisions import SwitchedKind
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.linearize import start_values
 from apc.unserved import UnservedError

@@ -110,7 +110,7 @@ class SiteJacobians:
     The function's one output is every matrix of a `LinearSite`, in order, column-major, less what is zero by
     structure; `shapes` cuts it.
     `edges` are those of its receives by (clock partition, receive). `timed` says that some entry depends on
-    time, if only on whether something has switched (see `switches.varying_slopes`).
+    time, if only on whether something has switched (see `decisions.varying_slopes`).
     """
 
     kind: Kind
