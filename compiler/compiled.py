@@ -289,6 +289,15 @@ class Limit:
     value: casadi.Function | None
 
 
+@dataclass(frozen=True, slots=True)
+class Replaced:
+    """A part that other equations represent in a linear analysis; `valid` says for which motions."""
+
+    part: str
+    equations: tuple[str, ...]
+    valid: str
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Kind:
     """All peers of one structure. `derivative(x, u, p, t) -> dx/dt (n_x,)`.
@@ -296,6 +305,8 @@ class Kind:
     A float among the values of a parameter is exact, but where `rounded` has it: by the parameter's place in
     `parameters`, the rationals that floats round, each float at most one of them. `hands` are the parts that
     the scene calls hands, if they answer to how they are moved; `held` the parts that any hand is joined to.
+    `linear` is the kind that represents it in a linear analysis, of the same states and parameters, None
+    where that is the kind itself; `replaced` are the parts in which they differ.
     """
 
     name: str
@@ -310,6 +321,8 @@ class Kind:
     hands: tuple[str, ...] = ()
     limits: tuple[Limit, ...] = ()
     held: tuple[str, ...] = ()
+    linear: Kind | None = None
+    replaced: tuple[Replaced, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

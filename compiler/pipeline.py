@@ -86,6 +86,13 @@ def check_definition(path: Path) -> str:
     return f"{name}, a {kind}"
 
 
+def linear_system(scene: Scene) -> SortedSystem | None:
+    """Return the equations of linear analyses, None where no component has equations of its own for them."""
+    if all(part.component.linearized is None for part in scene.parts):
+        return None
+    return sort(partition(flatten(scene, linear=True)))
+
+
 def run_stages(path: Path, *, until: Stage) -> StageValue:
     """Run the stages up to and including `until`. Raises ApcError with the mistakes of one that fails."""
     return next(value for stage, value in each_stage(path) if stage == until)
@@ -116,7 +123,9 @@ def stages_of(source: Source, texts: dict[str, bytes] | None = None) -> Iterator
         "flat": flatten,
         "clocked": partition,
         "sorted": sort,
-        "compiled": lambda ordered: build_functions(ordered, origin_of(path, texts)),
+        "compiled": lambda ordered: build_functions(
+            ordered, origin_of(path, texts), linear=linear_system(ordered.scene)
+        ),
     }
     value: StageValue = source
     yield "source", value

@@ -13,10 +13,11 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
-from apc.analysis.analysis import Analysis, analyze, near_start
+from apc.analysis.analysis import Analysis, analyze, analyze_sides, near_start
 from apc.analysis.contact_modes import ContactModes, contact_modes
 from apc.analysis.conventions import Conventions, conventions
 from apc.analysis.methods import PAPER
+from apc.analysis.sides import Side
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.spectrum import UNSTABLE
@@ -102,14 +103,21 @@ def judge(
     prepared
         From `instance.prepare`, of this system with any numbers.
     """
+    return _judged(system, prepared or prepare(system), method=method, certify=certify)[0]
+
+
+def _judged(
+    system: CompiledSystem, prepared: Prepared, *, method: str, certify: bool
+) -> tuple[Analysis, Side]:
+    """Return the analysis of the worst side of the kinks at which peers start, and that side."""
     if method != PAPER:
-        return analyze(system, method=method, certify=certify, prepared=prepared)
+        return analyze_sides(system, method=method, certify=certify, prepared=prepared)
     if certify:
         what = "method paper gives no proof: its matrices hold every sample of a frame, rounded"
         raise ApcError(Mistake("E850", Place(system.origin.topology), what, hint="--method auto --certify"))
     from apc.analysis.paper import analyze_paper  # rarely asked for
 
-    return analyze_paper(system)
+    return analyze_paper(system), Side("", system, prepared)
 
 
 def answer(
@@ -151,12 +159,12 @@ def answer(
         As `analysis.analyze` and `box_proof.prove_box`.
     """
     prepared = prepare(system)
-    analysis = judge(system, method=method, certify=certify, prepared=prepared)
+    analysis, side = _judged(system, prepared, method=method, certify=certify)
     modes, notes = _contact_modes(system, prepared)
     compared = conventions(system, prepared=prepared, default=analysis, quick=not every_convention)
     if compared.not_repeated and not every_convention:
         notes = (*notes, compared.not_repeated)
-    moved = sensitivities_of(system, prepared, analysis)
+    moved = sensitivities_of(side.system, side.prepared, analysis)
     nominal = _margins(system, prepared, analysis, wanted=margins)
     buzz, no_buzz = _buzz(system, prepared) if with_buzz else (None, "")
     return Answer(

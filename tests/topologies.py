@@ -14,6 +14,7 @@ from apc.compiler.equations.flatten import FlatSystem, flatten
 from apc.compiler.equations.structure import SortedSystem, sort
 from apc.compiler.errors import ApcError
 from apc.compiler.functions.functions import build_functions
+from apc.compiler.pipeline import linear_system
 from apc.compiler.scene.scene import Scene, build_scene
 from apc.compiler.source.source import Source, parse_source
 
@@ -77,9 +78,9 @@ def ordered(text: str, library: Library | None = None) -> SortedSystem:
 @functools.lru_cache(maxsize=32)
 def compiled(text: str, library: Library | None = None) -> CompiledSystem:
     """Compile a text; the same text gives the same model, with all that it keeps."""
-    return build_functions(
-        ordered(text, library), Origin("scene.yaml", (("scene.yaml", text.encode()),), program_digest())
-    )
+    system = ordered(text, library)
+    origin = Origin("scene.yaml", (("scene.yaml", text.encode()),), program_digest())
+    return build_functions(system, origin, linear=linear_system(system.scene))
 
 
 def wall(mass: float, damping: float, delay: float, stiffness: float, virtual: float = 0.0) -> CompiledSystem:

@@ -14,7 +14,16 @@ from typing import TypeVar
 
 from apc.compiler.errors import Place
 from apc.compiler.language.dimensions import Dimension
-from apc.compiler.language.expression import FUNCTIONS, KEYWORDS, Call, Equation, Expr, Name, names
+from apc.compiler.language.expression import (
+    FUNCTIONS,
+    KEYWORDS,
+    Call,
+    Equation,
+    Expr,
+    Name,
+    format_expression,
+    names,
+)
 from apc.compiler.language.units import Unit
 from apc.compiler.language.values import Binding, Bounds
 from apc.compiler.source.nodes import Node
@@ -152,6 +161,17 @@ class Inner:
 
 
 @dataclass(frozen=True, slots=True)
+class Linearized:
+    """What represents a component in a linear analysis.
+
+    Each of `equations` replaces the equation with the same left side. `valid` says for which motions.
+    """
+
+    equations: tuple[Equation, ...]
+    valid: str
+
+
+@dataclass(frozen=True, slots=True)
 class Component:
     """A component, whole.
 
@@ -175,6 +195,7 @@ class Component:
     passed: Joined = ()
     grips: tuple[str, ...] = ()
     peers: int = 0
+    linearized: Linearized | None = None  # None where the equations themselves are linearized
 
     def parameter(self, name: str) -> Parameter | None:
         """Return the parameter of this name, or None."""
@@ -194,6 +215,14 @@ class Component:
         """The flows of its own connectors, those of inner parts left out, each with its connector."""
         passed = {connector for connector, _, _ in self.passed}
         return ((name, flow) for name, kind in self.connectors if name not in passed for flow in kind.flows)
+
+    @property
+    def linear_equations(self) -> tuple[Equation, ...]:
+        """The equations of a linear analysis."""
+        if self.linearized is None:
+            return self.equations
+        replaced = {format_expression(equation.left): equation for equation in self.linearized.equations}
+        return tuple(replaced.get(format_expression(equation.left), equation) for equation in self.equations)
 
     @property
     def depth(self) -> int:

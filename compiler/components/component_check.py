@@ -18,7 +18,7 @@ from fractions import Fraction
 from itertools import count
 from typing import TypeVar
 
-from apc.compiler.components.component import OTHERS, Component, Option, Send, option_test
+from apc.compiler.components.component import OTHERS, Component, Linearized, Option, Send, option_test
 from apc.compiler.errors import Mistakes, Place, place_in
 from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND, Dimension
 from apc.compiler.language.expression import (
@@ -103,7 +103,7 @@ class ComponentNames:
                 named = entries(send.name, len(each) if len(each) > 1 else 0)
                 pairs = zip(named, each, strict=True)
                 sent += [replace(send, name=n, expression=item, dimension=dimension) for n, item in pairs]
-        component = self.component
+        component, linearized = self.component, self.component.linearized
         if not mistakes:
             for send in sends:
                 with mistakes:
@@ -111,12 +111,31 @@ class ComponentNames:
             for equation in component.equations:
                 with mistakes:
                     equations += self._checked(equation, mistakes)
+            if linearized is not None:
+                linearized = self._checked_linearized(linearized, equations, mistakes)
         return replace(
             component,
             locals=(*component.locals, *locals_),
             sends=(*component.sends, *sent),
             equations=tuple(equations),
+            linearized=linearized,
         )
+
+    def _checked_linearized(
+        self, linearized: Linearized, equations: Collection[Equation], mistakes: Mistakes
+    ) -> Linearized:
+        """Return the equations of a linear analysis, each checked to replace one of the component."""
+        replaced: list[Equation] = []
+        lefts = {format_expression(equation.left) for equation in equations}
+        for equation in linearized.equations:
+            with mistakes:
+                for written in self._checked(equation, mistakes):
+                    left = format_expression(written.left)
+                    if left not in lefts:
+                        what = f"linearized: no equation of {self.component.name} has {left} on its left"
+                        raise unknown("E514", equation.place, what, left, sorted(lefts))
+                    replaced.append(written)
+        return replace(linearized, equations=tuple(replaced))
 
     def _infer_locals(self, sends: Collection[Send]) -> list[tuple[str, Dimension]]:
         """Return the undeclared names that stand alone on the left of an equation, a vector's entry by entry.

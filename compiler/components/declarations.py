@@ -20,6 +20,7 @@ from itertools import chain
 
 from apc.compiler.components.component import (
     ROLES,
+    Linearized,
     Named,
     Number,
     Option,
@@ -36,6 +37,7 @@ from apc.compiler.language.units import Unit, parse_quantity, parse_unit, quanti
 from apc.compiler.language.values import AlreadyReportedError, Value, text_place
 from apc.compiler.language.vectors import SIZES
 from apc.compiler.language.vectors import entries as names_of
+from apc.compiler.source.nodes import Mapping as NodeMapping
 from apc.compiler.source.nodes import Node, Scalar, Sequence
 from apc.compiler.source.reading import (
     Body,
@@ -81,6 +83,33 @@ def read_equations(root: Body, mistakes: Mistakes) -> tuple[tuple[Equation, ...]
             equations.append(parse_equation(text, text_place(item)))
             undefined.difference_update(defined)
     return tuple(equations), undefined
+
+
+def read_linearized(root: Body, mistakes: Mistakes) -> Linearized | None:
+    """Read `linearized: {equations: [f = b*v], valid: speeds above the threshold}`, or one equation alone.
+
+    Parameters
+    ----------
+    root
+        The definition.
+    mistakes
+        Takes those of equations.
+    """
+    node = root.nodes.get("linearized")
+    if node is None:
+        return None
+    valid, items = "", (node,)
+    if isinstance(node, NodeMapping):
+        body = Body(node, ("equations", "valid"), "linearized", root.mistakes)
+        valid, items = body.text("valid"), body.read("equations", _items, ())
+    elif isinstance(node, Sequence):
+        items = node.items
+    equations = []
+    for item in items:
+        with mistakes:
+            text = text_of(item, "an equation", "linearized: a = b")
+            equations.append(parse_equation(text, text_place(item)))
+    return Linearized(tuple(equations), valid)
 
 
 def _items(node: Node, what: str) -> tuple[Node, ...]:

@@ -25,6 +25,7 @@ from apc.compiler.components.component import (
 from apc.compiler.components.component_check import ComponentNames, check_balance
 from apc.compiler.components.declarations import (
     read_equations,
+    read_linearized,
     read_parameters,
     read_sends,
     read_variables,
@@ -55,7 +56,7 @@ from apc.compiler.words import counted
 CONNECTOR = ("connector", "about", "source", "potentials", "flows")
 COMPONENT = (
     *("component", "about", "source", "peers", "extends", "connectors", "parameters", "variables"),
-    *("parts", "connect", "sends", "equations"),
+    *("parts", "connect", "sends", "equations", "linearized"),
 )
 DEEPEST = 10  # levels of parts inside parts
 
@@ -81,7 +82,8 @@ def read_component(source: Source, library: Definitions) -> Component:
     root = Body(mapping_of(source.root, "a component definition"), COMPONENT, "a component", mistakes)
     equations, undefined = read_equations(root, unread)
     draft = _read_declarations(root, library, mistakes)
-    draft = replace(draft, equations=(*draft.equations, *equations))
+    linearized = read_linearized(root, unread) or draft.linearized
+    draft = replace(draft, equations=(*draft.equations, *equations), linearized=linearized)
     sends = read_sends(root, unread)
     if mistakes:
         unread.pass_on(mistakes)

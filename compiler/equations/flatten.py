@@ -184,8 +184,11 @@ class FlatSystem:
     kinds: tuple[FlatKind, ...]
 
 
-def flatten(scene: Scene) -> FlatSystem:
-    """Write out the equations of every kind. Raises ApcError with every mistake found on the way."""
+def flatten(scene: Scene, *, linear: bool = False) -> FlatSystem:
+    """Write out the equations of every kind; `linear` those of a linear analysis.
+
+    Raises ApcError with every mistake found on the way.
+    """
     mistakes = Mistakes(scene.names)
     structures: dict[object, list[SceneGroup]] = {}
     for group in scene.groups:
@@ -195,7 +198,7 @@ def flatten(scene: Scene) -> FlatSystem:
     for groups in structures.values():
         first = groups[0]
         parts = [_with_words(part, dict(first.words)) for part in scene.parts if first.name in part.groups]
-        kind = _flat_kind("", parts, mistakes)
+        kind = _flat_kind("", parts, mistakes, linear=linear)
         joints = connection_equations(parts, mistakes)
         equations = (FlatEquation(left, right, CONNECTION, None, place) for left, right, place in joints)
         kind = replace(kind, equations=(*kind.equations, *equations))
@@ -245,7 +248,7 @@ def _with_words(part: Part, words: Mapping[str, str]) -> Part:
     return replace(part, options=own(part.options), references=own(part.references))
 
 
-def _flat_kind(name: str, parts: Sequence[Part], mistakes: Mistakes) -> FlatKind:
+def _flat_kind(name: str, parts: Sequence[Part], mistakes: Mistakes, *, linear: bool = False) -> FlatKind:
     """Write out parts, without their connections."""
     variables: list[FlatVariable] = []
     equations: list[FlatEquation] = []
@@ -264,7 +267,7 @@ def _flat_kind(name: str, parts: Sequence[Part], mistakes: Mistakes) -> FlatKind
             ),
         ]
         variables += [FlatVariable(f"{part.name}.{its}", unit, variable) for its, unit, variable in own]
-        for equation in component.equations:
+        for equation in component.linear_equations if linear else component.equations:
             left, right = (writer.written(item, equation) for item in (equation.left, equation.right))
             equations.append(FlatEquation(left, right, part.name, writer.clock, equation.place, equation))
         for send in component.sends:

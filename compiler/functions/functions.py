@@ -10,6 +10,7 @@ Does not: write files, or put numbers in the place of parameters.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import casadi
@@ -24,6 +25,7 @@ from apc.compiler.compiled import (
     Limit,
     Ports,
     Receive,
+    Replaced,
     SendPartition,
     State,
 )
@@ -48,7 +50,7 @@ from apc.compiler.functions.scene_data import (
     with_rounded,
 )
 from apc.compiler.language.dimensions import Dimension
-from apc.compiler.language.expression import names
+from apc.compiler.language.expression import format_expression, names
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.vectors import whole_and_index
 from apc.compiler.scene.instances import Part
@@ -57,18 +59,37 @@ from apc.compiler.scene.oddities import warning_texts
 WORK = Dimension((("kg", 1), ("m", 2), ("s", -2)))  # the joule
 
 
-def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
-    """Write every kind as CasADi functions, and what lies between the sites beside them."""
+def build_functions(
+    system: SortedSystem, origin: Origin, *, linear: SortedSystem | None = None
+) -> CompiledSystem:
+    """Write every kind as CasADi functions, and the network between the peers as data.
+
+    Parameters
+    ----------
+    system, origin
+        The sorted equations, and the texts they are from.
+    linear
+        The sorted equations of linear analyses, where those differ.
+    """
     scene = system.scene
     timings = Timings(scene)
-    writers = [Writer(kind) for kind in system.kinds]
-    before, heard = -1, list[str]()
-    while before < (before := sum(len(writer.known) for writer in writers)):  # until nothing new is read
-        for writer in writers:
-            writer.follow(heard)
-        receives = (number for writer in writers for number in writer.read(writer.kind.receives))
-        heard = list(dict.fromkeys(name for receive in receives for name in receive.sends))
-    kinds = [_kind(writer, heard, timings) for writer in writers]
+    writers, heard = _followed(system)
+    kinds = []
+    if linear is None:
+        kinds = [_kind(writer, heard, timings) for writer in writers]
+    else:
+        linear_writers, linear_heard = _followed(linear)
+        for writer, other in zip(writers, linear_writers, strict=True):
+            for name in {**writer.parameters, **other.parameters}:  # one vector serves both
+                writer.parameter(name)
+                other.parameter(name)
+            replaced = tuple(_replaced(writer.kind))
+            kind = _kind(writer, heard, timings)
+            if replaced:
+                of_analysis = _kind(other, linear_heard, timings)
+                _check_states(writer.kind, kind, of_analysis)
+                kind = replace(kind, linear=of_analysis, replaced=replaced)
+            kinds.append(kind)
     dropped = []
     for kind, writer in zip(system.kinds, writers, strict=True):
         unread = (hold.variable for hold in kind.clocked.holds if symbol(hold.symbol) not in writer.known)
@@ -108,6 +129,43 @@ def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
             if link.within and link.name in used
         ),
     )
+
+
+def _followed(system: SortedSystem) -> tuple[list[Writer], list[str]]:
+    """Return a writer of each kind, with all that is needed written, and the names that are received."""
+    writers = [Writer(kind) for kind in system.kinds]
+    before, heard = -1, list[str]()
+    while before < (before := sum(len(writer.known) for writer in writers)):  # until nothing new is read
+        for writer in writers:
+            writer.follow(heard)
+        receives = (number for writer in writers for number in writer.read(writer.kind.receives))
+        heard = list(dict.fromkeys(name for receive in receives for name in receive.sends))
+    return writers, heard
+
+
+def _replaced(kind: SortedKind) -> Iterable[Replaced]:
+    """Yield the parts of a kind that other equations represent in a linear analysis."""
+    for part in kind.clocked.flat.parts:
+        if (linearized := part.component.linearized) is not None:
+            texts = (
+                f"{format_expression(equation.left)} = {format_expression(equation.right)}"
+                for equation in linearized.equations
+            )
+            yield Replaced(part.name, tuple(texts), linearized.valid)
+
+
+def _check_states(kind: SortedKind, full: Kind, linear: Kind) -> None:
+    """Refuse equations of a linear analysis that have other states or held values."""
+    for whole, own in (
+        ([state.name for state in full.states], [state.name for state in linear.states]),
+        ([hold.name for hold in full.holds], [hold.name for hold in linear.holds]),
+    ):
+        if whole != own:
+            part = next(part for part in kind.clocked.flat.parts if part.component.linearized is not None)
+            names = ", ".join(sorted(set(whole) ^ set(own)))
+            what = f"linearized of {part.component.name}: {names} would be in one set of equations only"
+            hint = "equations that keep the same states and held values"
+            raise ApcError(Mistake("E514", part.component.place, what, hint=hint))
 
 
 def _kind(writer: Writer, heard: Iterable[str], timings: Timings) -> Kind:

@@ -18,7 +18,9 @@ from typing import Any, Unpack
 
 import numpy as np
 
+from apc.analysis.elements import replaced_elements
 from apc.analysis.plan import cannot_serve, make_plan, refuse_varying
+from apc.analysis.sides import Side, SideVerdict, sides, worst_side
 from apc.compiler.compiled import LENGTH, CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
@@ -40,7 +42,7 @@ from apc.frame.ages import linear_sites
 from apc.frame.discretize import TOO_LARGE
 from apc.frame.exchange import Exchange
 from apc.frame.finite_equations import finite_equations
-from apc.frame.instance import Instance, Prepared, instance, starting
+from apc.frame.instance import Instance, Prepared, instance, prepare, starting
 from apc.frame.names import Free
 from apc.network.nominal import left_out, unreliable
 from apc.result import Look, Result
@@ -64,7 +66,8 @@ class Analysis(Result):
     `left_out` says what of the scene the answer does not look at. Of the rigid modes
     `translations` and `rotations` move something; the others are of what `unfelt` names, memories that
     nothing reads at these values. `beyond` is how much larger than 1 the radius is, at least and at most,
-    where that was proved: closer to 1, maybe, than two floats.
+    where that was proved: closer to 1, maybe, than two floats. `sides` are the verdicts of all sides of the
+    kinks at which peers start, none where nothing has a kink; the analysis is that of the worst side.
     """
 
     shown_by = "analysis_output:analysis"
@@ -88,6 +91,7 @@ class Analysis(Result):
     rotations: int = 0
     unfelt: tuple[str, ...] = ()
     beyond: tuple[float, float] | None = None
+    sides: tuple[SideVerdict, ...] = ()
 
     def plot(self, ax: Any = None, **look: Unpack[Look]) -> Any:
         """Draw the eigenvalues over the unit circle into a matplotlib Axes, or a figure's, as `look` says."""
@@ -111,7 +115,8 @@ def prepare_at_start(
 ) -> Prepared | None:
     """Return what was prepared with every kind linearized where it starts, as its parameters say.
 
-    None where that can't be: see `instance.starting`.
+    None where that can't be: see `instance.starting`; and where peers start at a kink: each point is then
+    analyzed on all sides.
 
     Parameters
     ----------
@@ -125,9 +130,11 @@ def prepare_at_start(
     Raises
     ------
     ApcError
-        As `plan.refuse_varying`.
+        As `plan.refuse_varying` and `sides.sides`.
     """
     refuse_varying(system, prepared.jacobians)
+    if sides(system, prepared)[0].system is not system:
+        return None
     return starting(system, prepared, varied)
 
 
@@ -143,13 +150,22 @@ def near_start(system: CompiledSystem, prepared: Prepared | None = None) -> tupl
         From `prepare`, of this system with any numbers.
     """
     sites = prepared.jacobians if prepared else linear_sites(system)
+    elements = replaced_elements(system)
     if all(sites[group.kind].affine for group in system.groups):
-        return ()
+        return elements
     try:
-        groups, _ = lifted_groups(system, prepared=prepared)
+        listed = sides(system, prepared or prepare(system))
+        groups, _ = lifted_groups(listed[0].system, prepared=listed[0].prepared)
     except ApcError:  # at these values there is no answer
-        return (NOT_LINEAR,)
-    return _near_start(groups)
+        return (*elements, NOT_LINEAR)
+    return (*_of_sides([side.name for side in listed]), *elements, *_near_start(groups))
+
+
+def _of_sides(names: Sequence[str]) -> tuple[str, ...]:
+    """Return the limitation of an answer at a kink."""
+    if len(names) < 2:
+        return ()
+    return (f"peers start at a kink ({'; or '.join(names)}): the worse side decides",)
 
 
 def _near_start(groups: Sequence[PeerGroup]) -> tuple[str, ...]:
@@ -165,7 +181,9 @@ def analyze(
     prepared: Prepared | None = None,
     certify: bool = False,
 ) -> Analysis:
-    """Analyse a system by the method that serves it, or by one that is asked for.
+    """Analyze a system by the method that serves it, or by one that is asked for.
+
+    Where peers start at a kink every side is analyzed, and the result is that of the worst one.
 
     Parameters
     ----------
@@ -185,8 +203,36 @@ def analyze(
     ------
     ApcError
         E804 a system of too many states for its matrix, E806 numbers beyond floats, E850 a method that can't
-        serve this scene; and those of `plan.refuse_varying` and `peers.peer_groups`.
+        serve this scene; and those of `sides.sides`, `plan.refuse_varying` and `peers.peer_groups`.
     """
+    return analyze_sides(system, method=method, prepared=prepared, certify=certify)[0]
+
+
+def analyze_sides(
+    system: CompiledSystem, *, method: str, prepared: Prepared | None, certify: bool
+) -> tuple[Analysis, Side]:
+    """Return the analysis of the worst side, and that side.
+
+    Parameters
+    ----------
+    system, method, prepared, certify
+        As for `analyze`.
+    """
+    listed = sides(system, prepared or prepare(system))
+    each = [_analyze(side.system, method=method, prepared=side.prepared, certify=certify) for side in listed]
+    verdicts = tuple(
+        SideVerdict(side.name, one.verdict, one.stable, one.spectral_radius, one.spectral_radius_error)
+        for side, one in zip(listed, each, strict=True)
+    )
+    worst = worst_side(verdicts)
+    if len(listed) == 1:
+        return each[0], listed[0]
+    limitations = (*_of_sides([side.name for side in listed]), *each[worst].left_out)
+    return replace(each[worst], sides=verdicts, left_out=limitations), listed[worst]
+
+
+def _analyze(system: CompiledSystem, *, method: str, prepared: Prepared, certify: bool) -> Analysis:
+    """Analyze a system without kinks."""
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         scene = instance(system, prepared)
         plan = make_plan(scene, method)
@@ -207,7 +253,9 @@ def analyze(
             raise cannot_serve(system, method, "what a frame's ticks round hides the peers' own eigenvalues")
         if certify and (not plan.groups or plan.method == "determinant"):
             notes = (*notes, f"not proved, as method {plan.method} has no matrix of balls")
-        linearized = not scene.affine
+        nonlinear = not scene.affine
+        elements = replaced_elements(system)
+        linearized = nonlinear or bool(elements)
         population = () if plan.loops else representatives(scene)
         stands = _what_stands(spectrum, plan.loops, population)
         verdict, stable = spectrum.verdict, spectrum.stable
@@ -233,7 +281,7 @@ def analyze(
         linearized=linearized,
         notes=(*plan.notes, *notes, *spectrum.notes),
         proof=proof,
-        left_out=(*(_near_start(plan.groups) if linearized else ()), *left_out(system)),
+        left_out=(*elements, *(_near_start(plan.groups) if nonlinear else ()), *left_out(system)),
         unfelt=stands.names,
         translations=stands.translations,
         rotations=stands.rotations,

@@ -18,12 +18,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from apc.analysis.analysis import analyze
-from apc.analysis.switches import SwitchingPart, switching_parts
+from apc.analysis.switches import SwitchingPart, bind, switching_parts
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.timings import part
 from apc.eigen.spectrum import UNSTABLE
-from apc.frame.decisions import SwitchedKind, bind, find_switches
+from apc.frame.decisions import SwitchedKind, find_switches
 from apc.frame.instance import Prepared, prepare
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.linearize import linearize

@@ -27,13 +27,14 @@ from numpy.typing import NDArray
 
 from apc.analysis.contact_modes import parts_of_kinds, settings
 from apc.analysis.pushes import Push, push_of
+from apc.analysis.switches import bind
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.closing import Loop, close_loop, close_outside, lay_out
 from apc.eigen.modes import loops_at_right_angles
 from apc.eigen.peers import PeerGroup, peer_groups
 from apc.eigen.relative import relative_coordinates, relative_rows, with_doubt
 from apc.eigen.rigid import find_rigid_modes
-from apc.frame.decisions import bind, find_switches
+from apc.frame.decisions import find_switches
 from apc.frame.discretize import discretize
 from apc.frame.exchange import build_exchange
 from apc.frame.instance import Prepared, instance

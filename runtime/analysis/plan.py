@@ -13,13 +13,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from apc.analysis.methods import METHODS, PAPER
+from apc.analysis.switches import varying_slopes
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import Loop
 from apc.eigen.graph_loops import common_graph
 from apc.eigen.modes import arrange, dense_loop, refuse_dense
 from apc.eigen.peers import MOST_STATES, PeerGroup, more_differ, peer_groups, too_large, used_ways
-from apc.frame.decisions import varying_slopes
 from apc.frame.exchange import Exchange
 from apc.frame.instance import Instance
 from apc.frame.jacobians import SiteJacobians

@@ -1,7 +1,7 @@
 """Where a peer's equations switch between linear pieces: contacts, walls, limits.
 
 Takes: a kind of a `CompiledSystem` with its decisions.
-Gives: `SwitchingPart`, `switching_parts`.
+Gives: `SwitchingPart`, `switching_parts`; `bind`, `varying_slopes`.
 Guarantees: decisions that change something in common are one part.
 Does not: find the decisions (see `frame.decisions`).
 """
@@ -9,17 +9,19 @@ Does not: find the decisions (see `frame.decisions`).
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import casadi
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.frame.decisions import Decision, SwitchedKind, bound_kind
-from apc.frame.jacobians import SiteJacobians, jacobians
+from apc.compiler.interpolation import jacobian
+from apc.frame.decisions import Decision, SwitchedKind, bound_kind, find_switches
+from apc.frame.jacobians import SiteJacobians, jacobians, with_equations
 from apc.frame.linearize import start_values
 
 # A part with more decisions than this is refused: its pieces are as many as 2 to that power.
@@ -70,6 +72,37 @@ def switching_parts(switched: SwitchedKind, parameters: NDArray[np.float64]) -> 
         if pair is not None:
             parts.append(SwitchingPart(name, places, *pair))
     return tuple(parts)
+
+
+def varying_slopes(site: SiteJacobians) -> tuple[str, ...]:
+    """Return the names of what has slopes that change with time in some piece, whatever else moves.
+
+    Of a kind with a nonlinear loop nothing is known: all that is in the loop depends on all that drives it.
+    """
+    if not site.timed:
+        return ()
+    result: dict[str, None] = {}
+    for function in find_switches(site.kind).functions:
+        *moving, _, t = function.inputs
+        slopes = jacobian(function.output, casadi.vertcat(*moving))
+        result |= dict.fromkeys(function.names(slopes, t))
+    return tuple(result)
+
+
+def bind(switched: SwitchedKind, base: SiteJacobians, settings: Mapping[int, bool]) -> SiteJacobians:
+    """Return the Jacobians of a kind with every decision set.
+
+    Parameters
+    ----------
+    switched
+        The kind.
+    base
+        Its ordinary Jacobians: states, start values and structural patterns stay theirs, so that every piece
+        has the same frame and the same states.
+    settings
+        By the place of the decision; what is left out is off.
+    """
+    return with_equations(base, bound_kind(switched, settings))
 
 
 def _together(decisions: Sequence[Decision]) -> list[tuple[int, ...]]:

@@ -29,6 +29,7 @@ def check_command(
 
     Exit code 0 if there is none, 1 otherwise.
     """
+    from apc.analysis.elements import replaced_elements
     from apc.compiler.pipeline import check_definition, compile_topology
     from apc.frame.start_checks import check_values
     from apc.inputs import find_input
@@ -41,7 +42,7 @@ def check_command(
     system = compile_topology(path)
     check_values(system)
     tell(f"{path}: no mistakes. {system.name}, {counted(system.peers, 'peer')}.")
-    for line in warning_lines(system.warnings):
+    for line in warning_lines((*system.warnings, *replaced_elements(system))):
         tell(line)
 
 

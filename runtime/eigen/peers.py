@@ -252,18 +252,10 @@ def _peer_groups(instance: Instance) -> tuple[PeerGroup, ...]:
     """Group peers of equal matrices; where the start matters, those that start alike among such others."""
     exchange = instance.exchange
     by_matrices = all(site.parameters_suffice for site in instance.sites)
-    classes = _classes(instance, by_matrices=by_matrices)
+    classes = _classes(instance, by_matrices=True) if by_matrices else start_classes(instance)
     heard: list[tuple[Listening | None, Gains]] = [(None, {})] * len(classes)
     places = list(range(len(classes)))
     if not by_matrices:
-        links = {way.link for way in used_ways(instance.schedules)}
-        if not all(map(exchange.is_complete, links)):  # who hears whom may differ from peer to peer
-            each = itertools.islice(itertools.chain.from_iterable(classes), MOST_DIFFERENT + 1)
-            classes = [Peers((range(peer, peer + 1),)) for peer in each]
-        if len(classes) > MOST_DIFFERENT:
-            what = f"more than {MOST_DIFFERENT} peers that differ, in their place in a graph or at the start,"
-            raise ApcError(Mistake("E804", Place(exchange.scene), f"{what} can't be linearized pair by pair"))
-        classes.sort(key=lambda peers: peers.first)
         starting = StartClasses(instance, classes)
         listened = [starting.listen(g) for g in range(len(classes))]
         places, classes = _merged(starting, listened, classes)
@@ -273,6 +265,26 @@ def _peer_groups(instance: Instance) -> tuple[PeerGroup, ...]:
         build_group(instance, place, peers, *heard[place])
         for place, peers in zip(places, classes, strict=True)
     )
+
+
+def start_classes(instance: Instance) -> list[Peers]:
+    """Return the peers in classes of equal start values that receive from the same peers.
+
+    Raises
+    ------
+    ApcError
+        E804 more than MOST_DIFFERENT classes.
+    """
+    exchange = instance.exchange
+    classes = _classes(instance, by_matrices=False)
+    links = {way.link for way in used_ways(instance.schedules)}
+    if not all(map(exchange.is_complete, links)):  # the senders may differ from peer to peer
+        each = itertools.islice(itertools.chain.from_iterable(classes), MOST_DIFFERENT + 1)
+        classes = [Peers((range(peer, peer + 1),)) for peer in each]
+    if len(classes) > MOST_DIFFERENT:
+        what = f"more than {MOST_DIFFERENT} peers that differ, in their place in a graph or at the start,"
+        raise ApcError(Mistake("E804", Place(exchange.scene), f"{what} can't be linearized pair by pair"))
+    return sorted(classes, key=lambda peers: peers.first)
 
 
 def _merged(

@@ -68,7 +68,9 @@ def at_timings(
 def nominal(
     system: CompiledSystem, timings: Mapping[str, Fraction] | None = None, order: Sequence[str] = ORDER
 ) -> CompiledSystem:
-    """Return a scene whose ages are those that each tick finds if every packet arrives after its delay.
+    """Return the kinds of a linear analysis, with the ages that each tick finds on a nominal network.
+
+    There every packet arrives after its link's delay.
 
     Parameters
     ----------
@@ -84,6 +86,7 @@ def nominal(
     ApcError
         E811 peers of one kind that hear packets of several ages at one tick.
     """
+    system = replace(system, kinds=tuple(kind.linear or kind for kind in system.kinds))
     if not aged(system):
         return system
     if timings is None:

@@ -1,7 +1,7 @@
 """The decisions in a peer's equations: comparisons, max, min, abs and sign of what moves.
 
 Takes: a kind of a `CompiledSystem`.
-Gives: `Decision`, `SwitchedKind`, `find_switches`, `bind`, `bound_kind`; `varying_slopes`.
+Gives: `Decision`, `SwitchedKind`, `functions_of`, `find_switches`, `bound_kind`, `decided_kind`.
 Guarantees: found in the equations themselves: a comparison, an `if`, a `max`, `min`, `abs` or `sign` of
 something that moves is a decision, whatever the part is called.
 Does not: know which pieces a motion can reach, or switch what depends on time and parameters alone.
@@ -23,21 +23,35 @@ from typing import Any
 import casadi
 
 from apc.compiler.compiled import Kind
-from apc.compiler.interpolation import Interpolation, jacobian
+from apc.compiler.interpolation import Interpolation
 from apc.compiler.plain import LOOK, straight, symbolic, walk
-from apc.frame.jacobians import SiteJacobians, jacobians
 
-# Equal, not equal: of things that move they are so at an instant at most.
-_POINTS = {"eq": 0.0, "ne": 1.0}
+# Equal, not equal: what moves is equal to something at an instant at most, and on no side of it.
+_POINTS = ("eq", "ne")
+# Decisions whose symbol is 1 where the guard is positive; of all others it is where the guard is negative.
+_ABOVE = ("fmax", "sign")
+# Kinds whose decisions are remembered.
+KEPT = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Decision:
-    """A decision: its symbol, the names of what it changes, and `guard`, which is zero where it is taken."""
+    """A decision: its symbol, the names of the rows it changes, and its `guard`, zero at the switching point.
+
+    The symbol is 1 where the guard is positive if `above`, where it is zero if `point`, else where it is
+    negative. A guard may depend on the symbols of earlier decisions. What is decided at a point alone is part
+    of no piece and names no change.
+    """
 
     symbol: Any  # casadi.SX
     changes: tuple[str, ...]
     guard: Any  # casadi.SX
+    above: bool
+    point: bool
+
+    def holds(self, guard: Any) -> Any:
+        """Return whether the decision is taken at values of its guard: numbers, or symbols of CasADi."""
+        return guard == 0 if self.point else guard > 0 if self.above else guard < 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,12 +74,16 @@ class _Opened:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SwitchedKind:
-    """A kind with its decisions laid open. `walkable` is False where a nonlinear loop hides them."""
+    """A kind with its decisions laid open. `walkable` is False where a nonlinear loop hides them.
+
+    All functions share the symbols of `columns`, by name: x, u, p, t, and m, r and s of each clock and link.
+    """
 
     kind: Kind
     decisions: tuple[Decision, ...]
     functions: tuple[_Opened, ...]
     walkable: bool
+    columns: Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +103,8 @@ class _Walk:
         self.numbers: dict[Any, int] = {}
         self.symbols: dict[int, Any] = {}
         self.operands: dict[int, list[Any]] = {}
+        self.words: dict[int, str] = {}
+        self.columns: dict[str, Any] = {}
 
     def number(self, key: Any) -> int:
         return self.numbers.setdefault(key, len(self.numbers))
@@ -95,6 +115,7 @@ class _Walk:
         if number not in self.symbols:
             self.symbols[number] = casadi.SX.sym(f"d{len(self.symbols)}")
             self.operands[number] = [operand.expression for operand in operands]
+            self.words[number] = word
         return _Step(self.symbols[number], number, moves=False, decided=True)
 
     def open(self, function: Any, names: Sequence[str]) -> tuple[tuple[Any, ...], Any]:
@@ -103,7 +124,10 @@ class _Walk:
         `names` are the arguments', "p" and "t" those that do not move.
         """
         plain_function = straight(function)
-        inputs = tuple(casadi.SX.sym(name, function.sparsity_in(i)) for i, name in enumerate(names))
+        for place, name in enumerate(names):
+            if name not in self.columns:
+                self.columns[name] = casadi.SX.sym(name, function.sparsity_in(place))
+        inputs = tuple(self.columns[name] for name in names)
         steps = [
             _Step(entry, self.number((name, place)), name not in ("p", "t"), decided=False)
             for name, expression in zip(names, inputs, strict=True)
@@ -136,24 +160,32 @@ class _Walk:
         if moves and word in ("lt", "le"):
             return self.decide(word, operands)
         if moves and word in _POINTS:
-            return _Step(casadi.SX(_POINTS[word]), number, False, False)
+            equal = self.decide("eq", operands)
+            return equal if word == "eq" else _Step(1 - equal.expression, number, False, True)
         if moves and word in ("fmin", "fmax"):
             d = self.decide(word, operands).expression
-            return _Step(d * values[0] + (1 - d) * values[1], number, True, True)
+            return _Step(_branch(d, *values), number, True, True)
         if moves and word in ("fabs", "sign"):
             d = self.decide("sign", operands).expression
-            value = (2 * d - 1) * values[0] if word == "fabs" else 2 * d - 1
+            value = _branch(d, values[0], -values[0]) if word == "fabs" else 2 * d - 1
             return _Step(value, number, word == "fabs", True)
         if word == "if_else_zero" and operands[0].decided:
-            return _Step(values[0] * values[1], number, moves, True)
+            return _Step(symbolic(word)(*values), number, moves, True)
         return _Step(symbolic(word)(*values), number, moves, decided)
 
 
+def _branch(decision: Any, then: Any, otherwise: Any) -> Any:
+    """Return a choice between two expressions; the one not taken may be infinite."""
+    choose = symbolic("if_else_zero")
+    return choose(decision, then) + choose(1 - decision, otherwise)
+
+
+@functools.lru_cache(maxsize=KEPT)
 def find_switches(kind: Kind) -> SwitchedKind:
     """Lay a kind's decisions open."""
-    functions = _functions(kind)
+    functions = functions_of(kind)
     if not all(function.is_a("SXFunction") for _, function, _, _ in functions):
-        return SwitchedKind(kind, (), (), walkable=False)
+        return SwitchedKind(kind, (), (), walkable=False, columns={})
     opening = _Walk()
     opened = tuple(
         _Opened(where, *opening.open(function, names), rows) for where, function, names, rows in functions
@@ -166,42 +198,13 @@ def find_switches(kind: Kind) -> SwitchedKind:
                 changed |= dict.fromkeys(_changed(kind, item, symbol, opening.operands[number]))
         first, *others = opening.operands[number]
         # Of a sign there is one operand.
-        decisions.append(Decision(symbol, tuple(changed), first - others[0] if others else first))
-    return SwitchedKind(kind, tuple(decisions), opened, walkable=True)
+        guard, word = first - others[0] if others else first, opening.words[number]
+        names = () if word == "eq" else tuple(changed)
+        decisions.append(Decision(symbol, names, guard, word in _ABOVE, word == "eq"))
+    return SwitchedKind(kind, tuple(decisions), opened, walkable=True, columns=opening.columns)
 
 
-def varying_slopes(site: SiteJacobians) -> tuple[str, ...]:
-    """Return the names of what has slopes that change with time in some piece, whatever else moves.
-
-    Of a kind with a nonlinear loop nothing is known: all that is in the loop depends on all that drives it.
-    """
-    if not site.timed:
-        return ()
-    result: dict[str, None] = {}
-    for function in find_switches(site.kind).functions:
-        *moving, _, t = function.inputs
-        slopes = jacobian(function.output, casadi.vertcat(*moving))
-        result |= dict.fromkeys(function.names(slopes, t))
-    return tuple(result)
-
-
-def bind(switched: SwitchedKind, base: SiteJacobians, settings: Mapping[int, bool]) -> SiteJacobians:
-    """Return the Jacobians of a kind with every decision set.
-
-    Parameters
-    ----------
-    switched
-        The kind.
-    base
-        Its ordinary Jacobians: states, start values and structural patterns stay theirs, so that every piece
-        has the same frame and the same states.
-    settings
-        By the place of the decision; what is left out is off.
-    """
-    return replace(jacobians(bound_kind(switched, settings)), kind=base.kind, pattern=base.pattern)
-
-
-def _functions(kind: Kind) -> list[tuple[tuple[str, int, int], Any, tuple[str, ...], tuple[str, ...]]]:
+def functions_of(kind: Kind) -> list[tuple[tuple[str, int, int], Any, tuple[str, ...], tuple[str, ...]]]:
     """Return a kind's functions: where each stands, itself, its arguments' names, and those of its rows."""
     states = tuple(state.name for state in kind.states)
     listed: list[tuple[tuple[str, int, int], Any, tuple[str, ...], tuple[str, ...]]] = [
@@ -212,7 +215,8 @@ def _functions(kind: Kind) -> list[tuple[tuple[str, int, int], Any, tuple[str, .
         listed.append((("tick", p, 0), partition.tick, names, partition.outputs))
         for place, receive in enumerate(partition.receives):
             if receive.edge is not None:
-                edge = ("x", "u", f"m{p}", f"s {receive.link}", "p", "t")
+                sent = f"s{receive.edge.numel_in(3)} {receive.link}"  # an age may be a further row
+                edge = ("x", "u", f"m{p}", sent, "p", "t")
                 listed.append((("edge", p, place), receive.edge, edge, (receive.name,)))
     listed += [
         (("send", p, 0), send.send, ("x", "u", "p", "t"), send.channels) for p, send in enumerate(kind.sends)
@@ -245,14 +249,19 @@ def _changed(kind: Kind, opened: _Opened, symbol: Any, operands: Sequence[Any]) 
 
 def bound_kind(switched: SwitchedKind, settings: Mapping[int, bool]) -> Kind:
     """Return the kind with its decisions set to numbers; those left out are off."""
+    numbers = [casadi.SX(float(settings.get(place, False))) for place in range(len(switched.decisions))]
+    return decided_kind(switched, numbers)
+
+
+def decided_kind(switched: SwitchedKind, values: Sequence[Any]) -> Kind:
+    """Return the kind with an expression (casadi.SX) in place of each decision's symbol."""
     symbols = casadi.vertcat(*(decision.symbol for decision in switched.decisions))
-    values = casadi.vertcat(
-        *(casadi.SX(float(settings.get(place, False))) for place in range(len(switched.decisions)))
-    )
     result: dict[tuple[str, int, int], Any] = {}
     for function in switched.functions:
         output = (
-            casadi.substitute(function.output, symbols, values) if switched.decisions else function.output
+            casadi.substitute(function.output, symbols, casadi.vertcat(*values))
+            if switched.decisions
+            else function.output
         )
         result[function.where] = casadi.Function(
             function.where[0], list(function.inputs), [casadi.sparsify(output)]

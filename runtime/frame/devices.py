@@ -189,7 +189,7 @@ def coupled_directly(kinds: tuple[Kind, ...]) -> bool:
     kinds
         Those of a scene.
     """
-    if any(_keeps_to_itself(jacobians(kind)) for kind in kinds):
+    if any(_keeps_to_itself(jacobians(analyzed(kind))) for kind in kinds):
         return False
     parts = [{_part(state.name) for state in kind.states} for kind in kinds]
     gripped = [{part for part in own if _grips(kind, part)} for kind, own in zip(kinds, parts, strict=True)]
@@ -354,7 +354,7 @@ def devices_of(system: CompiledSystem, *, option: str) -> dict[int, Device]:
     numbers, direct = resolve(system), coupled_directly(system.kinds)
     result: dict[int, Device] = {}
     for place, group in enumerate(system.groups):
-        site = jacobians(system.kinds[group.kind])
+        site = jacobians(analyzed(system.kinds[group.kind]))
         device = find_device(site, numbers.parameters[place][0], unit_of, direct=direct)
         if isinstance(device, str):
             raise ApcError(Mistake("E931", Place(system.origin.topology), f"{option}: {device}"))
@@ -379,7 +379,7 @@ def directions_of(system: CompiledSystem) -> dict[str, CompiledSystem]:
     numbers, direct = resolve(system), coupled_directly(system.kinds)
     wanted: dict[str, None] = {}
     for place, group in enumerate(system.groups):
-        site = jacobians(system.kinds[group.kind])
+        site = jacobians(analyzed(system.kinds[group.kind]))
         result = find_devices(site, numbers.parameters[place][0], unit_of, direct=direct)
         axes = {own: device for own, device in result.items() if isinstance(device, Device)}
         wholes = {whole_and_index(axis)[0] if axis.endswith("]") else "" for axis in axes}
@@ -396,7 +396,7 @@ def _along(system: CompiledSystem, others: Sequence[str]) -> CompiledSystem:
             (place, int(driven[0]))
             for place, state in enumerate(kind.states)
             if state.unit == "m" and any(state.name.endswith(f".{axis}") for axis in others)
-            if len(driven := np.flatnonzero(jacobians(kind).pattern.a[place])) == 1
+            if len(driven := np.flatnonzero(jacobians(analyzed(kind)).pattern.a[place])) == 1
         ]
         names = [(kind.states[position].name, kind.states[velocity].name) for position, velocity in moving]
         for pair in names:
@@ -466,7 +466,9 @@ def _without_hands(kind: Kind, units: tuple[str | None, ...]) -> Kind | None:
     result = rewritten(replace(kind, hands=()), kind, lambda x, p: x, rates)
     x, u, p, t = result.derivative.sx_in()
     left = casadi.depends_on(result.derivative(x, u, p, t), casadi.vertcat(*(p[place] for place in own)))
-    return None if left else result
+    if left:
+        return None
+    return _with_linear(result, kind, lambda linear: _without_hands(linear, units) or linear)
 
 
 def _is_of(name: str, hand: str) -> bool:
@@ -573,7 +575,11 @@ def _with_hand(
         return casadi.vertcat(rate[:velocity], row, rate[velocity + 1 :])
 
     larger = replace(kind, parameters=(*kind.parameters, *names))
-    return rewritten(larger, kind, lambda x, p: x, rates)
+    return _with_linear(
+        rewritten(larger, kind, lambda x, p: x, rates),
+        kind,
+        lambda linear: _with_hand(linear, position, velocity, inverse_inertia, names),
+    )
 
 
 @functools.lru_cache(maxsize=64)
@@ -594,7 +600,19 @@ def _without(kind: Kind, position: int, velocity: int) -> Kind:
         return casadi.vertcat(*(rate[place] for place in kept))
 
     smaller = replace(kind, states=tuple(kind.states[place] for place in kept))
-    return rewritten(smaller, kind, whole, rates)
+    return _with_linear(
+        rewritten(smaller, kind, whole, rates), kind, lambda linear: _without(linear, position, velocity)
+    )
+
+
+def _with_linear(result: Kind, before: Kind, change: Callable[[Kind], Kind]) -> Kind:
+    """Return a changed kind with the same change of the kind that represents it in a linear analysis."""
+    return replace(result, linear=None if before.linear is None else change(before.linear))
+
+
+def analyzed(kind: Kind) -> Kind:
+    """Return the kind that represents a kind in a linear analysis."""
+    return kind.linear or kind
 
 
 def rewritten(

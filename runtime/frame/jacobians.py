@@ -1,8 +1,8 @@
 """The Jacobians of a kind, as one CasADi function of everything they may depend on; where one is not smooth.
 
 Takes: a kind of a `CompiledSystem`; CasADi expressions.
-Gives: `SiteJacobians` (built once a kind), `jacobians`; `Edge`, `edge_name`;
-`structural_pattern`; `guards_of`, `lookups_of`.
+Gives: `SiteJacobians` (built once a kind), `jacobians`, `with_equations`; `Edge`, `edge_name`;
+`structural_pattern`; `guards_of`, `lookups_of`, `nodes_of`.
 Guarantees: structural patterns come from CasADi, whatever the numbers; a kind that is called affine has the
 same Jacobians everywhere. Every comparison, max, min, abs, sign, floor, ceil and table that hangs on what
 moves is found, each once.
@@ -18,7 +18,7 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi
@@ -36,6 +36,7 @@ KEPT = 64
 _BINARY = {casadi.OP_LT, casadi.OP_LE, casadi.OP_EQ, casadi.OP_NE, casadi.OP_FMIN, casadi.OP_FMAX}
 _UNARY = {casadi.OP_FABS, casadi.OP_SIGN}
 _STEPS = {casadi.OP_FLOOR, casadi.OP_CEIL}
+DECIDING = _BINARY | _UNARY
 
 
 def guards_of(expression: Any, moving: Any, *, tables: bool = True) -> list[Any]:
@@ -51,7 +52,7 @@ def guards_of(expression: Any, moving: Any, *, tables: bool = True) -> list[Any]
         Whether the rows of tables are told, too.
     """
     result = []
-    for node in _nodes(expression):
+    for node in nodes_of(expression):
         parts = [node.dep(i) for i in range(node.n_dep())]
         code = node.op()
         if code in _BINARY:
@@ -68,7 +69,7 @@ def guards_of(expression: Any, moving: Any, *, tables: bool = True) -> list[Any]
 
 def lookups_of(expression: Any) -> list[tuple[Interpolation, Any]]:
     """Return each table that is looked up in an expression, with where in it, `casadi.SX`."""
-    calls = [node for node in _nodes(expression) if node.op() == casadi.OP_CALL]
+    calls = [node for node in nodes_of(expression) if node.op() == casadi.OP_CALL]
     return [(table_of(call.which_function()), call.dep(0)) for call in calls]
 
 
@@ -77,7 +78,7 @@ def _whole(expression: Any) -> Any:
     return casadi.sin(np.pi * expression)
 
 
-def _nodes(expression: Any) -> Iterator[Any]:
+def nodes_of(expression: Any) -> Iterator[Any]:
     """Yield all that an expression is made of, each once."""
     seen = set()
     work = [expression[i] for i in range(expression.numel())]
@@ -110,7 +111,9 @@ class SiteJacobians:
     The function's one output is every matrix of a `LinearSite`, in order, column-major, less what is zero by
     structure; `shapes` cuts it.
     `edges` are those of its receives by (clock partition, receive). `timed` says that some entry depends on
-    time, if only on whether something has switched (see `decisions.varying_slopes`).
+    time, if only on whether something has switched (see `switches.varying_slopes`). `equations` is the kind
+    whose functions are differentiated: `kind`, or one of its pieces. `kinks`, where the start values are put
+    in, is a function of the parameters that is above 0 at a kink (see `frame.kinks`).
     """
 
     kind: Kind
@@ -120,6 +123,8 @@ class SiteJacobians:
     affine: bool
     timed: bool
     edges: Mapping[tuple[int, int], Edge]
+    equations: Kind
+    kinks: Any | None = None  # casadi.Function
 
     @property
     def parameters_suffice(self) -> bool:
@@ -194,7 +199,22 @@ def jacobians(kind: Kind) -> SiteJacobians:
         affine=affine,
         timed=_depends(flat, t) or any(edge.timed for edge in edges.values()),
         edges=edges,
+        equations=kind,
     )
+
+
+def with_equations(base: SiteJacobians, kind: Kind) -> SiteJacobians:
+    """Return the Jacobians of other equations of a kind: one of its pieces.
+
+    Parameters
+    ----------
+    base
+        The kind's ordinary Jacobians: states, start values and structural patterns stay theirs, so that every
+        piece has the same frame and the same states.
+    kind
+        The kind with other equations.
+    """
+    return replace(jacobians(kind), kind=base.kind, pattern=base.pattern)
 
 
 def _patterns(kind: Kind, blocks: Sequence[Any]) -> list[NDArray[np.bool_]]:

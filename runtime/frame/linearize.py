@@ -24,9 +24,12 @@ from apc.compiler.compiled import PEERS, CompiledSystem, Kind
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import SiteJacobians
+from apc.frame.kinks import at_a_kink, kink_indicators
 from apc.frame.names import Free
 from apc.frame.parameters import exact_numbers, scope_of
 from apc.frame.site import LinearSite, assemble, cut, every_matrix, with_own_parts
+
+KINKED = "slopes differ from side to side"
 
 # Kinds that are kept as they start, and functions of many sites.
 KEPT = 64
@@ -131,7 +134,15 @@ def at_start(site: SiteJacobians, *, silent: bool = False) -> SiteJacobians | No
         if not silent:
             return None
         flat = casadi.substitute(flat, heard, casadi.SX.zeros(heard.shape))
-    return replace(site, function=casadi.Function("jacobians", symbols, [flat]), affine=True, timed=False)
+    built = replace(site, function=casadi.Function("jacobians", symbols, [flat]), affine=True, timed=False)
+    indicators = kink_indicators(site.equations)
+    if indicators is None:
+        return built
+    point = [casadi.vertcat(*x), casadi.vertcat(*u), casadi.vertcat(*m)]
+    column = indicators(*point, casadi.SX.zeros(heard.shape) if silent else heard, parameters, 0)
+    if casadi.depends_on(column, heard):
+        return None
+    return replace(built, kinks=casadi.Function("kinks", symbols, [column]))
 
 
 def start_arguments(
@@ -228,10 +239,23 @@ def _finite_slopes(
     else:
         if not site.affine:  # else the start is anywhere
             check_start(site, parameters, listening)
+            _refuse_kinks(site, parameters, listening)
         arguments = start_arguments(site, [float(value) for value in parameters], float, listening)
         flat = np.asarray(site.function(*arguments), dtype=np.float64).ravel()
+    if site.kinks is not None and np.isnan(flat).all():
+        raise at_a_kink(site.kind.name, KINKED)
     _refuse_infinite(site, flat)
     return flat
+
+
+def _refuse_kinks(site: SiteJacobians, parameters: NDArray[np.float64], listening: Listening | None) -> None:
+    """Refuse a point at which slopes differ from side to side."""
+    indicators = kink_indicators(site.equations)
+    if indicators is not None:
+        numbers = [float(value) for value in parameters]
+        column = indicators(*start_arguments(site, numbers, float, listening))
+        if np.asarray(column).max(initial=0.0) > 0:
+            raise at_a_kink(site.kind.name, KINKED)
 
 
 def check_start(
@@ -304,6 +328,9 @@ def linearize_rows(site: SiteJacobians, parameters: NDArray[np.float64]) -> NDAr
     rows = np.zeros((count, width))
     (values,) = of_rows(function, {4: parameters})
     rows[:, places] = values + 0.0  # −0 and 0 are one number
+    if site.kinks is not None:
+        (indicators,) = of_rows(site.kinks, {4: parameters})
+        rows[indicators.max(axis=1, initial=0.0) > 0] = np.nan
     return rows
 
 

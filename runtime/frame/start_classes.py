@@ -64,6 +64,10 @@ class StartClasses:
         counts = [count - (1 if g == h else 0) for h, count in enumerate(self.counts)]
         return [(h, Fraction(n), n) for h, n in enumerate(counts) if n and link in self.sent[h]]
 
+    def sent_to(self, link: str, g: int) -> list[list[Fraction]]:
+        """Return what each different sender that class g receives from sends over a link at the start."""
+        return [self.sent[h][link] for h, _, _ in self._senders(link, g)]
+
     def listen(self, g: int) -> tuple[Listening, Gains]:
         """Return what class g hears at the start, and what its edge functions weigh each sender by."""
         site, schedule = self.sites[g], self.schedules[g]

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import analyze as judge
 from apc.analysis.analysis import near_start
+from apc.analysis.elements import is_linear
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
@@ -206,7 +207,7 @@ def feel(
         viscosity = _viscosity(system, slow, port, other) if slow and "network_viscosity" in beside else None
         hinf = _extremes(answers, result) if "hinf" in beside else ()
         h2 = _noise(system, answers) if steady and "h2" in beside else ()
-    linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
+    linear = is_linear(system, prepared)
     here, there = (
         f"{answers.exchange.peer_name(item.peer)}.{device.part}"
         for item, device in ((port, answers.device), (other, answers.other))

@@ -11,6 +11,7 @@ Does not: say with which hand it shakes: which motion of the devices takes energ
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -18,8 +19,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import analyze, lifted_groups, near_start
+from apc.analysis.analysis import Analysis, analyze, lifted_groups, near_start
 from apc.analysis.contact_modes import contact_modes
+from apc.analysis.elements import is_linear
+from apc.analysis.sides import Side, sides
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
@@ -160,6 +163,41 @@ def passive_hands(
         }
         return _together(parts, replaced_hands(of_scene))
     fixed = analyze(clamped(system, option=OPTION), certify=certify)
+    each = [
+        _one_sided_hands(side.system, side.prepared, fixed, certify=certify)
+        for side in sides(system, prepared)
+    ]
+    badness = {False: 2, None: 1, True: 0}
+    worst = max(each, key=lambda hands: (badness[hands.stable], _missing(hands)))
+    return replace(worst, left_out=(*replaced_hands(of_scene), *_limitations(system, prepared)))
+
+
+def _missing(hands: PassiveHands) -> float:
+    """Return the damping that the worst mode lacks."""
+    worst = hands.worst
+    return -math.inf if worst is None else math.inf if worst.more is None else worst.more
+
+
+def _limitations(system: CompiledSystem, prepared: Prepared) -> tuple[str, ...]:
+    linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
+    return (
+        *near_start(system, prepared),
+        *left_out(system),
+        *_as_at_start(system, prepared, linear=linear),
+    )
+
+
+def _one_sided_hands(
+    system: CompiledSystem,
+    prepared: Prepared,
+    fixed: Analysis,
+    *,
+    certify: bool,
+) -> PassiveHands:
+    """Return the verdict of a topology without kinks, in which devices move along a line.
+
+    `fixed` is the analysis with its devices clamped.
+    """
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         loops: tuple[PortLoop, ...] = ()
         unserved = ""
@@ -169,7 +207,7 @@ def passive_hands(
             unserved = str(why)
         modes = tuple(_judge(loop) for loop in loops)
         never = unserved or (CIRCULATES if any(map(circulates, loops)) else "")
-    linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
+    linear = is_linear(system, prepared)
     stable: bool | None = None
     joined = not unserved and all(loop.joined for loop in loops)
     drawn = [mode.passive is False and (joined or mode.more is None) for mode in modes]
@@ -194,12 +232,7 @@ def passive_hands(
         why=never,
         proof=proof,
         linearized=not linear,
-        left_out=(
-            *replaced_hands(of_scene),
-            *near_start(system, prepared),
-            *left_out(system),
-            *_as_at_start(system, prepared, linear=linear),
-        ),
+        left_out=(),
     )
 
 
@@ -212,7 +245,8 @@ def _directions(system: CompiledSystem, prepared: Prepared) -> dict[str, Compile
         E933 where what moves along one direction acts on what moves along another.
     """
     along = directions_of(system)
-    for loop in split(*lifted_groups(system, prepared=prepared)) if along else ():
+    side = sides(system, prepared)[0] if along else Side("", system, prepared)
+    for loop in split(*lifted_groups(side.system, prepared=side.prepared)) if along else ():
         parts = load_pool("scipy.sparse.csgraph").connected_components(loop.matrix != 0, connection="weak")[1]
         of: dict[str, set[str]] = {}
         for name, part_ in zip(loop.layout.names, parts.tolist(), strict=True):
@@ -290,7 +324,11 @@ def loop_growths(system: CompiledSystem, prepared: Prepared, *, bounded: bool = 
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         result, scale = [(-np.inf, -np.inf, -np.inf)], 1.0
         with suppress(UnservedError):
-            loops = port_loops(system, prepared, option=OPTION)
+            loops = [
+                loop
+                for side in sides(system, prepared)
+                for loop in port_loops(side.system, side.prepared, option=OPTION)
+            ]
             result = [
                 _bounds(loop)[:3] if bounded else (-np.inf if circulates(loop) else _least(loop)[0],) * 3
                 for loop in loops

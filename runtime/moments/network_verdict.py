@@ -8,12 +8,15 @@ Does not: look at the nominal network (see `analysis`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
 
+from apc.analysis.elements import is_linear
+from apc.analysis.sides import sides
 from apc.compiler.compiled import CompiledSystem, Link
 from apc.compiler.multiples import common_multiple
 from apc.frame.finite_equations import finite_equations
@@ -139,9 +142,22 @@ def growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool = True) 
         Whether bounds are asked for; without them, they may be the radius itself.
     """
     try:
-        return _growth(system, prepared, bounded)
+        each = [_growth(side.system, side.prepared, bounded) for side in sides(system, prepared)]
     except UnservedError as why:
         return Growth(np.nan, 0.0, np.inf, False, str(why))
+    return worst_growth(each)
+
+
+def worst_growth(each: Sequence[Growth]) -> Growth:
+    """Return the largest of several numbers, all of which have to be below 1."""
+    largest = max(each, key=lambda growth: growth.radius)
+    return replace(
+        largest,
+        low=max(growth.low for growth in each),
+        high=max(growth.high for growth in each),
+        exact=all(growth.exact for growth in each),
+        proved=all(growth.proved for growth in each),
+    )
 
 
 def _growth(system: CompiledSystem, prepared: Prepared, bounded: bool) -> Growth:
@@ -342,15 +358,22 @@ def judge_network(
     """
     if not unreliable(system):
         return None
+    listed = sides(system, prepared or prepare(system))
+    each = [_judge_network(side.system, side.prepared, certify=certify) for side in listed]
+    badness = {False: 2, None: 1, True: 0}
+    return max(each, key=lambda verdict: (badness[verdict.stable], verdict.mean_square_radius or math.inf))
+
+
+def _judge_network(system: CompiledSystem, prepared: Prepared, *, certify: bool) -> NetworkVerdict:
+    """Judge a scene without kinks whose packets get lost or come late by chance."""
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        prepared = prepared or prepare(system)
         result = growth(system, prepared)
         lost = [link for link, law in unreliable(system) if law.mean_loss]
         followed = lost and not any(_asked_of_packets(system, link) for link in lost)
         worst = worst_case(system, prepared) if followed else None
         surely, unsure = _almost_sure(system, prepared, result)
         metres, unmeasured = _rms_error(result)
-        linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
+        linear = is_linear(system, prepared)
     judged = bool(np.isfinite(result.radius))
     decided = judged and result.stable is not None
     notes = (

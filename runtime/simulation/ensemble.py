@@ -20,6 +20,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.analysis.elements import is_linear
 from apc.compiler.compiled import LENGTH, CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
@@ -221,7 +222,7 @@ def _mean_square(system: CompiledSystem) -> MeanSquare | None:
             result = growth(system, prepared)
     except ApcError as error:  # what can't be analysed can be played
         return MeanSquare("", None, None, False, error.mistakes[0].what)
-    linearized = not all(prepared.jacobians[group.kind].affine for group in system.groups)
+    linearized = not is_linear(system, prepared)
     settles_in = None
     if 0 < result.radius < 1:
         settles_in = 2 * math.log(BAND) / math.log(result.radius) * float(prepared.schedules[0].frame_s)

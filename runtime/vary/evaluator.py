@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import lifted_groups
+from apc.analysis.sides import sides
 from apc.compiler.compiled import CompiledSystem, Group, Parameter, group_count
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import ClosedSystem
@@ -180,7 +181,11 @@ def closed_at(
 ) -> tuple[ClosedSystem, ...]:
     """Return the closed systems at one point (m,), as an analysis has them."""
     changed = apply(system, overrides_at(system, free, value))
-    return split(*lifted_groups(changed, prepared=prepared))
+    return tuple(
+        closed
+        for side in sides(changed, prepared)
+        for closed in split(*lifted_groups(side.system, prepared=side.prepared))
+    )
 
 
 def _relative(system: CompiledSystem, prepared: Prepared) -> list[Floats]:
@@ -191,7 +196,9 @@ def _relative(system: CompiledSystem, prepared: Prepared) -> list[Floats]:
 
 def leading_in_floats(system: CompiledSystem, prepared: Prepared) -> complex:
     """Return the largest eigenvalue of a scene in floats, what is rigid left out, NaN if there is none."""
-    matrices = _relative(system, prepared)
+    matrices = [
+        matrix for side in sides(system, prepared) for matrix in _relative(side.system, side.prepared)
+    ]
     if not all(np.isfinite(matrix).all() for matrix in matrices):
         return complex(np.nan)
     values = np.concatenate([np.zeros(1), *map(np.linalg.eigvals, matrices)])

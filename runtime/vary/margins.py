@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import analyze, lifted_groups, prepare_at_start
+from apc.analysis.sides import sides
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Place
 from apc.compiler.timings import part
@@ -133,7 +134,8 @@ def margins(system: CompiledSystem, *, prepared: Prepared | None = None, quick: 
         start = prepare_at_start(system, prepared, [*free, *delays])
         at = start or prepared
         delays = delays if start is not None else []
-        states = _loops(system, at, most=MOST_IN_PASSING if quick else math.inf)
+        first = sides(system, at)[0]  # every side has the same states
+        states = _loops(first.system, first.prepared, most=MOST_IN_PASSING if quick else math.inf)
         if not states:
             return Margins((), TAKES_LONG)
         largest = max(states)
@@ -168,9 +170,7 @@ def _loops(system: CompiledSystem, prepared: Prepared, *, most: float) -> list[i
 def _notes(rows: Sequence[Margin], start: Prepared | None) -> str:
     """Return what is to be said of all margins together."""
     estimated = [row.parameter for row in rows if row.estimated]
-    notes = ["delays were not varied: how the scene moves hangs on what is heard at the start"] * (
-        start is None
-    )
+    notes = ["delays were not varied: the linearization depends on the start values"] * (start is None)
     notes += [f"{ESTIMATE}: {', '.join(estimated)}"] * bool(estimated)
     notes += ["none: there is nothing to vary"] * (not rows)
     return "; ".join(notes)

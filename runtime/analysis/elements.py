@@ -1,0 +1,79 @@
+"""The elements of a topology that a linear analysis does not see as they are.
+
+Takes: a `CompiledSystem`.
+Gives: `replaced_elements`, `is_linear`.
+Guarantees: each part that other equations represent in a linear analysis is named with them, and each
+equation that is constant between jumps.
+Does not: find kinks (see `sides`).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator
+
+import casadi
+
+from apc.compiler.compiled import CompiledSystem, Kind
+from apc.frame.decisions import functions_of
+from apc.frame.instance import Prepared
+from apc.frame.jacobians import nodes_of
+
+# Operations whose slope is zero wherever they have one.
+FLAT = {casadi.OP_FLOOR, casadi.OP_CEIL, casadi.OP_SIGN}
+
+OF_ALL = "apc simulate covers smaller motions"
+
+
+def replaced_elements(system: CompiledSystem) -> tuple[str, ...]:
+    """Return a line for each element that is replaced, or flat, in a linear analysis.
+
+    Parameters
+    ----------
+    system
+        The compiled topology.
+    """
+    kinds = [system.kinds[number] for number in dict.fromkeys(group.kind for group in system.groups)]
+    lines = [line for kind in kinds for line in (*_replaced(kind), *_flat(kind.linear or kind))]
+    return tuple(dict.fromkeys(lines))
+
+
+def is_linear(system: CompiledSystem, prepared: Prepared) -> bool:
+    """Return whether the equations are linear as written, with no element replaced.
+
+    Parameters
+    ----------
+    system, prepared
+        The compiled topology, and the result of `instance.prepare`.
+    """
+    return all(
+        prepared.jacobians[group.kind].affine and not system.kinds[group.kind].replaced
+        for group in system.groups
+    )
+
+
+def _replaced(kind: Kind) -> Iterator[str]:
+    for element in kind.replaced:
+        valid = f", valid for {element.valid}" if element.valid else ""
+        yield f"{element.part} is replaced by {'; '.join(element.equations)}{valid}: {OF_ALL}"
+
+
+@functools.lru_cache(maxsize=64)
+def _flat(kind: Kind) -> tuple[str, ...]:
+    """Return a line for each equation with a floor, ceil or sign of a motion: its slope is zero."""
+    result: dict[str, None] = {}
+    for _, function, arguments, rows in functions_of(kind):
+        if not function.is_a("SXFunction"):
+            continue
+        symbols = function.sx_in()
+        column = function(*symbols)
+        moving = casadi.vertcat(
+            *(symbol for name, symbol in zip(arguments, symbols, strict=True) if name not in ("p", "t"))
+        )
+        for row in range(column.numel()):
+            if any(
+                node.op() in FLAT and casadi.depends_on(node.dep(0), moving) for node in nodes_of(column[row])
+            ):
+                name = rows[row % len(rows)]
+                result[f"{name} is constant between jumps: its slope is zero in a linear analysis"] = None
+    return tuple(result)

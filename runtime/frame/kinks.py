@@ -1,0 +1,288 @@
+"""Kinks: points where an equation of a peer has different slopes on different sides.
+
+Takes: a kind of a `CompiledSystem`, a point at which it is linearized.
+Gives: `Point`, `Piece`, `pieces_at`, `one_sided`, `names_of`; `kink_indicators`, `at_a_kink`.
+Guarantees: a piece is selected by some direction of motion away from the point, to first order: slopes that
+no side has are never returned. A one-sided kind has the values of the kind itself, and at the point the
+slopes of its piece.
+Does not: linearize, or combine the pieces of several peers (see `analysis.sides`).
+
+At a tie of max(a, b) a symbolic derivative is the mean of both slopes. A linearization with it describes no
+motion: on either side one of the two acts.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linprog
+
+from apc.compiler.compiled import Kind
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.interpolation import jacobian
+from apc.frame.decisions import SwitchedKind, decided_kind, find_switches
+
+# A guard of this size relative to its terms is zero: they are rounded some ten times on the way to it.
+TIE = 2.0**-46
+# What a guard of zeros alone is shifted by: any number that changes no other sum.
+SMALLEST = 1e-300
+# Slopes and values that differ by less, relative to themselves or to the largest, are equal: expressions are
+# rounded in another order on each side.
+EQUAL, ROUNDED = 1e-12, 1e-14
+# Ties at one point: each doubles the pieces to be tried.
+MOST_TIES = 8
+# Kinds whose guards are remembered.
+KEPT = 64
+
+_GENERATED = re.compile(r"\.held\d+$")  # names of expressions that are held
+
+Floats = NDArray[np.float64]
+Point = Mapping[str, Sequence[float]]  # the columns of `SwitchedKind.columns` by name
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """A piece that meets a point: for each tied decision whether it is taken, and the size of its tie.
+
+    `values` are those of all functions at the point, `slopes` over everything that moves.
+    """
+
+    taken: tuple[tuple[int, bool], ...]
+    ties: tuple[float, ...]
+    values: Floats
+    slopes: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Guards:
+    """Guards, slopes and values of a kind as functions of its columns and of the decisions' symbols."""
+
+    guards: Any  # casadi.Function -> (guards (n,), their slopes (n, moving), size of their terms (n,))
+    slopes: Any  # casadi.Function -> (values, slopes, size of the values' terms), of all functions in a row
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _guards(switched: SwitchedKind) -> _Guards:
+    """Return the functions of a kind that `pieces_at` evaluates."""
+    columns = list(switched.columns.values())
+    symbols = [decision.symbol for decision in switched.decisions]
+    everything = casadi.vertcat(*columns)
+    moving = casadi.vertcat(*(c for name, c in switched.columns.items() if name not in ("p", "t")))
+    guards = casadi.vertcat(*(decision.guard for decision in switched.decisions))
+    terms = casadi.fabs(jacobian(guards, everything)) @ casadi.fabs(everything)
+    outputs = casadi.vertcat(*(function.output for function in switched.functions))
+    sizes = casadi.fabs(jacobian(outputs, everything)) @ casadi.fabs(everything)
+    arguments = [*columns, casadi.vertcat(*symbols)]
+    dense = casadi.densify
+    return _Guards(
+        casadi.Function("guards", arguments, [dense(guards), dense(jacobian(guards, moving)), dense(terms)]),
+        casadi.Function("slopes", arguments, [outputs, dense(jacobian(outputs, moving)), dense(sizes)]),
+    )
+
+
+def pieces_at(switched: SwitchedKind, point: Point) -> tuple[Piece, ...]:
+    """Return the pieces that meet a point, those of equal slopes once; one without ties where it is smooth.
+
+    Parameters
+    ----------
+    switched
+        The kind with its decisions laid open.
+    point
+        Where it is linearized.
+
+    Raises
+    ------
+    ApcError
+        E808 an equation that jumps at the point, or more than MOST_TIES ties.
+    """
+    if not switched.decisions:
+        return (Piece((), (), np.zeros(0), np.zeros((0, 0))),)
+    functions, count = _guards(switched), len(switched.decisions)
+    columns = [list(point[name]) for name in switched.columns]
+    leaves: list[tuple[dict[int, bool], dict[int, float]]] = []
+
+    def follow(symbols: list[float], tied: dict[int, bool], ties: dict[int, float]) -> None:
+        """Try both sides of each tie, in the order in which guards depend on earlier decisions."""
+        place = len(symbols)
+        if place == count:
+            leaves.append((tied, ties))
+            return
+        guards, _, terms = functions.guards(*columns, [*symbols, *[0.0] * (count - place)])
+        guard, tie = float(guards[place]), max(TIE * float(terms[place]), SMALLEST)
+        if not abs(guard) <= tie or not np.isfinite(tie):
+            follow([*symbols, float(bool(switched.decisions[place].holds(guard)))], tied, ties)
+            return
+        if switched.decisions[place].point:
+            follow([*symbols, 0.0], {**tied, place: False}, {**ties, place: tie})
+            return
+        if len(tied) == MOST_TIES:
+            raise _refused(switched, [*tied, place], f"takes more than {MOST_TIES} decisions there")
+        for side in (True, False):
+            follow([*symbols, float(side)], {**tied, place: side}, {**ties, place: tie})
+
+    follow([], {}, {})
+    result: list[Piece] = []
+    for tied, ties in leaves:
+        symbols = _symbols(switched, functions, columns, tied)
+        _, rows, _ = functions.guards(*columns, symbols)
+        if not _reachable(switched, np.asarray(rows, dtype=np.float64), tied):
+            continue
+        values, slopes, sizes = map(np.asarray, functions.slopes(*columns, symbols))
+        piece = Piece(tuple(tied.items()), tuple(ties.values()), values.ravel(), slopes)
+        if result and (np.abs(piece.values - result[0].values) > TIE * sizes.ravel()).any():
+            raise _refused(switched, list(tied), "jumps there")
+        if not any(_equal(piece.slopes, other.slopes) for other in result):
+            result.append(piece)
+    return tuple(result)
+
+
+def _symbols(
+    switched: SwitchedKind, functions: _Guards, columns: Sequence[Sequence[float]], tied: Mapping[int, bool]
+) -> list[float]:
+    """Return the value of every decision's symbol on one side of the ties."""
+    symbols: list[float] = [0.0] * len(switched.decisions)
+    for place, decision in enumerate(switched.decisions):
+        guards, *_ = functions.guards(*columns, symbols)
+        symbols[place] = float(tied.get(place, bool(decision.holds(float(guards[place])))))
+    return symbols
+
+
+def _reachable(switched: SwitchedKind, rows: Floats, tied: Mapping[int, bool]) -> bool:
+    """Return whether some direction of motion takes these sides of the ties, to first order.
+
+    Parameters
+    ----------
+    switched
+        The kind.
+    rows
+        The slopes of all guards (n, moving). A guard without slope restricts no direction.
+    tied
+        The sides.
+    """
+    wanted = []
+    for place, side in tied.items():
+        size = float(np.abs(rows[place]).max(initial=0.0))
+        if size > 0 and np.isfinite(size) and not switched.decisions[place].point:
+            sign = 1.0 if side is switched.decisions[place].above else -1.0
+            wanted.append(sign * rows[place] / size)
+    if len(wanted) < 2:
+        return True
+    matrix = np.array(wanted)
+    # A direction d with matrix d ≥ 1 exists, in a box large enough for rows that are nearly opposite.
+    found = linprog(
+        np.zeros(matrix.shape[1]),
+        A_ub=-matrix,
+        b_ub=-np.ones(len(matrix)),
+        bounds=(-1e9, 1e9),
+        method="highs",
+    )
+    return bool(found.status == 0)
+
+
+def _equal(first: Floats, second: Floats) -> bool:
+    return bool(np.isclose(first, second, rtol=EQUAL, atol=_small(first), equal_nan=True).all())
+
+
+def _small(values: Floats) -> float:
+    return ROUNDED * float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
+
+
+def names_of(switched: SwitchedKind, places: Sequence[int]) -> tuple[str, ...]:
+    """Return the names of what some decisions change, each once; of a held expression its part's."""
+    return tuple(
+        dict.fromkeys(
+            _GENERATED.sub("", name) for place in places for name in switched.decisions[place].changes
+        )
+    )
+
+
+def _refused(switched: SwitchedKind, places: Sequence[int], why: str) -> ApcError:
+    names = ", ".join(names_of(switched, places)) or "an equation"
+    return at_a_kink(switched.kind.name, f"{names} {why}")
+
+
+def at_a_kink(where: str, what: str) -> ApcError:
+    """Return the refusal of a point without a linearization."""
+    text = f"{what}: there is no linearization at the start values"
+    hint = "start values on one side of the kink"
+    return ApcError(Mistake("E808", Place(where), text, hint=hint))
+
+
+def one_sided(switched: SwitchedKind, taken: Mapping[int, bool], ties: Mapping[int, float]) -> Kind:
+    """Return a kind whose slopes at a point are those of one piece.
+
+    Parameters
+    ----------
+    switched
+        The kind with its decisions laid open.
+    taken
+        For each tied decision whether it is taken at the point.
+    ties
+        The size of each tie, by which the switching point is shifted away.
+    """
+    expressions: list[Any] = []
+    for place, decision in enumerate(switched.decisions):
+        earlier = [item.symbol for item in switched.decisions[:place]]
+        guard = decision.guard
+        if earlier:
+            guard = casadi.substitute(guard, casadi.vertcat(*earlier), casadi.vertcat(*expressions))
+        if decision.point:
+            expressions.append(casadi.SX(0) if place in taken else decision.holds(guard))
+            continue
+        if place in taken:
+            shift = 2 * ties[place] if taken[place] is decision.above else -2 * ties[place]
+            guard = guard + shift
+        expressions.append(decision.holds(guard))
+    return decided_kind(switched, expressions)
+
+
+@functools.lru_cache(maxsize=KEPT)
+def kink_indicators(kind: Kind) -> Any | None:
+    """Return a function (x, u, m, r, p, t) -> (n,) that is above 0 where a decision is a kink.
+
+    Its arguments are those of `SiteJacobians.function`. None where no slope depends on a decision, where a
+    nonlinear loop hides the decisions, or where values of single senders decide.
+    """
+    switched = find_switches(kind)
+    if not switched.decisions:
+        return None
+    symbols = [decision.symbol for decision in switched.decisions]
+    everything = casadi.vertcat(*switched.columns.values())
+    moving = casadi.vertcat(*(c for name, c in switched.columns.items() if name not in ("p", "t")))
+    outputs = casadi.vertcat(*(item.output for item in switched.functions if item.where[0] != "edge"))
+    slopes = jacobian(outputs, moving)
+    slopes = slopes.nz[:] if slopes.nnz() else casadi.SX(0, 1)
+    sizes = TIE * casadi.fabs(jacobian(outputs, everything)) @ casadi.fabs(everything)
+    expressions: list[Any] = []
+    indicators: list[Any] = []
+    for place, decision in enumerate(switched.decisions):
+        guard = decision.guard
+        if place:
+            guard = casadi.substitute(guard, casadi.vertcat(*symbols[:place]), casadi.vertcat(*expressions))
+        expressions.append(decision.holds(guard))
+        if casadi.depends_on(outputs, symbols[place]):
+            ends = [casadi.substitute([slopes, outputs], [symbols[place]], [casadi.SX(d)]) for d in (1, 0)]
+            steeper, jump = (casadi.fabs(one - other) for one, other in zip(*ends, strict=True))
+            terms = casadi.fabs(jacobian(guard, everything)) @ casadi.fabs(everything)
+            differs = casadi.sum1(steeper) + casadi.sum1(jump > sizes)
+            indicators.append(casadi.if_else(casadi.fabs(guard) <= TIE * terms, differs, 0))
+    if not indicators:
+        return None
+    column = casadi.substitute(
+        casadi.vertcat(*indicators), casadi.vertcat(*symbols), casadi.vertcat(*expressions)
+    )
+    columns = switched.columns
+    parts = [*kind.clocks]
+    m = casadi.vertcat(*(columns.get(f"m{p}", casadi.SX(0, 1)) for p in range(len(parts))))
+    r = casadi.vertcat(*(columns.get(f"r{p}", casadi.SX(0, 1)) for p in range(len(parts))))
+    arguments = [columns["x"], columns["u"], m, r, columns["p"], columns["t"]]
+    if any(casadi.depends_on(column, c) for name, c in columns.items() if name.startswith("s")):
+        return None
+    return casadi.Function("kinks", arguments, [casadi.densify(column)])

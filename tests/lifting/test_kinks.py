@@ -1,0 +1,176 @@
+"""A start at a kink: each side is analyzed, and no slope that no side has."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import apc
+from apc.analysis.sides import sides
+from apc.compiler.errors import ApcError
+from apc.frame.instance import prepare
+from tests.language.own import component
+from tests.topologies import compiled, library, told
+
+MASS, DAMPING, PERIOD = 1.0, 20.0, 1e-3  # kg, N·s/m, s
+
+
+def radius(stiffness: float, velocity_gain: float = 0.0) -> float:
+    """Return the spectral radius of a mass with a sampled force, by its exact step; without its rigid mode.
+
+    Over a period x⁺ = x + (1 − e)/a v + (T − (1 − e)/a)/(m a) F and v⁺ = e v + (1 − e)/(m a) F, a = b/m and
+    e = exp(−a T), with F = −stiffness x − velocity_gain v.
+    """
+    rate = DAMPING / MASS
+    decay = math.exp(-rate * PERIOD)
+    reach = (1 - decay) / rate
+    push = np.array([[(PERIOD - reach) / DAMPING], [(1 - decay) / DAMPING]])
+    step = np.array([[1.0, reach], [0.0, decay]]) - push @ np.array([[stiffness, velocity_gain]])
+    values = np.linalg.eigvals(step)
+    if stiffness == 0:
+        values = np.delete(values, np.argmin(abs(values - 1)))
+    return float(abs(values).max())
+
+
+def topology(more: str = "", *, x: str = "0 m", count: int = 1) -> str:
+    return (
+        f"topology: kink\nclocks: {{tick: 1 ms}}\npeers: {{user: {{count: {count}}}}}\n"
+        f"masses: {{device: {{mass: {MASS} kg, damping: {DAMPING} N*s/m, x: {x}}}}}\n"
+        f"couplers: {{own: {{type: Own, flange: device, clock: tick{more}}}}}\n"
+    )
+
+
+def model(folder: Path, force: str, more: str = ", K: 60000 N/m", x: str = "0 m") -> apc.CompiledSystem:
+    return compiled(
+        topology(more, x=x),
+        library(folder, component("f = " + force, "flange.f = hold(f)", variables="f=N")),
+    )
+
+
+X = "sample(flange.x)"
+FORCES = {  # the stiffness of each side of each, for K = 60 kN/m
+    f"max(0, K*{X})": (0, 60e3),
+    f"if {X} >= 0 then K*{X} else 0": (0, 60e3),
+    f"if {X} > 0 then K*{X} else 0": (0, 60e3),
+    f"abs(K*{X})": (-60e3, 60e3),
+    f"sqrt((K*{X})^2)": (-60e3, 60e3),
+    f"K*norm({{{X}, 2*{X}}})": (-60e3 * math.sqrt(5), 60e3 * math.sqrt(5)),
+    f"max(0, K*{X}) - max(0, -K*{X})": (60e3,),  # no kink
+    f"max(0, max(K*{X}, 2*K*{X}))": (0, 120e3),
+    f"max(0, K*{X}) + min(0, K*{X}/3)": (20e3, 60e3),
+    f"if {X} == 0 then 0 else K*{X}": (60e3,),  # equal at an instant at most
+    f"max(K*{X}, K*{X})": (60e3,),
+}
+
+
+@pytest.mark.parametrize("force", FORCES)
+def test_the_worst_side_is_the_verdict(force: str, tmp_path: Path) -> None:
+    found = apc.analyze(model(tmp_path, force), certify=True)
+    truths = sorted(radius(stiffness) for stiffness in FORCES[force])
+    assert found.spectral_radius == pytest.approx(truths[-1], abs=1e-12)
+    assert found.stable is (truths[-1] < 1)
+    assert "proved" in found.proof
+    each = sorted(side.spectral_radius for side in found.sides)
+    assert each == pytest.approx(truths if len(truths) > 1 else [], abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("x", "stiffness"), [("-1e-12 m", 0), ("1e-12 m", 60e3), ("-1 mm", 0), ("1 mm", 60e3)]
+)
+def test_beside_a_kink_one_side_acts(x: str, stiffness: float, tmp_path: Path) -> None:
+    found = apc.analyze(model(tmp_path, f"max(0, K*{X})", x=x))
+    assert found.spectral_radius == pytest.approx(radius(stiffness), abs=1e-12)
+    assert not found.sides
+
+
+def test_a_tie_is_one_whatever_floats_round(tmp_path: Path) -> None:
+    """0.1 + 0.2 − 0.3 is 0 in rationals and 5.6e-17 in floats."""
+    text = component("f = max(0, K*(sample(flange.x) + a + b - c))", "flange.f = hold(f)", variables="f=N")
+    text = text.replace("parameters:\n", "parameters:\n  a: {unit: m}\n  b: {unit: m}\n  c: {unit: m}\n")
+    more = ", K: 60000 N/m, a: 0.1 m, b: 0.2 m, c: 0.3 m"
+    found = apc.analyze(compiled(topology(more), library(tmp_path, text)))
+    assert [side.spectral_radius for side in found.sides] == pytest.approx(
+        [radius(0), radius(60e3)], abs=1e-12
+    ) or [side.spectral_radius for side in found.sides] == pytest.approx([radius(60e3), radius(0)], abs=1e-12)
+
+
+def test_a_critical_value_is_that_of_the_worse_side(tmp_path: Path) -> None:
+    system = model(tmp_path, f"max(0, K*{X})", ", K: 100 N/m")
+    found = apc.critical(system, "own.K")
+    assert found.value is not None
+    assert found.value == pytest.approx(40133.778369378, abs=1e-6)
+    assert radius(found.value * (1 - 1e-9)) < 1 < radius(found.value * (1 + 1e-9))
+
+
+def test_passive_hands_meet_the_whole_wall() -> None:
+    """A wall of stiffness 0 and damping B at zero depth: b > B decides (Colgate and Schenkel), not B/2."""
+    for damping, passive in ((1.9, True), (2.1, False)):
+        text = (
+            "topology: wall\nclocks: {tick: 1 ms}\npeers: {user: {count: 1}}\n"
+            "masses: {device: {mass: 0.5 kg, damping: 2 N*s/m}}\n"
+            f"couplers: {{it: {{type: VirtualWall, flange: device, stiffness: 0 N/m, damping: {damping} N*s/m,"
+            " clock: tick}}\n"
+        )
+        assert apc.passive_hands(compiled(text)).stable is passive
+
+
+def test_a_force_that_jumps_has_no_linearization(tmp_path: Path) -> None:
+    for force in (f"F*sign({X}/L)", f"if {X} > 0 then F else 0"):
+        (line,) = told(apc.analyze, model(tmp_path, force))
+        assert "E808" in line
+        assert "jumps" in line
+        beside = apc.analyze(model(tmp_path, force, x="1 mm"))
+        assert beside.spectral_radius == pytest.approx(radius(0), abs=1e-12)
+
+
+def test_many_kinks_are_combined_or_refused_by_name(tmp_path: Path) -> None:
+    """Each of several groups takes each side: 2^4 combinations are analyzed, 2^5 refused."""
+    text = component(f"f = max(0, K*{X})", "flange.f = hold(f)", variables="f=N")
+    shelf = library(tmp_path, text)
+    for count in (2, 4, 5):
+        peers = ", ".join(f"u{k}: {{count: 1, set: {{own.K: {k}0000 N/m}}}}" for k in range(1, count + 1))
+        system = compiled(topology().replace("user: {count: 1}", peers), shelf)
+        if count == 5:
+            (line,) = told(apc.analyze, system)
+            assert "E808" in line
+            assert "own.f" in line
+            continue
+        found = apc.analyze(system)
+        truths = [
+            max(radius(k * 1e4 * on) for k, on in enumerate(chosen, 1))
+            for chosen in itertools.product((0, 1), repeat=count)
+        ]
+        assert sorted(side.spectral_radius for side in found.sides) == pytest.approx(
+            sorted(truths), abs=1e-12
+        )
+        assert found.spectral_radius == pytest.approx(max(truths), abs=1e-12)
+
+
+def test_sides_that_no_motion_reaches_are_left_out(tmp_path: Path) -> None:
+    """Of max(0, x) and max(0, 2 x) both act or neither; with max(0, −x) one of two does."""
+    for force, count in (
+        (f"max(0, K*{X}) + max(0, 2*K*{X})", 2),
+        (f"max(0, K*{X}) + max(0, -2*K*{X})", 2),
+        (f"max(0, K*{X}) + max(0, K*T*sample(der(flange.x)))", 4),
+    ):
+        system = model(tmp_path, force)
+        assert len(sides(system, prepare(system))) == count
+
+
+def test_where_a_path_crosses_the_kink_no_mean_slope_is_used(tmp_path: Path) -> None:
+    system = model(tmp_path, f"max(0, K*{X})", x="1 mm")
+    many = apc.analyze_many(system, {"device.x": [-1e-3, 0.0, 1e-3]})
+    assert many.spectral_radius[0] == pytest.approx(radius(0), abs=1e-12)
+    assert many.spectral_radius[2] == pytest.approx(radius(60e3), abs=1e-12)
+    assert math.isnan(many.spectral_radius[1]) or many.spectral_radius[1] == pytest.approx(
+        radius(60e3), abs=1e-12
+    )
+
+
+def test_what_has_no_side_is_refused_elsewhere(tmp_path: Path) -> None:
+    with pytest.raises(ApcError, match="E808"):
+        apc.feel(model(tmp_path, f"max(0, K*{X})", ", K: 100 N/m"), [5.0])
