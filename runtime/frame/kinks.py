@@ -136,7 +136,8 @@ def pieces_at(switched: SwitchedKind, point: Point) -> tuple[Piece, ...]:
             continue
         values, slopes, sizes = map(np.asarray, functions.slopes(*columns, symbols))
         piece = Piece(tuple(tied.items()), tuple(ties.values()), values.ravel(), slopes)
-        if result and (np.abs(piece.values - result[0].values) > TIE * sizes.ravel()).any():
+        # No number on one side alone, as of a root or logarithm there, is a jump too.
+        if result and not (np.abs(piece.values - result[0].values) <= TIE * sizes.ravel()).all():
             raise _refused(switched, list(tied), "jumps there")
         if not any(_equal(piece.slopes, other.slopes) for other in result):
             result.append(piece)
@@ -243,8 +244,22 @@ def one_sided(switched: SwitchedKind, taken: Mapping[int, bool], ties: Mapping[i
     return decided_kind(switched, expressions)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Indicators:
+    """Where a kind has kinks: `function` is above 0 at each, in the order of `names`."""
+
+    function: Any  # casadi.Function
+    names: tuple[str, ...]
+
+    def refuse(self, where: str, values: Any) -> None:
+        """Raise ApcError E808 if a value of the function (n,) is above 0."""
+        kinks = [name for name, value in zip(self.names, np.asarray(values).ravel(), strict=True) if value > 0]
+        if kinks:
+            raise at_a_kink(where, f"{', '.join(dict.fromkeys(kinks))} of {where} has a kink there")
+
+
 @functools.lru_cache(maxsize=KEPT)
-def kink_indicators(kind: Kind) -> Any | None:
+def kink_indicators(kind: Kind) -> Indicators | None:
     """Return a function (x, u, m, r, p, t) -> (n,) that is above 0 where a decision is a kink.
 
     Its arguments are those of `SiteJacobians.function`. None where no slope depends on a decision, where a
@@ -262,6 +277,7 @@ def kink_indicators(kind: Kind) -> Any | None:
     sizes = TIE * casadi.fabs(jacobian(outputs, everything)) @ casadi.fabs(everything)
     expressions: list[Any] = []
     indicators: list[Any] = []
+    names: list[str] = []
     for place, decision in enumerate(switched.decisions):
         guard = decision.guard
         if place:
@@ -273,6 +289,7 @@ def kink_indicators(kind: Kind) -> Any | None:
             terms = casadi.fabs(jacobian(guard, everything)) @ casadi.fabs(everything)
             differs = casadi.sum1(steeper) + casadi.sum1(jump > sizes)
             indicators.append(casadi.if_else(casadi.fabs(guard) <= TIE * terms, differs, 0))
+            names.append(", ".join(names_of(switched, [place])) or "an equation")
     if not indicators:
         return None
     column = casadi.substitute(
@@ -285,4 +302,4 @@ def kink_indicators(kind: Kind) -> Any | None:
     arguments = [columns["x"], columns["u"], m, r, columns["p"], columns["t"]]
     if any(casadi.depends_on(column, c) for name, c in columns.items() if name.startswith("s")):
         return None
-    return casadi.Function("kinks", arguments, [casadi.densify(column)])
+    return Indicators(casadi.Function("kinks", arguments, [casadi.densify(column)]), tuple(names))

@@ -24,12 +24,10 @@ from apc.compiler.compiled import PEERS, CompiledSystem, Kind
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import SiteJacobians
-from apc.frame.kinks import at_a_kink, kink_indicators
+from apc.frame.kinks import kink_indicators
 from apc.frame.names import Free
 from apc.frame.parameters import exact_numbers, scope_of
 from apc.frame.site import LinearSite, assemble, cut, every_matrix, with_own_parts
-
-KINKED = "slopes differ from side to side"
 
 # Kinds that are kept as they start, and functions of many sites.
 KEPT = 64
@@ -139,7 +137,8 @@ def at_start(site: SiteJacobians, *, silent: bool = False) -> SiteJacobians | No
     if indicators is None:
         return built
     point = [casadi.vertcat(*x), casadi.vertcat(*u), casadi.vertcat(*m)]
-    column = indicators(*point, casadi.SX.zeros(heard.shape) if silent else heard, parameters, 0)
+    received = casadi.SX.zeros(heard.shape) if silent else heard
+    column = indicators.function(*point, received, parameters, 0)
     if casadi.depends_on(column, heard):
         return None
     return replace(built, kinks=casadi.Function("kinks", symbols, [column]))
@@ -243,7 +242,9 @@ def _finite_slopes(
         arguments = start_arguments(site, [float(value) for value in parameters], float, listening)
         flat = np.asarray(site.function(*arguments), dtype=np.float64).ravel()
     if site.kinks is not None and np.isnan(flat).all():
-        raise at_a_kink(site.kind.name, KINKED)
+        indicators = kink_indicators(site.equations)
+        assert indicators is not None
+        indicators.refuse(site.kind.name, of_rows(site.kinks, {4: np.asarray(parameters)[None]})[0])
     _refuse_infinite(site, flat)
     return flat
 
@@ -253,9 +254,8 @@ def _refuse_kinks(site: SiteJacobians, parameters: NDArray[np.float64], listenin
     indicators = kink_indicators(site.equations)
     if indicators is not None:
         numbers = [float(value) for value in parameters]
-        column = indicators(*start_arguments(site, numbers, float, listening))
-        if np.asarray(column).max(initial=0.0) > 0:
-            raise at_a_kink(site.kind.name, KINKED)
+        values = indicators.function(*start_arguments(site, numbers, float, listening))
+        indicators.refuse(site.kind.name, np.asarray(values))
 
 
 def check_start(
@@ -330,7 +330,7 @@ def linearize_rows(site: SiteJacobians, parameters: NDArray[np.float64]) -> NDAr
     rows[:, places] = values + 0.0  # −0 and 0 are one number
     if site.kinks is not None:
         (indicators,) = of_rows(site.kinks, {4: parameters})
-        rows[indicators.max(axis=1, initial=0.0) > 0] = np.nan
+        rows[(indicators > 0).any(axis=1)] = np.nan
     return rows
 
 

@@ -92,7 +92,7 @@ def refusal(system: CompiledSystem, *, in_time: bool) -> str:
     in_time
         For a run in time; else for the eigenvalues of a frame.
     """
-    for kind in system.kinds:
+    for kind in (kind.linear or kind for kind in system.kinds):
         functions = [*(c.tick for c in kind.clocks), *(s.send for s in kind.sends)]
         if not all(map(is_rational, functions)) or not _has_exact_slopes(kind.derivative):
             return f"the equations of {kind.name} hold functions whose values are rounded"
@@ -246,7 +246,8 @@ def build_peers(
     link_of = {link.name: link for link in system.links}
     found = []
     for peer, group in zip(peers, groups, strict=True):
-        kind = system.kinds[system.groups[group].kind]
+        nonlinear = system.kinds[system.groups[group].kind]
+        kind = nonlinear.linear or nonlinear
         row = numbers.rows[group][peer - int(starts[group])]
         parameters = exact_numbers(kind, numbers.parameters[group][row])
         value = dict(zip(kind.parameters, parameters, strict=True))

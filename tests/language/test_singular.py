@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import apc
+from apc.compiler.errors import ApcError
 from tests.topologies import compiled, library, told
 
 SCENE = """
@@ -64,9 +65,9 @@ HELD = ["a.f = hold(z*K)", "b.f = -a.f"]
         ("z = L*sin(z/L)/2 + sample(a.x)", "z*K", 200),
         ("z = z*z/L + sample(a.x)", "z*K", 100),
         ("z = sample(a.x)", "if z >= 0 then K*z else K*L*(-z/L)^1.5", 100),
-        ("z = sample(a.x)", "if z < 0 then F*log(-z/L) else K*z", 100),
-        ("z = sample(a.x)", "if z < 0 then F*L/z else K*z", 100),
-        ("z = sample(a.x)", "if z < 0 then F*sqrt(z/L) else K*z", 100),
+        ("z = sample(a.x)", "if z < -L then F*log(-z/L) else K*z", 100),
+        ("z = sample(a.x)", "if z < -L then F*L/z else K*z", 100),
+        ("z = sample(a.x)", "if z < -L then F*sqrt(z/L) else K*z", 100),
     ],
 )
 def test_a_good_component_has_the_radius_of_its_spring(
@@ -74,6 +75,13 @@ def test_a_good_component_has_the_radius_of_its_spring(
 ) -> None:
     found = apc.analyze(model(tmp_path, [equation, f"a.f = hold({force})", "b.f = -a.f"]))
     assert found.spectral_radius == pytest.approx(sampled_spring(stiffness), abs=1e-12)
+
+
+@pytest.mark.parametrize("branch", ["F*log(-z/L)", "F*L/z", "F*sqrt(z/L - 1)"])
+def test_a_branch_that_is_infinite_at_the_start_has_no_linearization(branch: str, tmp_path: Path) -> None:
+    force = f"if z < 0 then {branch} else K*z"
+    with pytest.raises(ApcError, match="E808"):
+        apc.analyze(model(tmp_path, ["z = sample(a.x)", f"a.f = hold({force})", "b.f = -a.f"]))
 
 
 @pytest.mark.parametrize("jump", ["floor", "sign"])

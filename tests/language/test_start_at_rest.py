@@ -13,7 +13,7 @@ topology: pressed
 clocks: {{haptic: 1 ms}}
 peers:
   left: {{count: 1}}
-  right: {{count: 1, set: {{device.x: 20 mm}}}}
+  right: {{count: 1, set: {{device.x: 21 mm}}}}
 masses:
   device: {{mass: 0.1 kg, damping: 5 N*s/m}}
   cube: {{mass: 0.3 kg, damping: 5 N*s/m}}

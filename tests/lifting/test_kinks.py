@@ -112,8 +112,8 @@ def test_passive_hands_meet_the_whole_wall() -> None:
         text = (
             "topology: wall\nclocks: {tick: 1 ms}\npeers: {user: {count: 1}}\n"
             "masses: {device: {mass: 0.5 kg, damping: 2 N*s/m}}\n"
-            f"couplers: {{it: {{type: VirtualWall, flange: device, stiffness: 0 N/m, damping: {damping} N*s/m,"
-            " clock: tick}}\n"
+            f"couplers: {{it: {{type: VirtualWall, flange: device, damping: {damping} N*s/m, clock: tick,"
+            " stiffness: 0 N/m}}\n"
         )
         assert apc.passive_hands(compiled(text)).stable is passive
 

@@ -23,7 +23,7 @@ def test_the_answer_is_plain_data() -> None:
     assert list(found) == [
         *("topology", "peers", "frame_s", "states_per_peer", "method", "verdict", "stable"),
         *("spectral_radius", "spectral_radius_error", "rigid_modes", "modes", "linearized", "notes", "proof"),
-        *("left_out", "translations", "rotations", "unfelt", "beyond"),
+        *("left_out", "translations", "rotations", "unfelt", "beyond", "sides"),
     ]
     assert (found["peers"], found["frame_s"], found["states_per_peer"]) == (3, 0.008, 8)
     first = found["modes"][0]
