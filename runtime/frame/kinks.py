@@ -253,7 +253,9 @@ class Indicators:
 
     def refuse(self, where: str, values: Any) -> None:
         """Raise ApcError E808 if a value of the function (n,) is above 0."""
-        kinks = [name for name, value in zip(self.names, np.asarray(values).ravel(), strict=True) if value > 0]
+        kinks = [
+            name for name, value in zip(self.names, np.asarray(values).ravel(), strict=True) if value > 0
+        ]
         if kinks:
             raise at_a_kink(where, f"{', '.join(dict.fromkeys(kinks))} of {where} has a kink there")
 
@@ -287,8 +289,8 @@ def kink_indicators(kind: Kind) -> Indicators | None:
             ends = [casadi.substitute([slopes, outputs], [symbols[place]], [casadi.SX(d)]) for d in (1, 0)]
             steeper, jump = (casadi.fabs(one - other) for one, other in zip(*ends, strict=True))
             terms = casadi.fabs(jacobian(guard, everything)) @ casadi.fabs(everything)
-            differs = casadi.sum1(steeper) + casadi.sum1(jump > sizes)
-            indicators.append(casadi.if_else(casadi.fabs(guard) <= TIE * terms, differs, 0))
+            differs = casadi.logic_not(casadi.vertcat(steeper <= 0, jump <= sizes))  # or no number
+            indicators.append(casadi.if_else(casadi.fabs(guard) <= TIE * terms, casadi.sum1(differs), 0))
             names.append(", ".join(names_of(switched, [place])) or "an equation")
     if not indicators:
         return None
