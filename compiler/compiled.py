@@ -307,6 +307,8 @@ class Kind:
     the scene calls hands, if they answer to how they are moved; `held` the parts that any hand is joined to.
     `linear` is the kind that represents it in a linear analysis, of the same states and parameters, None
     where that is the kind itself; `replaced` are the parts in which they differ.
+    `symbols` are those of published wall conditions with the numbers that play them, empty unless every part
+    but hands has some.
     """
 
     name: str
@@ -323,6 +325,7 @@ class Kind:
     held: tuple[str, ...] = ()
     linear: Kind | None = None
     replaced: tuple[Replaced, ...] = ()
+    symbols: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -168,7 +168,7 @@ def answer(
     nominal = _margins(system, prepared, analysis, wanted=margins)
     buzz, no_buzz = _buzz(system, prepared) if with_buzz else (None, "")
     return Answer(
-        analysis=replace(analysis, notes=(*analysis.notes, *notes)),
+        analysis=replace(analysis, notes=(*analysis.notes, *notes, *_published(system))),
         network=_over_network(system, prepared, analysis, nominal, certify=certify, wanted=margins),
         sensitivities=moved,
         margins=nominal,
@@ -181,6 +181,13 @@ def answer(
         no_buzz=no_buzz,
         warnings=system.warnings,
     )
+
+
+def _published(system: CompiledSystem) -> tuple[str, ...]:
+    """Return published conditions; imported here, as few topologies have an element they are about."""
+    from apc.hands.published_limits import published_limits
+
+    return published_limits(system)
 
 
 def _over_network(

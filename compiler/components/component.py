@@ -37,6 +37,9 @@ OTHERS = "others"
 RESERVED = frozenset(
     {"peers", "others", "time", "pi", "ground", "type", "at", "shared", "set", *FUNCTIONS, *KEYWORDS}
 )
+# Symbols of published conditions on virtual walls: stiffness and damping of the wall, damping and Coulomb
+# friction of the device, sampling period, delay of the loop, resolution of the position.
+SYMBOLS = ("K", "B", "b", "c", "T", "t_d", "D")
 # A parameter of one of these roles isn't a number: it names, or describes, something of the scene.
 ROLES = (
     "clock",
@@ -196,6 +199,7 @@ class Component:
     grips: tuple[str, ...] = ()
     peers: int = 0
     linearized: Linearized | None = None  # None where the equations themselves are linearized
+    symbols: Named[str] = ()  # symbols of published wall conditions, and the parameters that play them
 
     def parameter(self, name: str) -> Parameter | None:
         """Return the parameter of this name, or None."""

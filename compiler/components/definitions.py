@@ -14,6 +14,7 @@ from typing import TypeVar
 
 from apc.compiler.components.component import (
     RESERVED,
+    SYMBOLS,
     Component,
     Connector,
     Inner,
@@ -56,7 +57,7 @@ from apc.compiler.words import counted
 CONNECTOR = ("connector", "about", "source", "potentials", "flows")
 COMPONENT = (
     *("component", "about", "source", "peers", "extends", "connectors", "parameters", "variables"),
-    *("parts", "connect", "sends", "equations", "linearized"),
+    *("parts", "connect", "sends", "equations", "linearized", "symbols"),
 )
 DEEPEST = 10  # levels of parts inside parts
 
@@ -83,7 +84,8 @@ def read_component(source: Source, library: Definitions) -> Component:
     equations, undefined = read_equations(root, unread)
     draft = _read_declarations(root, library, mistakes)
     linearized = read_linearized(root, unread) or draft.linearized
-    draft = replace(draft, equations=(*draft.equations, *equations), linearized=linearized)
+    symbols = _symbols(root, draft) or draft.symbols
+    draft = replace(draft, equations=(*draft.equations, *equations), linearized=linearized, symbols=symbols)
     sends = read_sends(root, unread)
     if mistakes:
         unread.pass_on(mistakes)
@@ -93,6 +95,18 @@ def read_component(source: Source, library: Definitions) -> Component:
     mistakes.raise_if_any()
     check_balance(component)
     return component
+
+
+def _symbols(root: Body, component: Component) -> tuple[tuple[str, str], ...]:
+    """Read `symbols: {K: stiffness}`: the parameters that play symbols of published conditions."""
+    names = {parameter.name: None for parameter in component.parameters}
+
+    def read(key: Scalar, value: Node) -> tuple[str, str]:
+        symbol = among(key.text, dict.fromkeys(SYMBOLS), key.place, "symbols names {}, which is no symbol of")
+        name = text_of(value, key.text, "K: stiffness")
+        return symbol, among(name, names, value.place, f"{symbol} names {{}}, which is no parameter of")
+
+    return tuple(root.each("symbols", "{K: stiffness}", read))
 
 
 def _read_declarations(root: Body, library: Definitions, mistakes: Mistakes) -> Component:

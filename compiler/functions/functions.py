@@ -88,7 +88,8 @@ def build_functions(
             if replaced:
                 of_analysis = _kind(other, linear_heard, timings)
                 _check_states(writer.kind, kind, of_analysis)
-                kind = replace(kind, linear=of_analysis, replaced=replaced)
+                symbols = _symbols(writer.kind)
+                kind = replace(kind, linear=of_analysis, replaced=replaced, symbols=symbols)
             kinds.append(kind)
     dropped = []
     for kind, writer in zip(system.kinds, writers, strict=True):
@@ -152,6 +153,22 @@ def _replaced(kind: SortedKind) -> Iterable[Replaced]:
                 for equation in linearized.equations
             )
             yield Replaced(part.name, tuple(texts), linearized.valid)
+
+
+def _symbols(kind: SortedKind) -> tuple[tuple[str, str], ...]:
+    """Return the symbols of published conditions with whole names, none unless every part has some."""
+    result = []
+    for part in kind.clocked.flat.parts:
+        if part.section == "hands":
+            continue
+        if not part.component.symbols:
+            return ()
+        clocks = dict(part.references)
+        result += [
+            (symbol, f"{clocks[name]}.period" if name in clocks else f"{part.name}.{name}")
+            for symbol, name in part.component.symbols
+        ]
+    return tuple(result)
 
 
 def _check_states(kind: SortedKind, full: Kind, linear: Kind) -> None:

@@ -33,6 +33,7 @@ from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, prepare
 from apc.frame.radius import RADII, UNIT, radius_of, solve, value_of, with_radius
 from apc.hands.port import PortLoop, port_loops
+from apc.hands.published_limits import published_limits
 from apc.moments.network_verdict import Growth
 from apc.network.nominal import left_out
 from apc.result import Result
@@ -182,6 +183,7 @@ def _limitations(system: CompiledSystem, prepared: Prepared) -> tuple[str, ...]:
     linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
     return (
         *near_start(system, prepared),
+        *published_limits(system),
         *left_out(system),
         *_as_at_start(system, prepared, linear=linear),
     )

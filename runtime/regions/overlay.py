@@ -22,7 +22,7 @@ from apc.compiler.compiled import CompiledSystem, Group
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.frame.names import Free, Range, find, unit_of, value_now
 from apc.frame.overrides import Override, apply
-from apc.regions.wall_conditions import CONDITIONS, MEANINGS, UNITS, PublishedCondition
+from apc.hands.wall_conditions import CONDITIONS, MEANINGS, UNITS, PublishedCondition
 
 Floats = NDArray[np.float64]
 

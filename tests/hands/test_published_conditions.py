@@ -9,8 +9,8 @@ import pytest
 
 import apc
 from apc.frame.names import Free, Range
+from apc.hands.wall_conditions import CONDITIONS
 from apc.regions.overlay import overlay_points, parse_overlay, symbol_values
-from apc.regions.wall_conditions import CONDITIONS
 from tests.topologies import AVERAGE, compiled, told, wall
 
 
@@ -120,3 +120,26 @@ EXAMPLE = "colgate:K=contact.stiffness,B=contact.damping,b=device.damping,T=hapt
 )
 def test_a_faulty_overlay_gets_one_clear_message(text: str, message: str) -> None:
     assert told(parse_overlay, MODEL, text) == [f"overlay: {message}"]
+
+
+@pytest.mark.parametrize(
+    ("stiffness", "coulomb", "holds"),
+    [(900, 0.5, True), (1010, 0.5, False), (900, 0.0224, False), (900, 0.0226, True)],
+)
+def test_a_wall_behind_an_encoder_is_held_against_published_conditions(
+    stiffness: float, coulomb: float, holds: bool
+) -> None:
+    """Abbott and Okamura: K ≤ min(2 b/T, 2 c/D), b = 0.5 N·s/m, T = 1 ms, D = 0.05 mm: 1000 N/m, c/(25 µm)."""
+    text = (
+        "topology: wall\nclocks: {haptic: 1 ms}\npeers: {user: {count: 1}}\n"
+        "masses: {device: {mass: 0.1 kg, damping: 0.4 N*s/m}}\ncouplers:\n"
+        "  encoder: {type: EncoderQuantization, flange: device, resolution: 0.05 mm}\n"
+        f"  friction: {{type: CoulombViscousFriction, a: device, b: ground, coulomb: {coulomb} N,"
+        " viscous: 0.1 N*s/m, threshold: 1 mm/s}\n"
+        "  wall: {type: VirtualWall, flange: encoder.measured, clock: haptic, x: 1 mm,"
+        f" stiffness: {stiffness} N/m}}\n"
+    ).replace("damping: 0.4 N*s/m}", "damping: 0.4 N*s/m, x: 1 mm}")
+    (line,) = [note for note in apc.passive_hands(compiled(text)).left_out if note.startswith("Abbott")]
+    assert ("2 c/D) holds" if holds else "2 c/D) does not hold") in line
+    delayed = text.replace("clock: haptic, x", "clock: haptic, delay: 1 ms, x")
+    assert not [note for note in apc.passive_hands(compiled(delayed)).left_out if note.startswith("Abbott")]
