@@ -42,6 +42,7 @@ from apc.frame.lift import FrameMap, compose, step_durations, with_roundings
 from apc.frame.parameters import resolve
 from apc.frame.ports import with_cuts
 from apc.frame.radius import RADII, radius_of, rounded, solve, value_of, with_radius
+from apc.frame.schedule import Tick
 from apc.frame.site import LinearSite
 from apc.unserved import UnservedError
 
@@ -134,7 +135,9 @@ def contact_groups(system: CompiledSystem, prepared: Prepared) -> list[tuple[Pee
         pushes = (
             push_of(switched[kind], part, prepared.jacobians[kind], peers.parameters) for part in parts[kind]
         )
-        pairs.append((peers, tuple(push for push in pushes if push)))
+        # A clock on which nothing depends, as of a force on a clamped device, has no ticks.
+        ticking = {event.partition for event in peers.schedule.events if isinstance(event, Tick)}
+        pairs.append((peers, tuple(push for push in pushes if push and push.partition in ticking)))
     return pairs
 
 

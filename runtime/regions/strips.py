@@ -180,7 +180,7 @@ def _standing(piece: Piece, other: Range, ends: Sequence[float], prepared: Prepa
     """Return a strip in which nothing depends on the delay: straight lines at the other's critical values."""
     low, high, free = float(other.low), float(other.high), other.free
     family = evaluator_of_many(piece.inside, [free], PLACE, prepared=prepared)
-    line = MatrixLine(family, np.array([parameter_of(piece.inside, free).value]), 0, low, high)
+    line = MatrixLine(family, prepared, np.array([parameter_of(piece.inside, free).value]), 0, low, high)
     result = search(line)
     if not result.stable or any(edge.proof == ESTIMATE for edge in result.edges):
         return None

@@ -75,7 +75,7 @@ class Critical(Result):
     there is no crossing; `verdict` then says whether all that was scanned is stable. `looked` values were
     looked at, and cells in which another crossing might hide divided down to `cell` of the value. `enters`
     says whether anything that decides depends on the parameter: on a start value of a linear scene nothing
-    does. `left_open` is that of `crossing.Search`. `counted` says that it is a number of peers: a
+    does. `left_open` and `alone` are those of `crossing.Search`. `counted` says that it is a number of peers: a
     crossing's value is then the number on its stable side.
     `left_out` says what of the scene the answer does not look at. `groups` are the groups' present values
     (None where their peers differ) of a parameter that is set for all groups though they have not all the
@@ -105,6 +105,7 @@ class Critical(Result):
     groups: tuple[tuple[str, float | None], ...] = ()
     counted: bool = False
     left_open: tuple[tuple[float, float], ...] = ()
+    alone: tuple[float, ...] = ()
 
     def plot(self, ax: Any = None, **look: Unpack[Look]) -> Any:
         """Draw where the eigenvalues go (root locus), as `look` says; return the matplotlib Axes.
@@ -185,7 +186,11 @@ def critical(
         elif by_growth:
             refuse_time(system, free, _PLACE, chosen_criterion)
             result = search(_singly(system, free, ends, prepared, chosen_criterion), progress=progress)
-            if chosen_criterion == PASSIVE and not passive_hands(system, prepared).why:
+            if (
+                chosen_criterion == PASSIVE
+                and result.stable == (False,)
+                and not passive_hands(system, prepared).why
+            ):
                 result = replace(result, enters=True)  # where clamped devices shake all values are one
         elif timed:
             start = prepare_at_start(system, prepared, [free])
@@ -233,6 +238,7 @@ def critical(
         groups=values_by_group(system, free),
         counted=counted,
         left_open=result.left_open,
+        alone=result.alone,
     )
 
 
@@ -245,7 +251,7 @@ def _everywhere(
 ) -> str:
     """Return the one verdict of all values, where none was found at which it changes."""
     side = search.stable[0] if search.stable else None
-    if search.scanned[0] <= present <= search.scanned[1]:
+    if search.scanned[0] <= present <= search.scanned[1] and present not in search.alone:
         # Floats alone say of which side all samples are; the analysis bounds its error.
         side = side if stable_now() == side else None
     words = {True: "stable", False: "unstable", None: "undecided"}[side]
@@ -272,7 +278,7 @@ def _line(system: CompiledSystem, free: Free, ends: Ends, prepared: Prepared) ->
             raise
         return _singly(system, free, ends, prepared, NOMINAL)
     low = parameter.minimum if low is None else low
-    line = MatrixLine(family, np.array([parameter.value]), 0, low, high)
+    line = MatrixLine(family, prepared, np.array([parameter.value]), 0, low, high)
     if high is None and parameter.maximum is not None:
         return replace(line, top=min(SPAN * line.scale, parameter.maximum))
     return line

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Protocol
 
@@ -57,8 +57,12 @@ HALF, WIDER, TRIES = 1e-13, 4.0, 24
 # The same where no more is wanted than where stability is first lost: floats mostly hold it.
 FIRST_HALF = 1e-10
 
-# Steps of Newton's method.
-NEWTON = 12
+# Steps of Newton's method, of Brent's, and of a bisection by verdicts.
+NEWTON, BRENT, HALVINGS = 12, 200, 60
+
+# How far inside a stretch its ends are sampled where the verdict changes in the cell beside, relative to the
+# value or the least size.
+BESIDE = 1e-9
 
 # A bracket this wide, relative to the value, with one verdict on both sides has no crossing.
 NOWHERE = 1e-6
@@ -160,7 +164,8 @@ class Search:
     at; `whole` is False where an eigenvalue kept so near to the circle that not every cell could be cleared;
     `enters` says whether any eigenvalue changed; `sided` whether each value to begin with, but those next to
     0, lies on a side; `left_open` are the stretches that no analysis decides; `why` says why the search
-    ended before its end.
+    ended before its end. `alone` are ends of a stretch at which the verdict is another than on all values
+    beside them: as where a stiffness of 0 takes a force away that every other value leaves.
     """
 
     edges: tuple[Crossing, ...]
@@ -172,6 +177,7 @@ class Search:
     sided: bool
     left_open: tuple[tuple[float, float], ...] = ()
     why: str = ""
+    alone: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -221,6 +227,7 @@ def search(line: Line, *, first: bool = False, progress: Progress | None = None)
     stable: list[bool] = []
     left_open: list[tuple[float, float]] = []
     ends: list[float] = []
+    alone: list[float] = []
     looked, whole, enters, sided, why = 0, True, False, True, ""
     before: Stretch | None = None
     for number, stretch in enumerate(line.stretches()):
@@ -242,6 +249,8 @@ def search(line: Line, *, first: bool = False, progress: Progress | None = None)
                 whole = False
                 left_open.append((float(stretch.low), float(stretch.high)))
             continue
+        samples, own = _with_ends_beside(stretch, samples)
+        alone += own
         side = (samples.growth < 0).tolist()
         if stable and stable[-1] != side[0]:
             assert before is not None, "a side comes of a stretch"
@@ -250,9 +259,11 @@ def search(line: Line, *, first: bool = False, progress: Progress | None = None)
             stable.append(side[0])
         for place in range(len(side) - 1):
             if side[place] != side[place + 1]:
+                around = samples.points[max(place - 1, 0) : place + 3].tolist()
                 crossing = _crossing(
                     stretch,
                     samples.points[place : place + 2].tolist(),
+                    (around[0], around[-1]),
                     samples.growth[place : place + 2].tolist(),
                     rising=side[place],
                     half=FIRST_HALF if first else HALF,
@@ -265,7 +276,16 @@ def search(line: Line, *, first: bool = False, progress: Progress | None = None)
             break
     scanned = (ends[0], ends[-1]) if ends else (math.nan, math.nan)
     return Search(
-        *(tuple(edges), tuple(stable), scanned, whole, looked, enters, sided, tuple(left_open)), why=why
+        edges=tuple(edges),
+        stable=tuple(stable),
+        scanned=scanned,
+        whole=whole,
+        looked=looked,
+        enters=enters,
+        sided=sided,
+        left_open=tuple(left_open),
+        why=why,
+        alone=tuple(alone),
     )
 
 
@@ -378,18 +398,46 @@ def _cubic(t: Floats, start: Complexes, end: Complexes, slope: Complexes, end_sl
     return np.asarray(straight + t * (1 - t) ** 2 * slope + t**2 * (t - 1) * end_slope)
 
 
+def _with_ends_beside(stretch: Stretch, samples: _Samples) -> tuple[_Samples, list[float]]:
+    """Return the samples with an end as it is just inside, where the verdict changes in the cell beside it.
+
+    Also, the ends at which the verdict is another than just inside.
+    """
+    alone = []
+    for place, next_place, way in ((0, 1, 1), (-1, -2, -1)):
+        stable = samples.growth < 0
+        if len(stable) < 2 or stable[place] == stable[next_place]:
+            continue
+        end = float(samples.points[place])
+        beside = end + way * BESIDE * max(abs(end), stretch.least)
+        inside = _sided(_sampled(stretch, np.array([beside])), ends=False)
+        if len(inside.points) and (inside.growth[0] < 0) == stable[next_place]:
+            at_end = replace(inside, points=np.array([end]))
+            others = samples.points != end
+            samples = samples.chosen(others).merged(at_end)
+            alone.append(end)
+    return samples, alone
+
+
 def _crossing(
-    stretch: Stretch, ends: Sequence[float], growth: Sequence[float], *, rising: bool, half: float
+    stretch: Stretch,
+    ends: Sequence[float],
+    limits: tuple[float, float],
+    growth: Sequence[float],
+    *,
+    rising: bool,
+    half: float,
 ) -> Crossing | None:
     """Close in on the crossing between two values, and hold it; None where both sides are judged alike.
 
-    `growth` are the logarithms of the spectral radius at the ends, `half` that of the bracket first tried,
-    relative to the value.
+    `growth` are the logarithms of the spectral radius at the ends, `limits` the samples before and behind
+    these, between which the bracket stays: a crossing may lie on an end. `half` is that of the bracket first
+    tried, relative to the value.
     """
-    low, high = ends
     value = _root(stretch, ends, growth, half)
     side = "below" if rising else "above"
-    width = half * (abs(value) or high - low)
+    width = half * (abs(value) or ends[1] - ends[0])
+    low, high = limits
     for _ in range(TRIES):
         left, right = max(value - width, low), min(value + width, high)
         grows = stretch.judge(Fraction(right if rising else left))
@@ -397,13 +445,9 @@ def _crossing(
         dies = grows if grows.stable is None else stretch.judge(Fraction(left if rising else right))
         below, above = (dies, grows) if rising else (grows, dies)
         if below.stable is rising and above.stable is (not rising):
-            bits = re.search(r"\d+ bits", f"{below.proof} {above.proof}")
-            proof = f"proved with {bits[0]}" if bits else grows.proof or "bounded in floats"
-            return Crossing(
-                (left + right) / 2, (right - left) / 2, side, grows.frequency_hz, "crossing", proof
-            )
+            return _held(left, right, side, (below, above))
         if None not in (below.stable, above.stable) and width > NOWHERE * abs(value):
-            return None
+            return _bisected(stretch, ends, rising=rising, half=half)
         if (left, right) == (low, high):
             break
         if below.stable == above.stable is not None:
@@ -416,6 +460,34 @@ def _crossing(
                 continue
         width *= WIDER
     return Crossing(value, min(width, high - low), side, grows.frequency_hz, "crossing", ESTIMATE)
+
+
+def _bisected(stretch: Stretch, ends: Sequence[float], *, rising: bool, half: float) -> Crossing | None:
+    """Hold a crossing by bisection with verdicts, None where both ends are judged alike or are left open."""
+    left, right = ends
+    below, above = (stretch.judge(Fraction(end)) for end in ends)
+    if not (below.stable is rising and above.stable is (not rising)):
+        return None
+    for _ in range(HALVINGS):
+        middle = (left + right) / 2
+        if right - left <= 2 * half * abs(middle):
+            break
+        at = stretch.judge(Fraction(middle))
+        if at.stable is None:
+            break
+        if at.stable is rising:
+            left, below = middle, at
+        else:
+            right, above = middle, at
+    return _held(left, right, "below" if rising else "above", (below, above))
+
+
+def _held(left: float, right: float, side: str, verdicts: tuple[Verdict, Verdict]) -> Crossing:
+    """Return the crossing between two values of these verdicts, the stable one on a side."""
+    grows = verdicts[1 if side == "below" else 0]
+    bits = re.search(r"\d+ bits", " ".join(verdict.proof for verdict in verdicts))
+    proof = f"proved with {bits[0]}" if bits else grows.proof or "bounded in floats"
+    return Crossing((left + right) / 2, (right - left) / 2, side, grows.frequency_hz, "crossing", proof)
 
 
 def _root(stretch: Stretch, ends: Sequence[float], growth: Sequence[float], off: float) -> float:
@@ -448,4 +520,16 @@ def _root(stretch: Stretch, ends: Sequence[float], growth: Sequence[float], off:
         value = new
     # Imported where Newton's method fails: it takes as long as an analysis.
     brentq = load_pool("scipy.optimize").brentq
-    return float(brentq(lambda value: at(value)[0], low, high, xtol=5e-324, rtol=off / 100))
+    nearest = off / 100
+    # Where it ends before, as between values next to each other, verdicts hold what there is.
+    return float(
+        brentq(
+            lambda value: at(value)[0],
+            low,
+            high,
+            xtol=nearest * stretch.least or math.ulp(0.0),
+            rtol=max(nearest, 4 * np.finfo(float).eps),
+            maxiter=BRENT,
+            disp=False,
+        )
+    )

@@ -20,11 +20,10 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Analysis, analyze, lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Place
-from apc.eigen.closing import ClosedSystem
 from apc.eigen.eigenpairs import eigenvalues
 from apc.eigen.modes import split
 from apc.eigen.rigid import rigid_modes_of
-from apc.eigen.spectrum import DRIFTS, Spectrum, solve_spectrum
+from apc.eigen.spectrum import DRIFTS
 from apc.frame.instance import Prepared
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
@@ -72,12 +71,18 @@ EVERY, FURTHER = 32, 1.25
 OPEN = Verdict(None, math.nan, math.inf, (), "")
 
 
-def judged(systems: Sequence[ClosedSystem]) -> Verdict:
-    """Return the verdict of closed systems; what drifts does so on both sides of a crossing."""
-    return verdict_of(solve_spectrum(systems), drifting=True)
+def judged(system: CompiledSystem, prepared: Prepared) -> Verdict:
+    """Return the verdict of a topology, open if there is no analysis.
+
+    A drift occurs on both sides of a crossing, so that it does not decide.
+    """
+    try:
+        return verdict_of(analyze(system, prepared=prepared), drifting=True)
+    except ApcError:
+        return OPEN
 
 
-def verdict_of(result: Spectrum | Analysis, *, drifting: bool | None = None) -> Verdict:
+def verdict_of(result: Analysis, *, drifting: bool | None = None) -> Verdict:
     """Return the verdict of an analysis; where the scene drifts, as is said."""
     stable = result.stable if result.verdict != DRIFTS else drifting
     return Verdict(stable, result.spectral_radius, result.spectral_radius_error, result.modes, result.proof)
@@ -110,10 +115,11 @@ def spread(bottom: float, top: float, scale: float) -> Floats:
 class MatrixLine(OneStretch):
     """One of an evaluator's free parameters varies, the others stay at `base` (m,): a line of one stretch.
 
-    `bottom` and `top` are its ends, None for those of `SPAN`.
+    `prepared` is that of the evaluator's topology. `bottom` and `top` are the ends, None for those of `SPAN`.
     """
 
     family: BatchEvaluator
+    prepared: Prepared
     base: Floats
     column: int
     bottom: float | None = None
@@ -136,7 +142,8 @@ class MatrixLine(OneStretch):
 
     def judge(self, value: Fraction) -> Verdict:
         """Return the verdict at a value."""
-        return judged(self.family.closed_at(self.point(float(value)).tolist()))
+        change = Override(self.family.free[self.column], value)
+        return judged(apply(self.family.system, [change]), self.prepared)
 
     @cached_property
     def scale(self) -> float:
@@ -234,9 +241,8 @@ class DelayLine(_JudgedLine):
             return OPEN
 
     def _judge_within(self, value: Fraction) -> Verdict:
-        """Return the verdict at a delay that moves events, of all systems without anything beside."""
-        changed = system_with_delay(self.system, self.free, value)
-        return judged(split(*lifted_groups(changed, prepared=self.prepared)))
+        """Return the verdict at a delay that moves events."""
+        return judged(system_with_delay(self.system, self.free, value), self.prepared)
 
     def stretches(self) -> Iterator[Stretch]:
         """Yield the value at which the line begins, then the stretches from one coincidence to the next."""

@@ -227,9 +227,9 @@ def _lines(
             continue
         if present:
             assert together is not None, "it is among those that are not 0"
-            whole = MatrixLine(together, base[base != 0], frees.index(item), present)
+            whole = MatrixLine(together, prepared, base[base != 0], frees.index(item), present)
         else:
-            whole = MatrixLine(evaluator(system, [item], prepared=prepared), np.zeros(1), 0, present)
+            whole = MatrixLine(evaluator(system, [item], prepared=prepared), prepared, np.zeros(1), 0, present)
         top = min(GROWTH * whole.scale, most)
         yield replace(whole, top=top) if top > present else None
 
@@ -263,6 +263,9 @@ def _margin(system: CompiledSystem, free: Free, search: Search) -> Margin | None
     present = value_now(system, free)
     row = replace(not_looked(system, free, ""), scanned=search.scanned[1])
     crossing = next((edge for edge in search.edges if edge.stable_side == "below"), None)
+    if crossing is None and search.stable[:1] == (False,):
+        # Stable as it is, and unstable at every larger value.
+        return replace(row, value=present, error=0.0, factor=1.0 if present else None, kind="jump")
     if crossing is None:
         return row
     return replace(
