@@ -23,6 +23,7 @@ from apc.eigen.peers import MOST_STATES, PeerGroup, more_differ, peer_groups, to
 from apc.frame.exchange import Exchange
 from apc.frame.instance import Instance
 from apc.frame.jacobians import SiteJacobians
+from apc.frame.schedule import Schedule
 from apc.memory import refuse_beyond
 
 # Up to so many states of motion of peers that differ, one matrix of all is quicker than what spares it, and
@@ -34,6 +35,10 @@ LARGEST_RING = 2000
 
 # From so many packets on their way on, leaving them out of the state is quicker.
 LONG_LINES = 60
+
+# A determinant has a row for each packet sent in a frame. Where packets take fewer frames than this, a matrix
+# with all of them is smaller than what the determinant takes, and its eigenvalues are well conditioned.
+MANY_FRAMES = 10
 
 
 # Bytes of an entry of a system's matrix: of each system what is told of it, of the one at work all it needs.
@@ -126,7 +131,7 @@ def make_plan(instance: Instance, method: str = "auto") -> Plan:
         if method == "determinant":
             text = method
         elif method == "auto" and (
-            max(sum(group.schedule.depths) for loop in loops for group in loop.sites) > LONG_LINES
+            any(_long_lines(group.schedule) for loop in loops for group in loop.sites)
             or (packets + held > LONG_LINES and max(loop.states for loop in loops) > MOST_STATES)
         ):
             text = "determinant"
@@ -146,6 +151,12 @@ def make_plan(instance: Instance, method: str = "auto") -> Plan:
         what = f"{len(loops):,} determinants of {sites:,} peers that differ"
     refuse_beyond(needed, "E804", Place(exchange.scene), what, "fewer peers that differ, or fewer states")
     return Plan(text, groups, loops, _sizes(loops, text), notes)
+
+
+def _long_lines(schedule: Schedule) -> bool:
+    """Say whether many packets are on their way at a time, each for many frames."""
+    packets = sum(schedule.depths)
+    return packets > max(LONG_LINES, MANY_FRAMES * len(schedule.sent))
 
 
 def is_large_ring(groups: Sequence[PeerGroup], exchange: Exchange) -> bool:

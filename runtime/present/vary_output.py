@@ -32,6 +32,8 @@ from apc.present.forms import (
     uncertain,
 )
 
+from apc.vary.crossing import PERIOD
+
 if TYPE_CHECKING:
     import pandas
 
@@ -86,7 +88,11 @@ def critical_text(critical: Critical) -> Lines:
         kind = "jump, " if crossing.kind == "jump" else ""
         turns = "" if math.isnan(crossing.frequency_hz) else f", {in_hertz(crossing.frequency_hz)}"
         yield f"    {kind}stable {crossing.stable_side} it{turns}, {crossing.proof}"
-        if crossing.error > ROUGH * abs(crossing.value):
+        if crossing.kind == PERIOD:
+            yield from sentences(
+                "every period between makes a frame of too many ticks with the other clocks to be analysed"
+            )
+        elif crossing.error > ROUGH * abs(crossing.value):
             yield "    no narrower: within its error the bounds on growth leave the verdict open"
     if critical.crossings:
         yield ""

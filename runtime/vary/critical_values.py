@@ -32,7 +32,7 @@ from apc.option_value import option_value
 from apc.result import Look, Result
 from apc.threads import single_threaded
 from apc.vary.counts import count_range
-from apc.vary.crossing import CELL, Crossing, Line, Progress, Search, search
+from apc.vary.crossing import CELL, Crossing, Line, Progress, Search, Verdict, search
 from apc.vary.delays import delay_now, pace
 from apc.vary.evaluator import (
     evaluator_of_many,
@@ -53,7 +53,8 @@ from apc.vary.growth import (
     line_points,
     refuse_time,
 )
-from apc.vary.line import SPAN, CountLine, DelayLine, MatrixLine, delay_reach
+from apc.vary.line import SPAN, CountLine, DelayLine, MatrixLine, delay_reach, judged
+from apc.vary.periods import PeriodLine, reaches_period, refuse_phase
 
 _PLACE = Place("critical value")
 
@@ -154,7 +155,7 @@ def critical(
     ------
     ApcError
         E622 no such parameter, E623 the number of peers, E842 a range that is none, E843 a limit out of the
-        parameter's bounds, E844 a period or phase, E845 a delay of a scene that isn't linear, E896 a number
+        parameter's bounds, E844 a phase, or periods that all make too long a frame, E845 a delay of a scene that isn't linear, E896 a number
         of an unreliable link; and those of `units.quantity`.
     """
     free = find(system, name.strip(), _PLACE, counts=True)
@@ -183,6 +184,14 @@ def critical(
                 CountLine(system, free, stable_of, *count_range(system, free, limits, present, _PLACE)),
                 progress=progress,
             )
+        elif timed and reaches_period(system, free):
+
+            def decide(changed: CompiledSystem) -> Verdict:
+                if by_growth:
+                    return judge_at(changed, prepared, [], _PLACE, criterion=chosen_criterion)
+                return judged(changed, prepared)
+
+            result = search(PeriodLine(system, free, decide, *limits, _PLACE), progress=progress)
         elif by_growth:
             refuse_time(system, free, _PLACE, chosen_criterion)
             result = search(_singly(system, free, ends, prepared, chosen_criterion), progress=progress)
@@ -193,6 +202,7 @@ def critical(
             ):
                 result = replace(result, enters=True)  # where clamped devices shake all values are one
         elif timed:
+            refuse_phase(system, free, _PLACE)
             start = prepare_at_start(system, prepared, [free])
             if start is None:
                 raise hangs_on_heard(system)

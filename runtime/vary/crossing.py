@@ -70,6 +70,9 @@ NOWHERE = 1e-6
 # After so many values at which nothing changes, nothing depends on a number whose every value takes long.
 STILL = 4
 
+# A crossing between two periods of a clock.
+PERIOD = "period"
+
 # What is said of a crossing that no bounds hold.
 ESTIMATE = "estimated in floats"
 
@@ -96,8 +99,9 @@ class Crossing:
 
     `stable_side` is "below" or "above"; `frequency_hz` is that of the motion that grows beside it; `kind` is
     "crossing", or "jump" where a packet comes a tick later or events change places, or "count" where it is
-    the number of peers on the stable side of a change from one number to the next; `proof` says how the value
-    is known.
+    the number of peers on the stable side of a change from one number to the next, or "period" between two
+    periods of a clock, with no other between that makes a short enough frame; `proof` says how the value is
+    known.
     """
 
     value: float

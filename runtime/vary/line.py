@@ -1,7 +1,7 @@
 """A scene along one of its numbers: its eigenvalues at many values, and its analysis at any.
 
 Takes: a `CompiledSystem`, what was prepared of it, and the number that varies.
-Gives: `MatrixLine`, `DelayLine`, `CountLine`; `spread`, `SPAN`; `one_by_one`, `verdict_of`, `OPEN`.
+Gives: `MatrixLine`, `JudgedLine`, `DelayLine`, `CountLine`; `spread`, `SPAN`; `one_by_one`, `verdict_of`, `OPEN`.
 Guarantees: `judge` is the scene's own analysis; `look` its matrices in floats.
 Does not: search (see `crossing`).
 """
@@ -197,7 +197,7 @@ def one_by_one(judge: Callable[[Fraction], Verdict], values: Floats) -> tuple[Co
 
 
 @dataclass(frozen=True, eq=False)
-class _JudgedLine:
+class JudgedLine:
     """A line of which each value is analysed by itself, once."""
 
     system: CompiledSystem
@@ -220,7 +220,7 @@ class _JudgedLine:
 
 
 @dataclass(frozen=True, eq=False)
-class DelayLine(_JudgedLine):
+class DelayLine(JudgedLine):
     """A delay from `low` to `high`: between two coincidences of events what decides is continuous.
 
     What happens exactly at `low` is a stretch of its own: events may coincide there. `rigid` are the numbers
@@ -346,7 +346,7 @@ def delay_reach(
 
 
 @dataclass(frozen=True, eq=False)
-class CountLine(_JudgedLine):
+class CountLine(JudgedLine):
     """A number of peers from `first` to `last`: a stretch each, the larger ones looked at less densely."""
 
     verdict_of: Callable[[CompiledSystem], bool | None]

@@ -4,6 +4,9 @@ OTHER is the Python of an environment in which another version of apc is install
 question on the same scene in turn, in one process each, with one thread. A number is wrong if the two are
 farther apart than both their errors, a verdict if it is another one; a time is that of a processor. What one
 version answers and the other does not is listed with its message.
+
+Without OTHER, or after the comparison, every critical value of a stiffness, damping or delay is bracketed: an
+analysis on each side of it, by a few times its error, has to give the verdict that the value states.
 """
 
 from __future__ import annotations
@@ -15,7 +18,7 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -56,7 +59,38 @@ def _simulate(model: Any) -> tuple[str, Numbers]:
     return "", [(ends[name], 1e-5 * max(1.0, abs(ends[name]))) for name in sorted(ends)]
 
 
-QUESTIONS: dict[str, Callable[[Any], tuple[str, Numbers]]] = {
+# An analysis has bounds of its own: it is asked so many errors from a critical value, and so much of the value
+# besides. An error above the widest, relatively, is an error of the search where analyses nearer decide.
+ASIDE, MORE, WIDEST = 3.0, 1e-9, 1e-6
+
+
+def _bracketed(model: Any, name: str, criterion: str) -> tuple[str, Numbers]:
+    """Return what is wrong with the critical values of a parameter, and the values with their errors."""
+    found = apc.critical(model, name, criterion=criterion)
+    decide = apc.passive_hands if criterion == "passive" else apc.analyze
+
+    def stable(value: float) -> bool | None:
+        return decide(model, set={name: f"{value!r} {found.unit}".removesuffix(" 1")}).stable
+
+    def side(crossing: Any, aside: float) -> tuple[bool | None, bool | None]:
+        below, above = (stable(crossing.value + way * aside) for way in (-1, 1))
+        return (below, above) if crossing.stable_side == "below" else (above, below)
+
+    wrong = []
+    for crossing in found.crossings:
+        size, least = abs(crossing.value), WIDEST * abs(crossing.value)
+        label = f"{name} {criterion} {crossing.value:.10g} ± {crossing.error:.1g}"
+        inner, outer = side(crossing, ASIDE * crossing.error + MORE * size)
+        if inner is False or outer is True:
+            wrong.append(f"{label}: analyses give {inner}, {outer}")
+        elif crossing.error > least and None not in side(crossing, least):
+            wrong.append(f"{label}: analyses nearer decide")
+        elif None in (inner, outer):
+            wrong.append(f"{label}: open at {ASIDE:g} times its error")
+    return "; ".join(wrong), [(crossing.value, crossing.error) for crossing in found.crossings]
+
+
+QUESTIONS: dict[str, Callable[..., tuple[str, Numbers]]] = {
     "analyze": _analyze,
     "first stiffness": lambda model: _critical(model, "stiffness", 0),
     "last delay": lambda model: _critical(model, "delay", -1),
@@ -64,7 +98,9 @@ QUESTIONS: dict[str, Callable[[Any], tuple[str, Numbers]]] = {
     "passive hands": lambda model: (apc.passive_hands(model).verdict, []),
     "simulate": _simulate,
     "default output": lambda model: (answer(model).analysis.verdict, []),
+    "bracketed": _bracketed,
 }
+BRACKETED = "bracketed"
 
 
 def serve() -> None:
@@ -79,14 +115,14 @@ def serve() -> None:
     signal.signal(signal.SIGALRM, stop)
     models: dict[str, Any] = {}
     for line in sys.stdin:
-        file, question, runs = json.loads(line)
+        file, question, runs, *more = json.loads(line)
         told: dict[str, Any] = {"refused": "", "words": "", "numbers": [], "seconds": []}
         signal.alarm(LONGEST_S)
         try:
             models[file] = models.get(file) or apc.compile(file)
             for _ in range(runs):
                 begun = time.process_time()
-                told["words"], told["numbers"] = QUESTIONS[question](models[file])
+                told["words"], told["numbers"] = QUESTIONS[question](models[file], *more)
                 told["seconds"].append(time.process_time() - begun)
         except TooLong:
             told["refused"] = f"took more than {LONGEST_S} s"
@@ -153,24 +189,56 @@ class Pairs:
                 print(f"  {title}: {row}")
 
 
+def bracketed(version: subprocess.Popen[str], files: Sequence[Path]) -> bool:
+    """Print and return whether analyses hold every critical value of all topologies on both sides."""
+    held, widest, wrong, refused = 0, 0.0, [], 0
+    for file in files:
+        try:
+            model = apc.compile(file)
+        except apc.ApcError:
+            continue
+        names = [name for ending in ("stiffness", "damping", "delay") for name in _named(model, ending)]
+        for name in names:
+            for criterion in ("nominal", "passive"):
+                told = answered(version, str(file), BRACKETED, 1, name, criterion)
+                if told["refused"]:
+                    refused += 1
+                    if not told["refused"].startswith("ApcError"):
+                        wrong.append(f"{file.stem}: {name} {criterion}: {told['refused']}")
+                    continue
+                held += len(told["numbers"])
+                widest = max([widest, *(error / abs(value) for value, error in told["numbers"] if value)])
+                wrong += [f"{file.stem}: {told['words']}"] * bool(told["words"])
+    print(f"\n{BRACKETED}: {held} critical values, the widest relative error {widest:.1g}")
+    print(f"  refused: {refused}")
+    for row in wrong:
+        print(f"  not held: {row}")
+    return not wrong
+
+
 def main() -> None:
     """Ask both versions every question on every scene, and print the comparison."""
     from tests.bench.judge import Judge, parser_of
 
     parser = parser_of("paired", __doc__)
-    parser.add_argument("other", help="the Python of the other version's environment")
+    parser.add_argument("other", nargs="?", help="the Python of the other version's environment")
     parser.add_argument("--only", action="append", choices=QUESTIONS, help="may be repeated")
     given = parser.parse_args()
     judge = Judge(given.strict)
-    ours, theirs = started(sys.executable), started(given.other)
+    ours = started(sys.executable)
     files = [file for folder in FOLDERS for file in sorted((ROOT / folder).glob("*.yaml"))]
-    for question in given.only or QUESTIONS:
+    files = files[:5] if given.quick else files
+    chosen = given.only or list(QUESTIONS)
+    theirs = started(given.other) if given.other else ours
+    for question in [one for one in chosen if one != BRACKETED] if given.other else []:
         pairs, runs = Pairs(), 3 if question == "analyze" else 1
-        for file in files[:5] if given.quick else files:
+        for file in files:
             asked = (str(file), question, runs)
             pairs.add(file.stem, answered(ours, *asked), answered(theirs, *asked))
         pairs.report(question)
         judge.right(f"{question}: the same answers", not pairs.different)
+    if BRACKETED in chosen:
+        judge.right(f"{BRACKETED}: analyses on both sides of every critical value", bracketed(ours, files))
     judge.end()
 
 
