@@ -31,7 +31,6 @@ from apc.present.forms import (
     table,
     uncertain,
 )
-
 from apc.vary.crossing import PERIOD
 
 if TYPE_CHECKING:

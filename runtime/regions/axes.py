@@ -14,8 +14,9 @@ from fractions import Fraction
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import with_unit
-from apc.frame.names import Free, Range, proposed_range, unit_of
+from apc.frame.names import Range, proposed_range, unit_of
 from apc.sweeps.grid import parse_axis
+from apc.vary.periods import refuse_phase
 
 PLACE = Place("region")
 
@@ -70,7 +71,7 @@ def parse_axes(
                 replace(mistake, place=Place(f"--{letter}"), hint=mistake.hint.removesuffix(":2"))
                 for mistake in error.mistakes
             ) from None
-        _refuse_period(system, axis.free)
+        refuse_phase(system, axis.free, PLACE, code="E903")
         low, high = axis.values[0], axis.values[-1]
         least = NARROWEST * max(abs(low), abs(high))
         if high - low < least:
@@ -86,13 +87,3 @@ def parse_axes(
             what = f"{item} and {other} are not apart: without a group it is that of all groups"
         raise ApcError(Mistake("E902", PLACE, what))
     return first, replace(second, low=second.low / scale, high=second.high / scale)
-
-
-def _refuse_period(system: CompiledSystem, free: Free) -> None:
-    """Raise E903 for what makes another frame at every value: one would see arithmetic, not physics."""
-    for clock in system.clocks:
-        if free.name in (clock.period, clock.phase):
-            what = (
-                f"{free.label} can't be an axis: at each value all clocks stand as before after another time"
-            )
-            raise ApcError(Mistake("E903", PLACE, what, hint='--vary "haptic.period=1 ms, 2 ms"'))

@@ -62,6 +62,7 @@ from apc.vary.growth import (
     refuse_time,
 )
 from apc.vary.leading import Part
+from apc.vary.periods import is_scaled, reaches_period
 
 if TYPE_CHECKING:
     import pandas
@@ -272,8 +273,9 @@ def region(
 
     Notes
     -----
-    Where one axis is a delay, the rectangle is cut where events coincide (see `strips`). Where both axes are
-    times each point is analysed by itself, and the boundary is a line from cell edge to cell edge, its error
+    Where one axis is a delay, the rectangle is cut where events coincide (see `strips`). Along a period it is
+    cut halfway between the periods that are analysed (see `periods`), unless all times scale with it. Where
+    both axes are times each point is analysed by itself, and the boundary is a line from cell edge to cell edge, its error
     the size of a cell. A scene that is linearized at its start, and starts elsewhere along an axis, is
     analysed point by point where other motions are free. With passive hands there are no steps: its
     points are on the boundary, straight lines between, and its error is an estimate by their middles.
@@ -295,9 +297,13 @@ def region(
         if counts:
             _check_count(axes[counts[0]], len(counts) == 2, bool(times), meant, affine=affine)
         times = [] if meant in BY_GROWTH else times + counts
+        # Where every time scales with a period the frame is the same at all values, but for its length.
+        scales = len(times) == 1 and not counts and _scales(system, free[times[0]])
+        times = [] if scales else times
+        _refuse_two_times(system, [free[place] for place in times])
         start = None if meant in BY_GROWTH else prepare_at_start(system, prepared, free)
         striped: Striped | None = None
-        if start is None or times:
+        if start is None or times or scales:
             plane = _points_plane(system, free, rectangle, prepared, meant, stepped=bool(times))
             if meant == NOMINAL and not times:
                 tolerance = max(tolerance, TOLERANCE_OF_DIFFERENCES)
@@ -341,6 +347,20 @@ def region(
         ),
         system=system,
     )
+
+
+def _scales(system: CompiledSystem, free: Free) -> bool:
+    return reaches_period(system, free) and is_scaled(system, free, delays=True)
+
+
+def _refuse_two_times(system: CompiledSystem, times: Sequence[Free]) -> None:
+    """Refuse a period beside another time, unless all clocks scale with it: ApcError E903."""
+    if len(times) < 2:
+        return
+    for free in times:
+        if reaches_period(system, free) and not is_scaled(system, free):
+            what = f"{free.label} is a period, and the other axis a time: their frames are too long"
+            raise ApcError(Mistake("E903", PLACE, what, hint=f"apc critical {free.label}"))
 
 
 def _check_count(axis: Range, both: bool, timed: bool, meant: str, *, affine: bool) -> None:

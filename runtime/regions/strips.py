@@ -39,6 +39,7 @@ from apc.vary.delays import Piece, delay_pieces, pace, system_with_delay
 from apc.vary.evaluator import closed_at, evaluator_of_many, generic, reaches_count
 from apc.vary.growth import NOMINAL, RadiusEvaluator
 from apc.vary.line import MatrixLine
+from apc.vary.periods import period_pieces, reaches_period
 
 Floats = NDArray[np.float64]
 
@@ -155,8 +156,9 @@ def _strips(
     progress: Callable[[str], None] | None,
 ) -> Iterator[_Strip | None]:
     """Yield the strips in order; None for one that can't be had in closed form."""
-    if reaches_count(system, delay.free):
-        for piece in count_pieces(system, delay, PLACE):
+    if reaches_count(system, delay.free) or reaches_period(system, delay.free):
+        pieces = count_pieces if reaches_count(system, delay.free) else period_pieces
+        for piece in pieces(system, delay, PLACE):
             ends = [
                 float((number - delay.low) / (delay.high - delay.low)) for number in (piece.low, piece.high)
             ]

@@ -76,8 +76,8 @@ class Critical(Result):
     there is no crossing; `verdict` then says whether all that was scanned is stable. `looked` values were
     looked at, and cells in which another crossing might hide divided down to `cell` of the value. `enters`
     says whether anything that decides depends on the parameter: on a start value of a linear scene nothing
-    does. `left_open` and `alone` are those of `crossing.Search`. `counted` says that it is a number of peers: a
-    crossing's value is then the number on its stable side.
+    does. `left_open` and `alone` are those of `crossing.Search`. `counted` says that it is a number of
+    peers: a crossing's value is then the number on its stable side.
     `left_out` says what of the scene the answer does not look at. `groups` are the groups' present values
     (None where their peers differ) of a parameter that is set for all groups though they have not all the
     same. `system` is the scene.
@@ -155,7 +155,8 @@ def critical(
     ------
     ApcError
         E622 no such parameter, E623 the number of peers, E842 a range that is none, E843 a limit out of the
-        parameter's bounds, E844 a phase, or periods that all make too long a frame, E845 a delay of a scene that isn't linear, E896 a number
+        parameter's bounds, E844 a phase, or periods
+        that all make too long a frame, E845 a delay of a scene that isn't linear, E896 a number
         of an unreliable link; and those of `units.quantity`.
     """
     free = find(system, name.strip(), _PLACE, counts=True)
@@ -314,6 +315,9 @@ def _check_limits(
     most = None if timed else parameter_of(system, free).maximum
     unit = "s" if timed else parameter_of(system, free).unit
     for value in (low, high):
+        if value is not None and timed and not value and reaches_period(system, free):
+            what = f"a limit of {free.name}"
+            raise ApcError(Mistake("E843", _PLACE, what, "more than 0 s", "0 s"))
         if value is not None and (
             (least is not None and value < least) or (most is not None and value > most)
         ):

@@ -310,11 +310,18 @@ def _reaches(system: CompiledSystem, group: Group, name: str) -> bool:
 
 
 def overrides_at(system: CompiledSystem, free: Sequence[Free], value: Sequence[float]) -> list[Override]:
-    """Return what sets parameters to a point (m,); of a number of peers, to the nearest whole number."""
-    return [
-        Override(item, Fraction(round(number) if reaches_count(system, item) else float(number)))
-        for item, number in zip(free, value, strict=True)
-    ]
+    """Return what sets parameters to a point (m,): counts to whole numbers, periods to ones of short frames."""
+    return [Override(item, _exact(system, item, number)) for item, number in zip(free, value, strict=True)]
+
+
+def _exact(system: CompiledSystem, free: Free, number: float) -> Fraction:
+    if reaches_count(system, free):
+        return Fraction(round(number))
+    if reaches_time(system, free):
+        from apc.vary.periods import nearest_period  # which needs the evaluator of delays
+
+        return nearest_period(system, free, Fraction(number))
+    return Fraction(number)
 
 
 def reaches_count(system: CompiledSystem, free: Free) -> bool:

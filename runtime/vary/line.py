@@ -1,7 +1,8 @@
 """A scene along one of its numbers: its eigenvalues at many values, and its analysis at any.
 
 Takes: a `CompiledSystem`, what was prepared of it, and the number that varies.
-Gives: `MatrixLine`, `JudgedLine`, `DelayLine`, `CountLine`; `spread`, `SPAN`; `one_by_one`, `verdict_of`, `OPEN`.
+Gives: `MatrixLine`, `JudgedLine`, `DelayLine`, `CountLine`; `spread`, `SPAN`; `one_by_one`, `judged`,
+`verdict_of`, `OPEN`.
 Guarantees: `judge` is the scene's own analysis; `look` its matrices in floats.
 Does not: search (see `crossing`).
 """
@@ -9,7 +10,7 @@ Does not: search (see `crossing`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property, partial

@@ -229,7 +229,9 @@ def _lines(
             assert together is not None, "it is among those that are not 0"
             whole = MatrixLine(together, prepared, base[base != 0], frees.index(item), present)
         else:
-            whole = MatrixLine(evaluator(system, [item], prepared=prepared), prepared, np.zeros(1), 0, present)
+            whole = MatrixLine(
+                evaluator(system, [item], prepared=prepared), prepared, np.zeros(1), 0, present
+            )
         top = min(GROWTH * whole.scale, most)
         yield replace(whole, top=top) if top > present else None
 

@@ -1,8 +1,8 @@
 """A clock period as the number that varies: which values are analysed, and where the verdict changes.
 
 Takes: a `CompiledSystem` and a timing, or a parameter, that a clock's period depends on.
-Gives: `reaches_period`, `refuse_phase`, `is_scaled`, `periods_near`, `period_pieces`, `PeriodLine`;
-`MOST_FRAME_TICKS`.
+Gives: `reaches_period`, `refuse_phase`, `is_scaled`; `nearest_period`, `periods_near`, `period_pieces`;
+`PeriodLine`, `MOST_FRAME_TICKS`.
 Guarantees: every verdict is an analysis at an exact rational period.
 Does not: give a verdict for periods whose frame with the other clocks is longer than `MOST_FRAME_TICKS`.
 
@@ -15,11 +15,12 @@ fraction comes next, as long as there is one. What is left is the resolution, an
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +44,9 @@ MOST_FRAME_TICKS = 400
 # Without limits given, periods from so many times shorter to so many times longer than the present one.
 PERIOD_SPAN = 32
 
+# Digits to which a period is met, the most that serve; periods that are kept for the next question.
+DIGITS, KEPT = 9, 256
+
 # Periods along an axis of a region, of those that are analysed.
 STRIPS = 32
 
@@ -60,11 +64,11 @@ def _reaches(system: CompiledSystem, free: Free, times: set[str]) -> bool:
     return free.name in times or free.name in scope_of(system).needed(sorted(times))
 
 
-def refuse_phase(system: CompiledSystem, free: Free, place: Place) -> None:
-    """Raise ApcError E844 for a number that the phase of a clock depends on, and no period."""
+def refuse_phase(system: CompiledSystem, free: Free, place: Place, *, code: str = "E844") -> None:
+    """Raise ApcError E844, or another code, for what the phase of a clock depends on, and no period."""
     if _reaches(system, free, _clock_times(system, phases=True)) and not reaches_period(system, free):
         what = f"{free.name} sets the phase of a clock: it can't be varied continuously"
-        raise ApcError(Mistake("E844", place, what, hint="apc analyze with --set, one value at a time"))
+        raise ApcError(Mistake(code, place, what, hint="apc analyze with --set, one value at a time"))
 
 
 def is_scaled(system: CompiledSystem, free: Free, *, delays: bool = False) -> bool:
@@ -119,6 +123,22 @@ def _between(
     return value if _ticks(system, free, value) <= MOST_FRAME_TICKS else None
 
 
+@lru_cache(maxsize=KEPT)
+def nearest_period(system: CompiledSystem, free: Free, value: Fraction) -> Fraction:
+    """Return a period near a value, by powers of ten, whose frame is short; any other time as it is."""
+    if value <= 0 or not reaches_period(system, free) or is_scaled(system, free):
+        return value
+    if _ticks(system, free, value) <= MOST_FRAME_TICKS:
+        return value
+    unit = _unit(system, free)
+    for digits in range(DIGITS, 0, -1):
+        off = value / 10**digits
+        near = _between(system, free, unit, value - off, value + off)
+        if near is not None:
+            return near
+    return value
+
+
 def periods_near(
     system: CompiledSystem, free: Free, targets: Sequence[Fraction], place: Place
 ) -> list[Fraction]:
@@ -157,7 +177,7 @@ def periods_near(
 
 
 def period_pieces(system: CompiledSystem, axis: Range, place: Place) -> Iterator[Piece]:
-    """Yield a piece for each of some periods of a range, from halfway to the one before to halfway to the next.
+    """Yield a piece for each of some periods of a range, with ends halfway to those beside it.
 
     Raises
     ------
@@ -166,7 +186,7 @@ def period_pieces(system: CompiledSystem, axis: Range, place: Place) -> Iterator
     """
     step = (axis.high - axis.low) / STRIPS
     values = periods_near(system, axis.free, [axis.low + step * k for k in range(STRIPS + 1)], place)
-    middles = [(before + after) / 2 for before, after in zip(values, values[1:], strict=False)]
+    middles = [(before + after) / 2 for before, after in itertools.pairwise(values)]
     for value, low, high in zip(values, [axis.low, *middles], [*middles, axis.high], strict=True):
         yield Piece(low, high, None, system_with_delay(system, axis.free, value))
 

@@ -59,8 +59,8 @@ def _simulate(model: Any) -> tuple[str, Numbers]:
     return "", [(ends[name], 1e-5 * max(1.0, abs(ends[name]))) for name in sorted(ends)]
 
 
-# An analysis has bounds of its own: it is asked so many errors from a critical value, and so much of the value
-# besides. An error above the widest, relatively, is an error of the search where analyses nearer decide.
+# An analysis has bounds of its own: it is asked so many errors from a critical value, and so much of the
+# value besides. An error above the widest, relatively, is an error of the search where analyses nearer decide.
 ASIDE, MORE, WIDEST = 3.0, 1e-9, 1e-6
 
 

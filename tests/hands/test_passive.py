@@ -418,3 +418,43 @@ def test_no_model_has_every_passive_hand() -> None:
         apc.ApcError, match=r"E930 passive hands are all .*Write: apc\.passive_hands\(model\)"
     ):
         apc.with_hands(users(3, 200), "passive")
+
+
+WALL = """\
+topology: wall
+clocks: {haptic: 1 ms}
+peers: {user: {count: 1}}
+masses: {device: {mass: 0.5 kg, damping: 2 N*s/m, x: START}}
+couplers:
+  wall: {type: VirtualWall, flange: device, stiffness: 1000 N/m, damping: DAMPING, clock: haptic, x: START}
+"""
+
+
+def textbook(damping: str, start: str = "1 mm") -> CompiledSystem:
+    """Return a sampled wall before a device of 2 N·s/m, which is passive below K = 2 (b − |B|)/T."""
+    return compiled(WALL.replace("DAMPING", damping).replace("START", start))
+
+
+@pytest.mark.parametrize(("damping", "truth"), [("0 N*s/m", 4000.0), ("0.5 N*s/m", 3000.0)])
+def test_the_critical_value_of_the_textbook_wall(damping: str, truth: float) -> None:
+    found = apc.critical(textbook(damping), "wall.stiffness", criterion="passive")
+    assert found.value == pytest.approx(truth, rel=1e-9) and (found.error or 1) < 1e-8 * truth
+
+
+def test_a_critical_value_on_an_end_of_a_cell_is_held() -> None:
+    # K = 2 b/T = 10,000 N/m is one of the values scanned.
+    values = {"device.mass": "0.1 kg", "device.damping": "5 N*s/m"}
+    found = apc.critical(textbook("0 N*s/m"), "wall.stiffness", set=values, criterion="passive")
+    assert found.value == pytest.approx(1e4, rel=1e-9) and (found.error or 1) < 1e-2
+
+
+@pytest.mark.parametrize("damping", ["2 N*s/m", "3 N*s/m", "20 N*s/m"])
+def test_a_wall_of_more_damping_than_its_device_is_never_passive(damping: str) -> None:
+    found = apc.critical(textbook(damping), "wall.stiffness", criterion="passive")
+    assert (found.value, found.crossings) == (None, ())
+    assert found.verdict == "unstable at every value scanned"
+
+
+def test_a_wall_that_is_only_touched_has_no_critical_value() -> None:
+    found = apc.critical(textbook("0.5 N*s/m", "0 m"), "wall.stiffness", criterion="passive")
+    assert found.value is None and "where the scene starts: there nothing depends" in found.verdict

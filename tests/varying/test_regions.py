@@ -393,7 +393,7 @@ KEEPS = "E905 in part of the rectangle some motion neither grows nor dies out"
             f"user.{Y}",
             "E902 coordination.stiffness and user.coordination.stiffness are not apart",
         ),
-        (AVERAGE, "haptic.period=1 ms:2 ms", Y, "E903 haptic.period can't be an axis"),
+        (AVERAGE, "haptic.phase=1 ms:2 ms", Y, "E903 haptic.phase sets the phase of a clock"),
         (
             AVERAGE,
             "user.count=2:5.5",

@@ -1,0 +1,94 @@
+"""The largest sampling period, alone and beside other clocks: closed forms, and analyses on both sides."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import pytest
+
+import apc
+from apc.analysis.analysis import analyze
+from apc.compiler.compiled import CompiledSystem
+from apc.frame.names import Free
+from apc.vary.delays import system_with_delay
+from tests.topologies import AVERAGE, compiled
+from tests.varying.closed_forms import built
+
+PULL = 97.3
+
+
+WALL = """\
+topology: wall
+clocks: {haptic: 1 ms}
+peers: {user: {count: 1}}
+masses: {device: {mass: 0.5 kg, damping: 2 N*s/m, x: 1 mm}}
+couplers:
+  wall: {type: VirtualWall, flange: device, stiffness: 1000 N/m, damping: 0.5 N*s/m, clock: haptic, x: 1 mm}
+"""
+
+
+def pulled(delay_ms: int = 0, clocks: str = "", other: str = "", delay: str = "") -> CompiledSystem:
+    """Return a position pulled back: x⁺ = x − p (T − d) x − p d x(a tick ago), stable below 2/p + 2 d."""
+    return built(
+        f"topology: pulled\nclocks: {{tick: 2 ms{clocks}}}\npeers: {{user: {{count: 1}}}}\n"
+        f"masses:\n  it: {{type: Late, pull: {PULL!r} Hz, growth: 0 Hz, clock: tick, "
+        f"delay: {delay or f'{delay_ms} ms'}}}\n{other}"
+    )
+
+
+def beside(period: str) -> CompiledSystem:
+    """Return the same beside a second one that stays, and decides nothing."""
+    other = "  that: {type: Late, pull: 1 Hz, growth: 0 Hz, clock: other, delay: 0 ms}\n"
+    return pulled(0, f", other: {period}", other)
+
+
+@pytest.mark.parametrize("delay_ms", [0, 3])
+def test_one_clock_has_the_largest_period_of_the_closed_form(delay_ms: int) -> None:
+    found = apc.critical(pulled(delay_ms), "tick.period")
+    assert found.value == pytest.approx(2 / PULL + 2e-3 * delay_ms, rel=1e-12)
+    assert found.error is not None and found.error < 1e-11 * found.value
+    assert [one.stable_side for one in found.crossings] == ["below"]
+
+
+@pytest.mark.parametrize("period", ["1 ms", "3 ms"])
+def test_beside_another_clock_the_error_is_the_gap_between_periods(period: str) -> None:
+    system = beside(period)
+    found = apc.critical(system, "tick.period")
+    (one,) = found.crossings
+    assert abs(one.value - 2 / PULL) <= one.error < 1e-3 * one.value and one.kind == "period"
+    # The ends are fractions of the other period with short frames.
+    unit = Fraction(int(period[0]), 1000)
+    for side, stable in ((-1, True), (1, False)):
+        end = Fraction((one.value + side * one.error) / float(unit)).limit_denominator(400) * unit
+        assert analyze(system_with_delay(system, Free("tick.period"), end)).stable is stable
+
+
+def test_the_textbook_wall_with_passive_hands_has_its_longest_period() -> None:
+    # Colgate and Schenkel (1997): b > K T/2 + |B|.
+    found = apc.critical(compiled(WALL), "haptic.period", criterion="passive")
+    assert found.value == pytest.approx(2 * (2 - 0.5) / 1000, rel=1e-6)
+
+
+def test_periods_of_too_long_frames_are_refused_by_name() -> None:
+    system = beside("1 ms")
+    with pytest.raises(apc.ApcError, match=r"E844 periods of tick\.period from .* make frames of more than"):
+        apc.critical(system, "tick.period", lower="2.00011 ms", upper="2.00012 ms")
+
+
+def test_a_region_over_a_period_is_that_of_the_closed_form() -> None:
+    # Stable where pull·T < 2: of pull 50 to 200 Hz and T 5 to 25 ms.
+    # ∫ min(2/p, 25 ms) − 5 ms dp = 30·20 ms + ∫_80^200 (2/p − 5 ms) dp.
+    truth = 30 * 0.02 + 2 * math.log(200 / 80) - 120 * 0.005
+    for system, most in ((pulled(0), 1e-6), (beside("1 ms"), 0.03)):
+        found = apc.region(system, x="tick.period=5 ms:25 ms", y="it.pull=50 Hz:200 Hz")
+        assert abs(found.stable_area - truth) <= most * truth
+
+
+def test_a_limit_of_0_and_a_phase_are_refused() -> None:
+    with pytest.raises(apc.ApcError, match=r"E843 a limit of haptic\.period"):
+        apc.critical(compiled(AVERAGE), "haptic.period", lower="0 ms")
+    with pytest.raises(apc.ApcError, match=r"E844 haptic\.phase sets the phase"):
+        apc.critical(compiled(AVERAGE), "haptic.phase")
+    with pytest.raises(apc.ApcError, match=r"E903 haptic\.phase sets the phase"):
+        apc.region(compiled(AVERAGE), x="haptic.phase=0 ms:1 ms", y="contact.stiffness=1 N/m:2 N/m")
