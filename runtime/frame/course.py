@@ -237,7 +237,9 @@ def followed_closely(course: Complexes, values: Complexes) -> tuple[Floats, NDAr
     From point to point they turn by little, or a mode that is real changes its sign, which is half a turn.
     """
     angles = _angles(_phases(course))
-    signs = (values.imag == 0) & (np.pi - np.abs(angles) <= NEAR_ZERO)
+    # In an enclosure of more bits a real eigenvalue has an imaginary part, far below a float's rounding.
+    real = np.abs(values.imag) <= ROUNDED * np.abs(values)
+    signs = real & (np.pi - np.abs(angles) <= NEAR_ZERO)
     return angles.sum(axis=0), np.asarray(((np.abs(angles) < CLOSE) | signs).all(axis=0))
 
 

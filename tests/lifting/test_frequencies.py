@@ -72,6 +72,18 @@ def test_what_is_computed_from_itself_alone_turns_from_tick_to_tick(tmp_path: Pa
     assert flips.frequency_hz == pytest.approx(500, rel=1e-9)
 
 
+@pytest.mark.parametrize(("name", "count"), [("three-users-mesh", 3), ("planar-users", 2)])
+def test_a_certified_real_negative_eigenvalue_keeps_its_frequency_and_damping(name: str, count: int) -> None:
+    """λ = −|λ| is e^{sT} with Im s T = π: half a turn in a frame of 8 ms, 62.5 Hz; in a plane it is double."""
+    modes = analyze(apc.compile(SCENES / f"{name}.yaml"), certify=True).modes
+    negative = [mode for mode in modes if abs(mode.eigenvalue.imag) < 1e-99 and mode.eigenvalue.real < -1e-6]
+    assert len(negative) == count
+    for mode in negative:
+        decay = -math.log(mode.magnitude)
+        assert mode.frequency_hz == pytest.approx(1 / (2 * 0.008), rel=1e-12)
+        assert mode.damping_ratio == pytest.approx(decay / math.hypot(decay, math.pi), rel=1e-12)
+
+
 def test_what_a_mode_turns_hangs_on_no_phase_of_its_vector() -> None:
     for system in split(*lifted_groups(apc.compile(SCENES / "two-users-reported.yaml"))):
         values, vectors = np.linalg.eig(system.matrix.astype(complex))
