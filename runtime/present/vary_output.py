@@ -84,9 +84,8 @@ def critical_text(critical: Critical) -> Lines:
         return
     for crossing in critical.crossings:
         yield f"  {uncertain(crossing.value, crossing.error, unit)}"
-        kind = "jump, " if crossing.kind == "jump" else ""
         turns = "" if math.isnan(crossing.frequency_hz) else f", {in_hertz(crossing.frequency_hz)}"
-        yield f"    {kind}stable {crossing.stable_side} it{turns}, {crossing.proof}"
+        yield f"    {_sides(crossing)}{turns}, {crossing.proof}"
         if crossing.kind == PERIOD:
             yield from sentences(
                 "every period between makes a frame of too many ticks with the other clocks to be analysed"
@@ -110,23 +109,30 @@ def critical_text(critical: Critical) -> Lines:
 
 def _stable_ranges(critical: Critical) -> str:
     """Return where a scene is stable in a sentence; nothing where no crossing was found."""
-    ranges, begin = [], ""
+    ranges, begin, included = [], "", None
     for crossing in critical.crossings:
         if critical.counted:
             value = f"{math.floor(crossing.boundary) + (crossing.stable_side == 'above'):,d}"
         else:
             by, shown = as_shown(crossing.value, critical.unit)
-            value = with_unit(
-                f"{_on_stable_side(crossing.value * by, crossing.error * by, crossing.stable_side):g}", shown
-            )
+            error = 0.0 if crossing.stable_at else crossing.error * by
+            value = with_unit(f"{_on_stable_side(crossing.value * by, error, crossing.stable_side):g}", shown)
         if crossing.stable_side == "above":
-            begin = value
+            begin, included = value, critical.counted or crossing.stable_at
             continue
-        most = f"up to {value}" if critical.counted else f"below {value}"
+        most = f"up to {value}" if critical.counted or crossing.stable_at else f"below {value}"
         ranges.append(f"from {begin} {most}" if begin else most)
         begin = ""
-    ranges += [f"from {begin} on" if critical.counted else f"above {begin}"] if begin else []
+    ranges += [f"from {begin} on" if included else f"above {begin}"] if begin else []
     return f"stable with {critical.parameter} {', and '.join(ranges)}" if ranges else ""
+
+
+def _sides(crossing: Crossing) -> str:
+    """Return the stable side of a crossing; of a jump, the verdict at its own value, too."""
+    if crossing.kind != "jump":
+        return f"stable {crossing.stable_side} it"
+    at = {True: ", stable at it", False: ", unstable at it", None: ""}[crossing.stable_at]
+    return f"jump{at}, stable {crossing.stable_side} it"
 
 
 def _on_stable_side(value: float, error: float, side: str) -> float:

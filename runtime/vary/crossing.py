@@ -1,7 +1,7 @@
 """Where the verdict of a scene changes as one of its numbers varies, held between two verdicts.
 
 Takes: a `Line`, a scene along one of its numbers.
-Gives: `Verdict`, `Crossing`, `Stretch`, `Line`, `OneStretch`, `Search`; `search`.
+Gives: `Verdict`, `Crossing`, `Stretch`, `Line`, `OneStretch`, `Search`; `search`; `shortest_decimal`.
 Guarantees: on either side of a crossing, by its error, the scene's own analysis gives another verdict; where
 it gives none, the crossing is called an estimate. A jump is at an exact value.
 Does not: prove that there are no others between two values that were looked at.
@@ -64,6 +64,9 @@ NEWTON, BRENT, HALVINGS = 12, 200, 60
 # value or the least size.
 BESIDE = 1e-9
 
+# The radius is discontinuous in a bracket narrower than this, relative to the value, in which it changes by more.
+JUMP = 1e-6
+
 # A bracket this wide, relative to the value, with one verdict on both sides has no crossing.
 NOWHERE = 1e-6
 
@@ -98,10 +101,11 @@ class Crossing:
     """A value at which the spectral radius crosses 1, right to `error`, both in SI.
 
     `stable_side` is "below" or "above"; `frequency_hz` is that of the motion that grows beside it; `kind` is
-    "crossing", or "jump" where a packet comes a tick later or events change places, or "count" where it is
-    the number of peers on the stable side of a change from one number to the next, or "period" between two
-    periods of a clock, with no other between that makes a short enough frame; `proof` says how the value is
-    known.
+    "crossing", or "jump" where the radius is discontinuous: a packet comes a tick later, events change places
+    or a contact closes; or "count" where it is the number of peers on the stable side of a change from one
+    number to the next, or "period" between two periods of a clock, with no other between that makes a short
+    enough frame; `proof` says how the value is known. `stable_at` is the verdict at a jump's own value, None
+    of any other crossing, or if undecided.
     """
 
     value: float
@@ -110,6 +114,7 @@ class Crossing:
     frequency_hz: float
     kind: str
     proof: str
+    stable_at: bool | None = None
 
     @property
     def boundary(self) -> float:
@@ -449,7 +454,7 @@ def _crossing(
         dies = grows if grows.stable is None else stretch.judge(Fraction(left if rising else right))
         below, above = (dies, grows) if rising else (grows, dies)
         if below.stable is rising and above.stable is (not rising):
-            return _held(left, right, side, (below, above))
+            return _held(stretch, left, right, side, (below, above))
         if None not in (below.stable, above.stable) and width > NOWHERE * abs(value):
             return _bisected(stretch, ends, rising=rising, half=half)
         if (left, right) == (low, high):
@@ -483,15 +488,31 @@ def _bisected(stretch: Stretch, ends: Sequence[float], *, rising: bool, half: fl
             left, below = middle, at
         else:
             right, above = middle, at
-    return _held(left, right, "below" if rising else "above", (below, above))
+    return _held(stretch, left, right, "below" if rising else "above", (below, above))
 
 
-def _held(left: float, right: float, side: str, verdicts: tuple[Verdict, Verdict]) -> Crossing:
+def _held(
+    stretch: Stretch, left: float, right: float, side: str, verdicts: tuple[Verdict, Verdict]
+) -> Crossing:
     """Return the crossing between two values of these verdicts, the stable one on a side."""
-    grows = verdicts[1 if side == "below" else 0]
+    dies, grows = verdicts if side == "below" else verdicts[::-1]
     bits = re.search(r"\d+ bits", " ".join(verdict.proof for verdict in verdicts))
     proof = f"proved with {bits[0]}" if bits else grows.proof or "bounded in floats"
-    return Crossing((left + right) / 2, (right - left) / 2, side, grows.frequency_hz, "crossing", proof)
+    middle, kind, at = (left + right) / 2, "crossing", None
+    if right - left < JUMP * abs(middle) and grows.radius - dies.radius > JUMP:
+        # A discontinuity of the radius, as where a contact closes: at a value that somebody wrote.
+        exact = shortest_decimal(left, right)
+        middle, kind, at = float(exact), "jump", stretch.judge(exact).stable
+    error = max(right - middle, middle - left)
+    return Crossing(middle, error, side, grows.frequency_hz, kind, proof, at)
+
+
+def shortest_decimal(low: float, high: float) -> Fraction:
+    """Return the decimal number of the fewest digits after the point in [low, high], low ≤ high."""
+    least, most, digits = Fraction(low), Fraction(high), 0
+    while (number := math.ceil(least * 10**digits)) > most * 10**digits:
+        digits += 1
+    return Fraction(number, 10**digits)
 
 
 def _root(stretch: Stretch, ends: Sequence[float], growth: Sequence[float], off: float) -> float:

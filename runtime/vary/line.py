@@ -321,7 +321,8 @@ class DelayLine(JudgedLine):
             error, proof = max(error, after.high - after.low), ESTIMATE
         grows = above if stable_below else below
         side = "below" if stable_below else "above"
-        return Crossing(float(value), float(error), side, grows.frequency_hz, "jump", proof)
+        at = None if error else self.judge(value).stable
+        return Crossing(float(value), float(error), side, grows.frequency_hz, "jump", proof, at)
 
 
 def delay_reach(

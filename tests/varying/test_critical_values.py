@@ -323,8 +323,27 @@ def test_a_link_delay_jumps_where_a_packet_comes_a_tick_later() -> None:
     # A packet that comes with a tick is seen by it: the jump's own value is one with what is below.
     moved = apc.set_parameters(compiled(SOFT), {"lan.delay": f"{first.value!r} s"})
     assert apc.analyze(moved).stable and apc.critical(moved, "lan.delay").value == first.value
+    assert first.stable_at is True
+    assert f"stable with lan.delay up to {1000 * first.value:g} ms\n" in str(found)
+    assert "jump, stable at it, stable below it" in str(found)
     row = next(one for one in apc.margins(moved).rows if one.parameter == "lan.delay")
     assert (row.value, row.factor, row.kind) == (first.value, 1.0, "jump")
+
+
+@pytest.mark.parametrize(("name", "value"), [("device.x", -0.02), ("contact.half_width", 0.01)])
+def test_where_a_contact_closes_the_radius_jumps_at_the_value_of_the_geometry(
+    name: str, value: float
+) -> None:
+    """The device at x = −10 mm touches a cube at 0 within its half width: open at equality, where f = 0."""
+    system = compiled(replaced(PRESSED, ("1000 N/m", "200 kN/m")))
+    found = apc.critical(system, name, lower="-0.05 m" if value < 0 else None, upper="0.05 m")
+    (one,) = found.crossings
+    assert (one.kind, one.value, one.stable_side) == ("jump", value, "below")
+    for off, stable in ((-1e-9, True), (1e-9, False)):
+        moved = apc.set_parameters(system, {name: value + off})
+        assert apc.analyze(moved).stable is stable
+    at = apc.analyze(apc.set_parameters(system, {name: value})).stable
+    assert one.stable_at is at
 
 
 def test_jumps_of_a_scene_within_a_part_in_10_13_of_its_boundary_are_exact() -> None:
