@@ -130,6 +130,7 @@ def open_scene(
     outputs: Mapping[str, Path | None] | None = None,
     *,
     hands: str = "free",
+    varied: Iterable[str] = (),
     notify: Callable[[str], None] | None = None,
 ) -> CompiledSystem:
     """Return the compiled model that a command means.
@@ -144,21 +145,25 @@ def open_scene(
         What the command will write, by the option that says so: see `check_outputs`.
     hands
         How hands are to be taken, see `devices.with_hands`.
+    varied
+        The parameters that the command varies, each a text that begins with a name.
     notify
         Is told what a setting for all groups takes the place of.
 
     Raises
     ------
     ApcError
-        As `find_input`, `load_or_compile`, `check_outputs`, `overrides.parse_override` and `overrides.apply`.
+        As `find_input`, `load_or_compile`, `check_outputs`, `devices.with_hands`,
+        `devices.refuse_numberless`, `overrides.parse_override` and `overrides.apply`.
     """
     path = find_input(file, compiled_too=True)
     system = load_or_compile(path)
     check_outputs(path, (name for name, _ in system.origin.texts), outputs or {})
     if hands != "free":
-        from apc.frame.devices import with_hands
+        from apc.frame.devices import refuse_numberless, with_hands
 
         system = with_hands(system, hands)
+        refuse_numberless(hands, (*settings, *varied))
     if not settings:
         return system
     from apc.frame.names import OVERRIDE, notes_for_all_groups

@@ -91,7 +91,7 @@ def analyze_command(
 
     if cells is not None and not box and hands in (*HANDS, PASSIVE):  # hands of the library make a box
         raise click.UsageError("--cells wants a --box to divide")
-    system = open_scene(file, settings, {"--plot": plot}, hands=hands, notify=note_aside)
+    system = open_scene(file, settings, {"--plot": plot}, hands=hands, varied=box, notify=note_aside)
     if hands == PASSIVE:
         asked = {"--method": method != AUTO, "--conventions": every_convention, "--buzz": with_buzz}
         asked |= {"--margins": bool(margins), "--plot": plot is not None}

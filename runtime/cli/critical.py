@@ -71,7 +71,9 @@ def critical_command(
     if plot is not None and asked == "passive":
         what = "--plot and --hands passive don't go together: what hands can draw has no eigenvalues"
         raise ApcError(Mistake("E930", Place("--hands"), what, hint="--hands clamped"))
-    system = open_scene(file, settings, {"--plot": plot}, hands=hands, notify=note_aside)
+    system = open_scene(
+        file, settings, {"--plot": plot}, hands=hands, varied=(path, *over), notify=note_aside
+    )
     if over:
         if plot is not None:
             raise click.UsageError("--plot and --over don't go together: there are as many loci as scenes")

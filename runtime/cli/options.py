@@ -108,7 +108,7 @@ SHARED: dict[str, Callable[[inspect.Parameter], click.Parameter]] = {
     ),
     "hands": option(
         "What holds the devices. free: nothing but what the scene says. clamped: they are held fast. held: "
-        "each by a hand of hand.mass, hand.damping and hand.stiffness, 0 unless --set. passive: stable means "
+        "each by a hand of hand.mass, hand.damping and hand.stiffness, given by --set. passive: stable means "
         "stable with all hands that give back no more energy than they got. Or a hand of the library, such "
         "as StylusArmForward.",
         "HANDS",

@@ -8,6 +8,7 @@ Does not: compute.
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 from apc.cli.options import (
@@ -75,8 +76,9 @@ def region_command(
     listed = parse_vary(vary) if vary else tuple(parse_panel(text) for text in panels) or ((),)
     asked = criterion_with(hands, criterion)
     note_usual(hands)
+    varied = [text for text in (x, y, *itertools.chain(*listed)) if text]
     systems = [
-        open_scene(text, settings, {"--out": out}, hands=hands, notify=note_aside)
+        open_scene(text, settings, {"--out": out}, hands=hands, varied=varied, notify=note_aside)
         for text in (file, *compare)
     ]
     with status_line() as progress:

@@ -79,7 +79,7 @@ def sweep_command(
     values = _values(over)
     asked = criterion_with(hands, criterion)
     note_usual(hands)
-    system = open_scene(file, settings, {"--out": out}, hands=hands, notify=note_aside)
+    system = open_scene(file, settings, {"--out": out}, hands=hands, varied=over, notify=note_aside)
     with _progress(out) as progress:
         result = sweep(
             system,

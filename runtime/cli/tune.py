@@ -43,7 +43,7 @@ def tune_command(
     minimize: str = option(
         "What is to be as small as can be: a gain; settling_time or spectral_radius (the same gains); "
         '"feel.error at 1 Hz", or feel.impedance, feel.transmitted; feel.damping of slow motions; '
-        "feel.error_h2, for white forces of 1 N rms, feel.error_hinf, the largest gain at any frequency; or "
+        "feel.error_h2, the rms at the ticks for white forces of 1 N rms, feel.error_hinf, the largest gain at any frequency; or "
         "a weighted sum in SI of gains and these, "
         '"feel.damping - 0.01*coordination.stiffness".',
         "AIM",
@@ -104,7 +104,14 @@ def tune_command(
         )
     if write is not None and against:
         raise click.UsageError("--write is of one design, and --against finds several")
-    system = open_scene(file, settings, {"--write": write, "--plot": plot}, hands=hands, notify=note_aside)
+    system = open_scene(
+        file,
+        settings,
+        {"--write": write, "--plot": plot},
+        hands=hands,
+        varied=(*free, *over),
+        notify=note_aside,
+    )
     criterion = criterion_with(hands, None)
     if hands == FREE:
         system, criterion = held_as_studied(system)

@@ -4,7 +4,7 @@ Takes: a kind's Jacobians and exact numbers; a `CompiledSystem`.
 Gives: `Device`, `find_device`, `find_devices`, `devices_of`, `coupled_directly`,
 `directions_of`; `no_device`; `Push`,
 `find_push`; `HANDS`, `with_hands`, `without_hands`, `clamped`, `held`; `replaced_hands`; `refuse_hands`;
-`published`; `OWN_MASS`, `UNHELD`.
+`published`; `refuse_numberless`; `OWN_MASS`, `UNHELD`.
 Guarantees: a scene that is clamped or held is a scene as any other: parameters, groups and clocks stay.
 Does not: ask whether it is stable (see `passivity` for hands of every kind).
 
@@ -20,7 +20,8 @@ whose columns say what a force at i does to all of them, M⁻¹ eᵢ.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
@@ -62,6 +63,9 @@ _NUMBERS = (
     ("damping", "N*s/m", "of the hand, to where the arm stands"),
     ("stiffness", "N/m", "of the hand, to where it holds the device at the start"),
 )
+# The example in a message: about the usual values of StylusArmForward in the library.
+_USUAL = (("mass", "0.2 kg"), ("damping", "18 N*s/m"), ("stiffness", "270 N/m"))
+_HAND_NAME = re.compile(rf"([\w.]+\.)?{HAND}\.\w")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -516,6 +520,29 @@ def with_hands(system: CompiledSystem, hands: str) -> CompiledSystem:
     return replace(
         compiled_system, name=f"{system.name}, {name}", origin=system.origin.after((HANDS_CHANGE, hands))
     )
+
+
+def refuse_numberless(hands: str, named: Iterable[str]) -> None:
+    """Refuse hands that are held but have no number: a hand of 0 kg, 0 N*s/m and 0 N/m is a free hand.
+
+    Parameters
+    ----------
+    hands
+        As for `with_hands`.
+    named
+        The parameters that are set or varied: names, or texts that begin with a name.
+
+    Raises
+    ------
+    ApcError
+        E930 none of `hand.mass`, `hand.damping` and `hand.stiffness` is among them.
+    """
+    if hands != HELD or any(_HAND_NAME.match(text.strip()) for text in named):
+        return
+    names = ", ".join(f"{HAND}.{name}" for name, _, _ in _NUMBERS)
+    what, got = f"--hands {HELD}", "none, which is a free hand"
+    hint = f"--hands {HELD} " + " ".join(f'--set "{HAND}.{name}={value}"' for name, value in _USUAL)
+    raise ApcError(Mistake("E930", Place("--hands"), what, f"a value for {names}", got, hint))
 
 
 def clamped(system: CompiledSystem, *, option: str = "--hands clamped") -> CompiledSystem:

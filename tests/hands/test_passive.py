@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import shlex
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -411,6 +412,23 @@ def test_the_command_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert usual in said(*asked, "StylusArmForward") and usual not in said(*asked, "clamped")
     found = apc.critical(scene, PULL, lower="600 N/m", criterion="passive")
     assert (found.value, found.verdict) == (None, "unstable at every value scanned")
+
+
+def test_held_hands_without_a_number_are_asked_for_one_and_the_fix_runs(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    scene = str(SCENES / "three-users-average.yaml")
+    for command in ("analyze", "critical contact.stiffness", "compare"):
+        assert run([*command.split(), scene, "--hands", "held", "--json"]) == 1
+        message = capsys.readouterr().err
+        assert "E930" in message and "hand.mass, hand.damping, hand.stiffness" in " ".join(message.split())
+    fix = shlex.split(" ".join(message.split()).rpartition("Write: ")[2])
+    assert run(["analyze", scene, *fix, "--json"]) == 0
+    # At rest each device holds to the ground by its hand: nothing moves freely any more.
+    assert json.loads(capsys.readouterr().out)["verdict"] == "stable"
+    for words in (["--set", "hand.damping=0 N*s/m"], ["--box", "hand.mass=0 kg:0.1 kg"]):
+        assert run(["analyze", scene, "--hands", "held", *words, "--json"]) == 0
+    assert run(["critical", "hand.mass", scene, "--hands", "held", "--upper", "1 kg", "--json"]) == 0
 
 
 def test_no_model_has_every_passive_hand() -> None:

@@ -125,7 +125,7 @@ def test_a_scheme_that_refuses_has_its_place_and_says_why(tmp_path: Path) -> Non
         files.append(str(tmp_path / name / "scene.yaml"))
         Path(files[-1]).write_text(text, encoding="utf-8")
     out = tmp_path / "found.json"
-    assert run(["compare", *files, "--hands", "held", "--out", str(out)]) == 0
+    assert run(["compare", *files, "--hands", "held", "--set", "hand.mass=0.2 kg", "--out", str(out)]) == 0
     one, other = json.loads(out.read_text(encoding="utf-8"))["schemes"]
     assert one["analysis"] is not None and not one["refused"]
     assert (other["analysis"], other["stiffness"], other["feel"], other["stable"]) == (None,) * 4
