@@ -357,7 +357,8 @@ def feel(
     -------
     Feel
         Impedance, transmitted admittance and error between copies, complex (k,), in SI, with a bound; mass,
-        damping and stiffness of slow motions; H∞ and H2 norms.
+        damping and stiffness of slow motions; H∞ norms; H2 norms, an rms at the ticks: motion between ticks
+        is not included.
 
     Raises
     ------

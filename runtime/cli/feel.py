@@ -44,9 +44,9 @@ def feel_command(
     The impedance (force by velocity, in N*s/m) at each frequency, all other
     hands as the scene has them; mass, damping and stiffness of slow motions;
     the velocity at another device and how far the copies of the object are
-    apart, a newton (transparency); the largest gains at any frequency; what
-    noise does. FILE is a topology
-    or a compiled model.
+    apart, a newton (transparency); the largest gains at any frequency; the rms
+    caused by white noise, at the ticks (motion between ticks is not included).
+    FILE is a topology or a compiled model.
 
     \b
         apc feel --at "user[1].device" --frequencies "1 Hz, 5 Hz"

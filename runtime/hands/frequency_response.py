@@ -88,7 +88,9 @@ class Extremes:
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """Root mean squares over the ticks of a frame, for noise of each peer's own, white from tick to tick.
+    """Root mean squares at the ticks of a frame, for noise of each peer's own, white from tick to tick.
+
+    Motion between ticks is not included.
 
     `error_m` of a copy less the mean of the others', `velocity_m_s` of a device: for forces of 1 N rms at
     hands, or samples of positions off by 1 m rms (a sensor of steps q is off by q/√12). None in a scene that

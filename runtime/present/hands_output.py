@@ -41,6 +41,9 @@ SHOWN = 12
 # Digits of a table's numbers, at most.
 DIGITS = 6
 
+# Where the root mean squares of a `Noise` are taken.
+NOISE_RMS = "at the ticks, motion between ticks not included"
+
 
 def passive_text(passive_hands: PassiveHands) -> Lines:
     """Yield whether a scene is stable with any passive hands, in words and numbers."""
@@ -160,9 +163,9 @@ def feel_text(feel: Feel) -> Lines:
         yield "\n  Largest gain at any frequency (H∞), forces of any course:"
         yield from table([_extreme(extremes) for extremes in feel.hinf])
     for noise in feel.h2:  # of a sample that is off by a mm, a µm is what a mm is of 1 N
-        what, small = ("1 N rms of every hand", "m")
+        what, small = "1 N rms at every hand", "m"
         if noise.source != "hands":
-            what, small = "1 mm rms of every device's samples", "µ"
+            what, small = "1 mm rms on every device's samples", "µ"
         values = [
             f"{quantity} {measured(value * 1e3, off * 1e3, unit)}"
             for quantity, value, off, unit in (
@@ -173,7 +176,7 @@ def feel_text(feel: Feel) -> Lines:
         ]
         yield ""
         spread = ", ".join(values) or "it drifts, or rounding hides that it does not"
-        yield from notes(f"{spread} (rms) for {what}, new at each tick")
+        yield from notes(f"{spread}: rms {NOISE_RMS}, for {what}, white from tick to tick")
 
 
 def _curves(feel: Feel) -> list[tuple[NDArray[np.complex128], Floats, float, bool, str]]:
@@ -218,6 +221,7 @@ def feel_document(feel: Feel) -> Plain:
     instead = {
         "hinf": {f"{extremes.mode} {extremes.of}": extremes for extremes in feel.hinf},
         "h2": {noise.source: noise for noise in feel.h2},
+        "h2_rms": NOISE_RMS,
     }
     return record(feel, instead)
 

@@ -128,6 +128,9 @@ def test_a_lone_mass_feels_like_itself() -> None:
         hands = next(one for one in found.h2 if one.source == "hands")
         assert hands.velocity_m_s is not None and hands.errors[1] is not None
         assert abs(mpmath.mpf(hands.velocity_m_s) - truth) <= hands.errors[1] < 1e-11 * truth
+    # It is the rms at the ticks, which is not that over time.
+    assert "rms at the ticks, motion between ticks not included" in " ".join(str(found).split())
+    assert found.to_dict()["h2_rms"] == "at the ticks, motion between ticks not included"
 
 
 RING = replaced(MESH, ("delay: 8 ms}", "delay: 8 ms, graph: ring}"))
