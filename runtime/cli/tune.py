@@ -43,8 +43,8 @@ def tune_command(
     minimize: str = option(
         "What is to be as small as can be: a gain; settling_time or spectral_radius (the same gains); "
         '"feel.error at 1 Hz", or feel.impedance, feel.transmitted; feel.damping of slow motions; '
-        "feel.error_h2, the rms at the ticks for white forces of 1 N rms, feel.error_hinf, the largest gain at any frequency; or "
-        "a weighted sum in SI of gains and these, "
+        "feel.error_h2, the rms at the ticks for white forces of 1 N rms, feel.error_hinf, the largest gain "
+        "at any frequency; or a weighted sum in SI of gains and these, "
         '"feel.damping - 0.01*coordination.stiffness".',
         "AIM",
     ),

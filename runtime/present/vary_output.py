@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from apc.frame.settable import Parameters, Settable
     from apc.sweeps.resumable_sweep import Sweep
     from apc.vary.critical_values import Critical
+    from apc.vary.crossing import Crossing
     from apc.vary.many import Analyses
     from apc.vary.margins import Margins
     from apc.vary.sensitivity import Sensitivities

@@ -64,7 +64,8 @@ NEWTON, BRENT, HALVINGS = 12, 200, 60
 # value or the least size.
 BESIDE = 1e-9
 
-# The radius is discontinuous in a bracket narrower than this, relative to the value, in which it changes by more.
+# The radius is discontinuous in a bracket narrower than this, relative to the value, in which it changes by
+# more.
 JUMP = 1e-6
 
 # A bracket this wide, relative to the value, with one verdict on both sides has no crossing.

@@ -310,7 +310,7 @@ def _reaches(system: CompiledSystem, group: Group, name: str) -> bool:
 
 
 def overrides_at(system: CompiledSystem, free: Sequence[Free], value: Sequence[float]) -> list[Override]:
-    """Return what sets parameters to a point (m,): counts to whole numbers, periods to ones of short frames."""
+    """Return overrides to a point (m,): counts are rounded, periods become ones of short frames."""
     return [Override(item, _exact(system, item, number)) for item, number in zip(free, value, strict=True)]
 
 

@@ -74,7 +74,7 @@ def test_what_is_computed_from_itself_alone_turns_from_tick_to_tick(tmp_path: Pa
 
 @pytest.mark.parametrize(("name", "count"), [("three-users-mesh", 3), ("planar-users", 2)])
 def test_a_certified_real_negative_eigenvalue_keeps_its_frequency_and_damping(name: str, count: int) -> None:
-    """λ = −|λ| is e^{sT} with Im s T = π: half a turn in a frame of 8 ms, 62.5 Hz; in a plane it is double."""
+    """λ = −|λ| is e^{sT} with Im s T = π: half a turn in a frame of 8 ms, 62.5 Hz. In a plane λ is double."""
     modes = analyze(apc.compile(SCENES / f"{name}.yaml"), certify=True).modes
     negative = [mode for mode in modes if abs(mode.eigenvalue.imag) < 1e-99 and mode.eigenvalue.real < -1e-6]
     assert len(negative) == count

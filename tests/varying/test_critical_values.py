@@ -331,9 +331,7 @@ def test_a_link_delay_jumps_where_a_packet_comes_a_tick_later() -> None:
 
 
 @pytest.mark.parametrize(("name", "value"), [("device.x", -0.02), ("contact.half_width", 0.01)])
-def test_where_a_contact_closes_the_radius_jumps_at_the_value_of_the_geometry(
-    name: str, value: float
-) -> None:
+def test_where_a_contact_closes_the_radius_jumps_at_the_geometry(name: str, value: float) -> None:
     """The device at x = −10 mm touches a cube at 0 within its half width: open at equality, where f = 0."""
     system = compiled(replaced(PRESSED, ("1000 N/m", "200 kN/m")))
     found = apc.critical(system, name, lower="-0.05 m" if value < 0 else None, upper="0.05 m")
