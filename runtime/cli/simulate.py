@@ -109,11 +109,11 @@ def simulate_command(
 
         system = trace_of_worst(system)
     if strike is not None:
-        from apc.simulation.strike import WATCHED
+        from apc.simulation.strike import WATCHED, impulse_text
         from apc.simulation.strike import strike as struck
 
         system, what = struck(system, strike)
-        note_aside(f"{what} is struck as the scene begins")
+        note_aside(impulse_text(what))
         asked = asked or system.experiment.duration or WATCHED
     seconds = duration_of(system, asked, runs=runs or 1)
     if still is not None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.present.bodies import Body, Disc, heading, moves_in_plane, views_of
-from apc.simulation.strike import SPEED, WATCHED, strike
+from apc.simulation.strike import WATCHED, impulse_text, strike
 from apc.simulation.trajectory import simulate
 
 Floats = NDArray[np.float64]
@@ -69,7 +69,7 @@ def motion_of(system: CompiledSystem, *, struck: bool) -> Motion:
     remarks = []
     if struck:
         system, what = strike(system)
-        remarks.append(f"{what} is struck: it starts at {SPEED * MM:g} mm/s.")
+        remarks.append(impulse_text(what))
     shown = tuple((view.name, body) for view in views for body in view.bodies)
     names = [
         [f"{peer}.{state}" for state in (body.states[0], body.states[planar], *body.turning)]

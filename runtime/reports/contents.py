@@ -12,7 +12,6 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -26,7 +25,6 @@ from apc.compiler.timings import part
 from apc.compiler.words import counted
 from apc.distribution import versions
 from apc.frame.names import parameter_of, unit_of
-from apc.frame.overrides import apply, parse_override
 from apc.hands.asked import read_frequencies
 from apc.hands.frequency_response import feel
 from apc.inputs import open_scene
@@ -34,6 +32,7 @@ from apc.moments.network_verdict import judge_network
 from apc.regions.axes import parse_axes
 from apc.regions.stable_region import region
 from apc.result import Result
+from apc.simulation.strike import WATCHED, impulse_text, strike
 from apc.simulation.trajectory import simulate
 from apc.vary.critical_values import critical
 from apc.vary.growth import MEAN_SQUARE, NOMINAL
@@ -43,8 +42,6 @@ LIBRARIES = ("casadi", "numpy", "scipy", "sympy", "python-flint", "matplotlib")
 MOST_PLAYED = 60  # peers
 JITTER = "jitter"
 FURTHER = 3  # times the present value a region reaches where the scene says no range
-SECONDS = Fraction(1)  # that a scene is played, where it doesn't say how long
-PUSH = "0.1 m/s"  # with which a device starts in a scene that is at rest
 FEEL = ("0.1 Hz", 200)  # the lowest frequency, and how many
 # Numbers computed anew, on another processor or by other libraries, are the same up to this, relatively, and
 # by as much as their own errors; of what is next to nothing beside the others of a list nothing is known.
@@ -256,23 +253,19 @@ def _response(system: CompiledSystem, call: str) -> Section:
         why = f"{counted(system.peers, 'peer', ',')} are more than the {MOST_PLAYED} that a report plays"
         return Section("response", "", refused=f"{why}; apc simulate does")
     duration, remarks = system.experiment.duration, []
-    length = "" if duration else f" --duration {shlex.quote(f'{float(SECONDS):g} s')}"
-    trajectory = simulate(system, duration=duration or SECONDS)
-    if trajectory.summary.verdict == "rests" and (push := _push(system)):
-        remarks.append(f"At rest as it stands: here it starts with {push}.")
-        length += f" --set {shlex.quote(push)}"
-        pushed = apply(system, [parse_override(system, push)])
-        trajectory = simulate(pushed, duration=duration or SECONDS)
+    length = "" if duration else f" --duration {shlex.quote(f'{float(WATCHED):g} s')}"
+    trajectory = simulate(system, duration=duration or WATCHED)
+    if trajectory.summary.verdict == "rests":
+        try:
+            struck, what = strike(system)
+        except ApcError as error:
+            remarks.append(_why(error))
+        else:
+            remarks.append(f"The start is at rest. Here {impulse_text(what)}")
+            length += f" --strike {shlex.quote(what.partition('.')[0])}"
+            trajectory = simulate(struck, duration=duration or WATCHED)
     command = f"apc simulate {call}{length} --plot run.svg"
     return Section("response", command, tuple(remarks), (trajectory,), (trajectory,))
-
-
-def _push(system: CompiledSystem) -> str:
-    """Return the setting that gives the first body of the first group a start velocity."""
-    group = system.groups[0]
-    starts = [state.start for state in system.kinds[group.kind].states if state.unit == "m/s"]
-    name = f"{group.name}.{starts[0]}" if starts and len(system.groups) > 1 else "".join(starts[:1])
-    return f"{name}={PUSH}" if name else ""
 
 
 def _feel(system: CompiledSystem, call: str) -> Section:

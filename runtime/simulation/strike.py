@@ -1,7 +1,7 @@
 """A peer that is struck: its device moves as the scene begins.
 
 Takes: a `CompiledSystem` and the name of a peer.
-Gives: `strike`; `SPEED`, `WATCHED`.
+Gives: `strike`, `impulse_text`; `SPEED`, `WATCHED`.
 Guarantees: all else begins as the scene says.
 Does not: play it (see `trajectory`).
 """
@@ -21,7 +21,18 @@ from apc.simulation.signals import sent_states
 # How fast the struck device starts, in m/s, and how long that is watched, in s, where the scene says nothing.
 SPEED, WATCHED = 0.1, Fraction(1)
 
+MM = 1e3
+
 _PEER = re.compile(r"(?P<group>.+?)(\[(?P<number>\d+)\])?")
+
+
+def impulse_text(name: str) -> str:
+    """Return the sentence on the initial velocity of what `strike` named.
+
+    >>> impulse_text("user[1].device")
+    'user[1].device starts with 100 mm/s more than in the topology.'
+    """
+    return f"{name} starts with {SPEED * MM:g} mm/s more than in the topology."
 
 
 def strike(system: CompiledSystem, peer: str = "") -> tuple[CompiledSystem, str]:

@@ -40,7 +40,7 @@ HINF = "error_hinf"
 
 # What hands feel, by its name in a demand: its unit, and whether it is at a frequency. `error_h2` is the rms
 # at the ticks of a copy's error for white forces of 1 N rms at all hands, `error_hinf` the largest gain from
-# forces of any course, which add up to 0 over peers that are alike, to how far a copy is from the mean of all.
+# any forces, which add up to 0 over peers that are alike, to how far a copy is from the mean of all.
 FELT = {
     "impedance": ("N*s/m", True),
     "transmitted": ("m/s/N", True),

@@ -6,13 +6,16 @@ import functools
 import html
 import json
 import re
+import shlex
 import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import apc
+from apc.explore.motion import motion_of
 from apc.present import report_output as pages
 from apc.present.report_output import kept_report, report_page
 from apc.reports.contents import Report, differences
@@ -98,6 +101,23 @@ def test_the_numbers_are_those_of_the_commands() -> None:
     assert str(stiffness) == str(apc.critical(model, "coordination.stiffness")) in page()
     [region] = sections["region"].results
     assert str(region) == str(apc.region(model)) in page()
+
+
+def test_one_user_is_struck_as_by_the_command_and_in_the_browser() -> None:
+    """A common initial velocity excites the common mode alone, in which mesh and average are the same."""
+    section = next(one for one in paper().scenes[0].sections if one.key == "response")
+    [played] = section.results
+    start = {one.name: played.values[0, at] for at, one in enumerate(played.signals) if one.unit == "m/s"}
+    assert {name: value for name, value in start.items() if value} == {"user[1].device.v": 0.1}
+    words = shlex.split(section.command)
+    assert words[words.index("--strike") + 1] == "user[1]"
+    seen = motion_of(apc.compile(SCENE), struck=True)
+    places = [at for at, one in enumerate(played.signals) if one.local == "device.x"]
+    moved = 1e3 * played.values[:, places]
+    columns = [at for at, (_, body) in enumerate(seen.bodies) if body.states[0] == "device.x"]
+    off = seen.x[:, columns] - seen.x[0, columns]
+    rows = np.searchsorted(played.time, seen.time)
+    np.testing.assert_allclose(off, moved[rows], atol=1e-9)
 
 
 @pytest.mark.whole
