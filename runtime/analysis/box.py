@@ -28,7 +28,7 @@ from apc.eigen.ratios import NotRational, Ratio, Ratios, open_site
 from apc.frame.display_units import Unit
 from apc.frame.exchange import Exchange
 from apc.frame.instance import Prepared
-from apc.frame.names import Free, Range, find
+from apc.frame.names import Free, Range, find, overlap, times_of
 from apc.frame.overrides import Override, apply, check_bounds
 from apc.frame.parameters import exact_numbers, scope_of
 from apc.frame.site import LinearSite
@@ -108,7 +108,7 @@ def _parameter(system: CompiledSystem, free: Free) -> Parameter:
     delays = {text for link in system.links for text in (link.delay, *(pair.delay for pair in link.delays))}
     if name in delays:  # judged piece by piece
         return Parameter(name, "s", float(times[name]), minimum=0.0, exact=times[name])
-    if name in scope_of(system).needed([*times]) or name not in common:
+    if times_of(system, name) or name in scope_of(system).needed([*times]) or name not in common:
         what = f"{name} is a time, or sets one: what happens in a frame changes with it by jumps"
         rhythm = any(name in (clock.period, clock.phase) for clock in system.clocks)
         raise ApcError(Mistake("E831", _PLACE, what, hint="" if rhythm else f"apc critical {name}"))
@@ -215,7 +215,7 @@ def open_sites(
         E831 a parameter left open twice, E832 a scene that is no rational function of the parameters.
     """
     for place, interval in enumerate(ranges):
-        if any(other.free.meets(interval.free) for other in ranges[:place]):
+        if any(overlap(system, other.free, interval.free) for other in ranges[:place]):
             raise ApcError(Mistake("E831", _PLACE, f"{interval.free.label} has two ranges in one box"))
     if not all(site.parameters_suffice for site in prepared.jacobians):
         what = f"{system.name} is not linear: where it is linearized may move with the parameters"

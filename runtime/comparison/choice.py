@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.frame.names import Free, find, named_times, unit_of
+from apc.frame.names import Free, find, times_of, unit_of
 from apc.frame.parameters import scope_of
 from apc.network.nominal import channel_numbers
 from apc.vary.margins import STIFFNESSES
@@ -88,7 +88,7 @@ def choose(system: CompiledSystem, over: Sequence[str]) -> dict[str, Choice]:
 
 def _axis(system: CompiledSystem, free: Free) -> str:
     """Return what a parameter is. Raises ApcError E940 if it is nothing that is compared."""
-    if free.name in {timing.name for timing in named_times(system)}:
+    if times_of(system, free.name):
         return DELAY
     if free.name in channel_numbers(system):
         return LOSS

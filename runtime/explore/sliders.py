@@ -23,7 +23,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import with_unit
 from apc.frame.display_units import as_shown
 from apc.frame.linearize import start_names
-from apc.frame.names import Free, Range, named_times, parameter_of, unit_of
+from apc.frame.names import Free, Range, named_times, parameter_of, times_of, unit_of
 from apc.frame.overrides import Override, parse_override
 from apc.vary.evaluator import free_parameters
 from apc.vary.margins import STIFFNESSES, coupler_parameters
@@ -221,7 +221,8 @@ def _times(system: CompiledSystem, studied: dict[str, tuple[Fraction, Fraction]]
 
 
 def _about(system: CompiledSystem, name: str) -> str:
-    return next((parameter.about for parameter in system.parameters if parameter.name == name), "")
+    about = next((parameter.about for parameter in system.parameters if parameter.name == name), "")
+    return f"{about}, of all groups" if len(times_of(system, name)) > 1 else about
 
 
 def _periods(now: Fraction, others: Sequence[Fraction]) -> list[Fraction]:

@@ -33,7 +33,7 @@ from apc.frame.devices import Push
 from apc.frame.exchange import Exchange
 from apc.frame.instance import Peers, prepare
 from apc.frame.linearize import site_of_entries
-from apc.frame.names import Free, find, unit_of
+from apc.frame.names import Free, find, overlap, times_of, unit_of
 from apc.frame.parameters import free_values
 from apc.frame.radius import Arithmetic
 from apc.frame.site import LinearSite
@@ -96,12 +96,12 @@ def _frees(system: CompiledSystem, names: Sequence[str]) -> list[Free]:
     frees: list[Free] = []
     for name in names:
         free = find(system, name, Place(OPTION))
-        if free.name in {timing.name for timing in system.timings}:
+        if times_of(system, free.name):
             what = f"{free.label} is a time: another one is another order of events, and another state"
             hint = f'one value at a time: --set {free.label}="…"'
             raise ApcError(Mistake("E954", Place(OPTION), what, hint=hint))
         refuse_channel_number(system, free, Place(OPTION))
-        if any(free.meets(other) for other in frees):
+        if any(overlap(system, free, other) for other in frees):
             what = f"{free.label} is named twice"
             raise ApcError(Mistake("E954", Place(OPTION), what, hint=f"{OPTION} {free.label}"))
         frees.append(free)

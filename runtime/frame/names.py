@@ -1,8 +1,8 @@
 """What a person calls a parameter or a timing, and what stands behind the name.
 
 Takes: a `CompiledSystem` and a name such as `contact.stiffness`, `right.hand.force` or `links.lan.delay`.
-Gives: `Free`, `Range`, `proposed_range`, `find`, `is_named`, `named_times`, `parameter_of`, `value_now`,
-`unit_of`, `values_by_group`, `notes_for_all_groups`.
+Gives: `Free`, `Range`, `proposed_range`, `find`, `overlap`, `is_named`, `named_times`, `times_of`,
+`parameter_of`, `value_now`, `unit_of`, `values_by_group`, `notes_for_all_groups`.
 Guarantees: a name that means nothing raises, with the nearest real one.
 Does not: read or change values.
 """
@@ -10,7 +10,7 @@ Does not: read or change values.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -54,10 +54,6 @@ class Free:
     def label(self) -> str:
         """The name as a person writes it, its group before it."""
         return self.name if self.group is None else f"{self.group}.{self.name}"
-
-    def meets(self, other: Free) -> bool:
-        """Say whether both are one number of some group: without a group it is that of all."""
-        return self.name == other.name and (self.group == other.group or None in (self.group, other.group))
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,8 +122,7 @@ def find(system: CompiledSystem, name: str, place: Place = OVERRIDE, *, counts: 
     if name not in known and first in groups and rest in parameters:
         name, group = rest, first
     if group is not None and name in times:
-        what = f"{written} is no parameter of {system.name}: {name} is one time for all groups"
-        raise ApcError(Mistake("E622", place, what, hint=name))
+        raise _not_of_the_group(system, name, group, written, place)
     if name == PEERS or (name in sizes and not counts):
         hint = f"apc critical {sizes[0]}"
         what = f"{written} is a number of peers, which doesn't vary here"
@@ -152,6 +147,25 @@ def find(system: CompiledSystem, name: str, place: Place = OVERRIDE, *, counts: 
         near = nearest(name, sorted(known))
         raise ApcError(Mistake("E622", place, f"{written} is no parameter of {system.name}", hint=near))
     return Free(name, group)
+
+
+def _not_of_the_group(system: CompiledSystem, name: str, group: str, written: str, place: Place) -> ApcError:
+    """Return the refusal of a group's time that the group does not set in the topology."""
+    what = f"{written} is no parameter of {system.name}: {name} is one time for all groups"
+    hint = name
+    if len(system.groups) > 1:
+        what += " that set none of their own"
+        value, number = value_now(system, Free(name)), next(g.count for g in system.groups if g.name == group)
+        setting = f"{{count: {number}, set: {{{name}: {1000 * value:.12g} ms}}}}"
+        hint = f"{name}, or in the topology peers: {{{group}: {setting}}}"
+    return ApcError(Mistake("E622", place, what, hint=hint))
+
+
+def overlap(system: CompiledSystem, free: Free, other: Free) -> bool:
+    """Return whether two names set one number of some group: a name without a group is that of all."""
+    if free.name == other.name:
+        return free.group == other.group or None in (free.group, other.group)
+    return free.name in times_of(system, other.name) or other.name in times_of(system, free.name)
 
 
 def _of_one_peer(system: CompiledSystem, result: re.Match[str], place: Place) -> ApcError:
@@ -180,6 +194,17 @@ def is_named(name: str) -> bool:
 def named_times(system: CompiledSystem) -> list[Timing]:
     """Return the timings that stand in the scene under a name of their own."""
     return [timing for timing in system.timings if is_named(timing.name)]
+
+
+def times_of(system: CompiledSystem, name: str) -> tuple[str, ...]:
+    """Return the names of the timings that a name without a group sets.
+
+    The timing of that name comes first, then those that groups set for themselves: of `contact.delay` also
+    `left.contact.delay`. Empty where the name is of no timing.
+    """
+    timings = {timing.name for timing in system.timings}
+    names = (name, *(f"{group.name}.{name}" for group in system.groups))
+    return tuple(text for text in names if text in timings)
 
 
 def parameter_of(system: CompiledSystem, free: Free) -> Parameter:
@@ -217,10 +242,29 @@ def values_by_group(system: CompiledSystem, free: Free) -> tuple[tuple[str, floa
     )
 
 
+def _beside_a_time(system: CompiledSystem, free: Free) -> Iterator[str]:
+    """Yield which groups and pairs of groups a link's or clock's time does not reach."""
+    for link in system.links:
+        others = [pair.delay for pair in link.delays]
+        if free.name == link.delay and others:
+            yield f"{free.name} is the delay of all pairs of groups but those of {', '.join(others)}"
+    for clock in system.clocks:
+        if free.name not in (clock.period, clock.phase):
+            continue
+        ticking = [
+            group.name
+            for group in system.groups
+            if any(part.clock == clock.name for part in system.kinds[group.kind].clocks)
+        ]
+        if 0 < len(ticking) < len(system.groups):
+            yield f"{free.name} is of the clock {clock.name}, the clock of {', '.join(ticking)} only"
+
+
 def notes_for_all_groups(system: CompiledSystem, frees: Iterable[Free]) -> list[str]:
-    """Say what groups have now of each parameter that is set for all of them though they differ in it."""
+    """Return what a name without a group replaces, or leaves as it is, where the groups differ."""
     notes = []
     for free in frees:
+        notes += _beside_a_time(system, free)
         pairs = values_by_group(system, free)
         if free.group is not None or not pairs:
             continue

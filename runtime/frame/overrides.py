@@ -24,7 +24,7 @@ from apc.compiler.peer_counts import peers_of, recounted
 from apc.compiler.words import with_unit
 from apc.frame.display_units import Unit, as_shown
 from apc.frame.names import GIVEN, OVERRIDE, Free, find, unit_of
-from apc.frame.parameters import Scope, columns_of, scope_of
+from apc.frame.parameters import Scope, columns_of, scope_of, with_times_of_groups
 
 N = TypeVar("N", Parameter, Timing)
 
@@ -82,7 +82,9 @@ def apply(system: CompiledSystem, overrides: Sequence[Override]) -> CompiledSyst
     """
     if not overrides:
         return system
-    everywhere = {override.free.name: override.value for override in overrides if override.free.group is None}
+    everywhere = with_times_of_groups(
+        system, {override.free.name: override.value for override in overrides if override.free.group is None}
+    )
     counts = _counts(system, everywhere)
     if counts:
         everywhere |= peers_of(counts)
@@ -94,7 +96,8 @@ def apply(system: CompiledSystem, overrides: Sequence[Override]) -> CompiledSyst
         own = {
             override.free.name: override.value for override in overrides if override.free.group == group.name
         }
-        # Set for everybody means for this group as well: its own old value goes. A time of its own stays.
+        # Set for everybody means for this group as well: its own old value goes. One that follows its own
+        # timing stays, and has the timing's new value.
         shared = {name: value for name, value in everywhere.items() if f"{group.name}.{name}" not in timings}
         values = {value.name: value for value in group.values if value.name not in shared}
         values |= {name: parameters[name] for name in own if name not in values}

@@ -2,7 +2,7 @@
 
 Takes: a `CompiledSystem`, and new values by name, in any kind of number.
 Gives: `Scope`, `scope_of`, the one resolver of what follows from what; `Numbers`, `resolve`, `exact_numbers`;
-`columns_of`; `free_rows`, `free_values`.
+`columns_of`; `free_rows`, `free_values`; `with_times_of_groups`.
 Guarantees: what a value reaches by a formula is worked out with it, in the order settled when the scene was
 compiled; what none reaches keeps the very number it was compiled with. Peers with the same parameters share
 one row. Complex values are complex steps: the imaginary part is a derivative.
@@ -24,7 +24,7 @@ from apc.compiler.compiled import CompiledSystem, Formula, Group, Kind, Paramete
 from apc.compiler.errors import ApcError, Mistake
 from apc.compiler.language.evaluation import computed
 from apc.frame.exact import ROWS
-from apc.frame.names import OVERRIDE, Free
+from apc.frame.names import OVERRIDE, Free, times_of
 
 Floats = NDArray[np.float64]
 V = TypeVar("V")
@@ -96,6 +96,15 @@ def scope_of(
         if name in holder and name not in fixed and (formula := holder[name].formula) is not None
     }
     return Scope(holder, formulas)
+
+
+def with_times_of_groups(system: CompiledSystem, given: Mapping[str, V]) -> dict[str, V]:
+    """Return values for all groups, and with each the timings that groups set for themselves.
+
+    One value for all groups replaces a group's own. A timing of a group that is given itself keeps its value.
+    """
+    own = {time: value for name, value in given.items() for time in times_of(system, name) if time != name}
+    return own | dict(given)
 
 
 def _rows(name: str, formula: Formula, values: list[Any]) -> Any:
@@ -253,7 +262,9 @@ def free_values(
     wanted = system.kinds[group.kind].parameters
     columns = columns_of(system, group, wanted, peer)
     scope = scope_of(system, group.values, fixed={column.name for column in group.columns})
-    given = {free.name: value for free, value in values.items() if free.group is None}
+    given = with_times_of_groups(
+        system, {free.name: value for free, value in values.items() if free.group is None}
+    )
     given |= {free.name: value for free, value in values.items() if free.group == group.name}
 
     def now(name: str) -> float:

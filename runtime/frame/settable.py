@@ -23,7 +23,7 @@ from apc.compiler.compiled import (
     group_count,
 )
 from apc.frame.display_units import Unit
-from apc.frame.names import Free, is_named, named_times, parameter_of, values_by_group
+from apc.frame.names import Free, is_named, named_times, parameter_of, times_of, values_by_group
 from apc.frame.parameters import columns_of
 from apc.result import Result
 
@@ -128,7 +128,8 @@ def _number(parameter: Parameter, name: str, low: float, high: float) -> Settabl
 
 def _time(system: CompiledSystem, timing: Timing) -> Settable:
     """Return a period, which is above 0 s, a phase, which is below its period, or a delay."""
-    value, about = float(timing.value), ""
+    values = [item.value for item in system.timings if item.name in times_of(system, timing.name)]
+    about = ""
     for clock in system.clocks:
         if timing.name == clock.period:
             about = f"from one tick of {clock.name} to the next"
@@ -137,8 +138,9 @@ def _time(system: CompiledSystem, timing: Timing) -> Settable:
     if any(timing.name == link.delay for link in system.links):
         about = "from a packet's sending to where it can be heard"
     text = next((parameter.about for parameter in system.parameters if parameter.name == timing.name), about)
+    low, high = float(min(values)), float(max(values))
     is_period = timing.name in {clock.period for clock in system.clocks}
-    return Settable(timing.name, value, value, "s", 0.0, is_period, None, _text(timing), "", text)
+    return Settable(timing.name, low, high, "s", 0.0, is_period, None, _text(timing), "", text)
 
 
 def _text(item: Parameter | Timing) -> str:

@@ -14,7 +14,7 @@ from fractions import Fraction
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import with_unit
-from apc.frame.names import Range, proposed_range, unit_of
+from apc.frame.names import Range, overlap, proposed_range, unit_of
 from apc.sweeps.grid import parse_axis
 from apc.vary.periods import refuse_phase
 
@@ -80,7 +80,7 @@ def parse_axes(
             raise ApcError(Mistake("E903", Place(f"--{letter}"), what, expected, got))
         intervals.append(Range(axis.free, axis.unit, axis.values[0], axis.values[-1]))
     first, second = intervals
-    if first.free.meets(second.free):
+    if overlap(system, first.free, second.free):
         item, other = first.free.label, second.free.label
         what = f"{item} is on both axes; a region has two parameters"
         if item != other:

@@ -20,7 +20,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.ages import linear_sites
 from apc.frame.exchange import build_exchange
 from apc.frame.linearize import linearize
-from apc.frame.names import Range
+from apc.frame.names import Range, times_of
 from apc.frame.overrides import Override, apply, parse_override
 from apc.frame.parameters import resolve
 from apc.option_value import with_last_unit
@@ -166,7 +166,8 @@ def _refuse_set(axes: Sequence[Range], system: CompiledSystem, settings: Sequenc
     for text in settings:
         free = parse_override(system, text).free
         for axis in axes:
-            if axis.free.name == free.name and free.group in (None, axis.free.group):
+            all_of_it = free.group in (None, axis.free.group) and axis.free.name == free.name
+            if all_of_it or axis.free.name in times_of(system, free.name):
                 what = f"{axis.free.label} is on an axis and set for the panel as well"
                 raise ApcError(Mistake("E902", PLACE, what))
 

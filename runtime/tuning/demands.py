@@ -20,7 +20,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.frame.devices import FREE as FREE_HANDS
 from apc.frame.devices import with_hands
-from apc.frame.names import Free, Range, find, given_ranges, proposed_range
+from apc.frame.names import Free, Range, find, given_ranges, overlap, proposed_range
 from apc.frame.overrides import Override, apply
 from apc.network.nominal import unreliable
 from apc.option_value import option_value
@@ -195,7 +195,7 @@ def read_demands(
             raise ApcError(Mistake("E995", FREE, what, hint=f"--over {gain.free.label}=…"))
     borne = given_ranges(system, [_range(system, text, OVER) for text in over])
     for place, gain in enumerate((*gains, *borne)):
-        if any(other.free.meets(gain.free) for other in (*gains, *borne)[:place]):
+        if any(overlap(system, other.free, gain.free) for other in (*gains, *borne)[:place]):
             raise ApcError(Mistake("E831", PLACE, f"{gain.free.label} has two ranges"))
     delays = [interval for interval in borne if is_delay(system, interval.free)]
     if len(delays) > 1:

@@ -27,7 +27,7 @@ from apc.eigen.modes import split
 from apc.eigen.peers import PeerGroup, states_of
 from apc.frame.exchange import Exchange
 from apc.frame.instance import Prepared
-from apc.frame.names import Free, is_named, parameter_of
+from apc.frame.names import Free, is_named, parameter_of, times_of
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import free_rows, scope_of
 from apc.frame.radius import UNIT
@@ -331,6 +331,6 @@ def reaches_count(system: CompiledSystem, free: Free) -> bool:
 
 def reaches_time(system: CompiledSystem, free: Free) -> bool:
     """Say whether a period, phase or delay is, or depends on, this parameter."""
-    if any(timing.name == free.name for timing in system.timings):
+    if times_of(system, free.name):
         return True
     return free.name in scope_of(system).needed([timing.name for timing in system.timings])

@@ -30,7 +30,7 @@ from apc.eigen.peers import states_of
 from apc.eigen.spectrum import DRIFTS, finite
 from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, prepare
-from apc.frame.names import Free, named_times, parameter_of, unit_of, value_now
+from apc.frame.names import Free, named_times, parameter_of, times_of, unit_of, value_now
 from apc.network.nominal import channel_numbers
 from apc.result import Result
 from apc.threads import single_threaded
@@ -238,6 +238,8 @@ def _lines(
 
 def _delay_margin(system: CompiledSystem, free: Free, prepared: Prepared, largest: int) -> Margin | None:
     """Return the margin of a delay, in a scene whose largest loop has so many states."""
+    if len(times_of(system, free.name)) > 1:
+        return not_looked(system, free, "groups set their own")
     now = delay_now(system, free)
     end, count = delay_reach(system, free, now, pieces=PIECES, further=FURTHER)
     if count > MOST_PIECES:

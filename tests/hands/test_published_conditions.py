@@ -129,7 +129,7 @@ def test_a_faulty_overlay_gets_one_clear_message(text: str, message: str) -> Non
 def test_a_wall_behind_an_encoder_is_held_against_published_conditions(
     stiffness: float, coulomb: float, holds: bool
 ) -> None:
-    """Abbott and Okamura: K ≤ min(2 b/T, 2 c/D), b = 0.5 N·s/m, T = 1 ms, D = 0.05 mm: 1000 N/m, c/(25 µm)."""
+    """Abbott and Okamura: K ≤ min(2 b/T, 2 c/D), b = 0.5 N·s/m, T = 1 ms, D = 0.05 mm."""
     text = (
         "topology: wall\nclocks: {haptic: 1 ms}\npeers: {user: {count: 1}}\n"
         "masses: {device: {mass: 0.1 kg, damping: 0.4 N*s/m}}\ncouplers:\n"
