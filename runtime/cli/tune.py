@@ -8,6 +8,7 @@ Does not: compute.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -146,15 +147,23 @@ def tune_command(
 
 def _write(system: CompiledSystem, tuning: Tuning, settings: Sequence[str], path: Path) -> None:
     """Write the topology with the gains, and with what else was set."""
-    from apc.compiler.files import write_text
+    from apc.compiler.pipeline import compile_again
     from apc.compiler.words import with_unit
-    from apc.explore.written import with_values
-    from apc.frame.names import find
+    from apc.explore.written import write_topology
+    from apc.frame.names import HELD, find
     from apc.frame.overrides import parse_override
 
-    values = {parse_override(system, setting).free: setting.partition("=")[2].strip() for setting in settings}
+    as_written = compile_again(replace(system.origin, changes=()), path.parent)
+    # The numbers of the hand of --hands held are of no topology.
+    names = {setting.partition("=")[0].strip() for setting in settings} - set(HELD)
+    names |= {parameter.name for parameter in as_written.parameters}
+    values = {
+        parse_override(as_written, setting).free: setting.partition("=")[2].strip()
+        for setting in settings
+        if setting.partition("=")[0].strip() in names
+    }
     for gain in tuning.gains:
         number = f"{float(gain.value):.12g}"
-        values[find(system, gain.parameter)] = with_unit(number, gain.unit).removesuffix(" 1")
+        values[find(as_written, gain.parameter)] = with_unit(number, gain.unit).removesuffix(" 1")
     (text,) = (text for name, text in system.origin.texts if name == system.origin.topology)
-    write_text(path, with_values(text.decode(), system, values).removesuffix("\n"))
+    write_topology(path, text.decode(), as_written, values)
