@@ -276,8 +276,8 @@ def region(
     Where one axis is a delay, the rectangle is cut where events coincide (see `strips`). Along a period it is
     cut halfway between the periods that are analysed (see `periods`), unless all times scale with it. Where
     both axes are times each point is analysed by itself, and the boundary is a line from cell edge to cell
-    edge, its error the size of a cell. A scene that is linearized at its start, and starts elsewhere along an axis, is
-    analysed point by point where other motions are free. With passive hands there are no steps: its
+    edge, its error the size of a cell. A scene that is linearized at its start, and starts elsewhere along an
+    axis, is analysed point by point where other motions are free. With passive hands there are no steps: its
     points are on the boundary, straight lines between, and its error is an estimate by their middles.
     """
     free = tuple(axis.free for axis in axes)

@@ -60,7 +60,7 @@ def _simulate(model: Any) -> tuple[str, Numbers]:
 
 
 # An analysis has bounds of its own: it is asked so many errors from a critical value, and so much of the
-# value besides. An error above the widest, relatively, is an error of the search where nearer analyses decide.
+# value besides. A larger relative error than the widest is a fault of the search if nearer analyses decide.
 ASIDE, MORE, WIDEST = 3.0, 1e-9, 1e-6
 
 
