@@ -30,6 +30,7 @@ from apc.compiler.components.component import (
     Variable,
 )
 from apc.compiler.errors import ApcError, Mistakes, Place
+from apc.compiler.language.constants import check_constants
 from apc.compiler.language.dimensions import DIMENSIONLESS
 from apc.compiler.language.expression import Equation
 from apc.compiler.language.grammar import parse_equation, parse_expression
@@ -80,7 +81,7 @@ def read_equations(root: Body, mistakes: Mistakes) -> tuple[tuple[Equation, ...]
             text = text_of(item, "an equation", "- a + b = c")
             defined = _DEFINES.findall(text)
             undefined.update(defined)
-            equations.append(parse_equation(text, text_place(item)))
+            equations.append(_equation(text, text_place(item)))
             undefined.difference_update(defined)
     return tuple(equations), undefined
 
@@ -108,8 +109,16 @@ def read_linearized(root: Body, mistakes: Mistakes) -> Linearized | None:
     for item in items:
         with mistakes:
             text = text_of(item, "an equation", "linearized: a = b")
-            equations.append(parse_equation(text, text_place(item)))
+            equations.append(_equation(text, text_place(item)))
     return Linearized(tuple(equations), valid)
+
+
+def _equation(text: str, place: Place) -> Equation:
+    """Return an equation whose constants are bounded."""
+    equation = parse_equation(text, place)
+    for side in (equation.left, equation.right):
+        check_constants(side, text, place)
+    return equation
 
 
 def _items(node: Node, what: str) -> tuple[Node, ...]:
@@ -125,7 +134,9 @@ def read_sends(root: Body, mistakes: Mistakes) -> tuple[Send, ...]:
         with mistakes:
             name = name_of(key, "what is sent")
             text, place = text_of(value, name, f"{name}: sample(object.x)"), text_place(value)
-            sends.append(Send(name, parse_expression(text, place), text, place, DIMENSIONLESS))
+            expression = parse_expression(text, place)
+            check_constants(expression, text, place)
+            sends.append(Send(name, expression, text, place, DIMENSIONLESS))
     return tuple(sends)
 
 

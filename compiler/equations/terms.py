@@ -41,6 +41,7 @@ LinearForm: TypeAlias = tuple[
 
 ZERO, ONE, HALF = sympy.S.Zero, sympy.S.One, sympy.S.Half
 LARGEST = int(sys.float_info.max)
+FLOAT_DIGITS = 17  # decimal digits that tell a float from all others
 
 
 class NoDerivativeError(Exception):
@@ -75,8 +76,11 @@ class Abs(Choice):
 
     @classmethod
     def eval(cls, value: Term) -> Term | None:
-        """Return the value of a number."""
-        return sympy.Abs(value) if value.is_number else None
+        """Return the value of a number; None of one that holds a choice, which stays as it is written."""
+        number = rounded(value)
+        if number.is_Rational:
+            return -value if number < 0 else value
+        return value if value.is_number and value.is_extended_real is not True else None
 
     def _eval_power(self, exponent: Term) -> Term | None:
         return self.args[0] ** exponent if exponent.is_even else None
@@ -112,6 +116,21 @@ class Interpolate(Choice):
         raise NoDerivativeError(f"{text_of(self)}, which has none")
 
 
+def rounded(value: Term) -> Term:
+    """Return a number as a rational: the nearest float, unless it is rational or no real number.
+
+    SymPy's own floor and sign of e^700 compute hundreds of digits, or give up.
+    """
+    if not value.is_number or value.is_Rational or value.is_extended_real is False or value is sympy.nan:
+        return value
+    number = value.evalf(FLOAT_DIGITS)
+    return sympy.Rational(float(number)) if number.is_Float else value
+
+
+def _of_rounded(function: Any) -> Callable[[Term], Term]:
+    return lambda value: function(rounded(value))
+
+
 FUNCTIONS: dict[str, Any] = {
     "+": operator.add,
     "-": operator.sub,
@@ -125,10 +144,17 @@ FUNCTIONS: dict[str, Any] = {
     "interpolate": Interpolate,
     "abs": Abs,
     "sqrt": sympy.sqrt,
-    **{name: getattr(sympy, name) for name in ("sign", "floor", "atan2", *SMOOTH)},
+    "sign": _of_rounded(sympy.sign),
+    "floor": _of_rounded(sympy.floor),
+    **{name: getattr(sympy, name) for name in ("atan2", *SMOOTH)},
     **{name: type(name, (Condition,), {}) for name in CONDITIONS},
 }
-NAMES = {sympy.Abs: "abs", **{function: name for name, function in FUNCTIONS.items()}}
+NAMES = {
+    sympy.Abs: "abs",
+    sympy.sign: "sign",
+    sympy.floor: "floor",
+    **{function: name for name, function in FUNCTIONS.items()},
+}
 
 
 @functools.cache

@@ -116,6 +116,22 @@ def evaluate(expr: Expr, lookup: Lookup, place: Place) -> Value:
     return value
 
 
+def constant_value(expr: Expr) -> Value | None:
+    """Return the value of an expression without names, None if it holds what changes with time or with peers.
+
+    Raises
+    ------
+    FaultError
+        It has no finite real value.
+    """
+    if any(isinstance(node, Call) and node.function not in {*_OPERATIONS, "if"} for node in walk(expr)):
+        return None
+    if any(True for _ in names(expr)):
+        return None
+    value: Value = _exactly(expr, lambda _: 0, EXACT.__getitem__)
+    return value
+
+
 def exact_value(name: str, formula: Formula, values: Sequence[Fraction]) -> Fraction:
     """Return what a number comes to; beyond rational operations, the float it was rounded to.
 

@@ -252,6 +252,47 @@ def _bomb(rng: random.Random) -> Files:
     return {TOPOLOGY: _encoded(scene.replace(old, made, 1) if replaces else scene + made)}
 
 
+CONSTANT = """\
+component: Constant
+connectors: {{a: Flange, b: Flange}}
+parameters: {{stiffness: {{unit: N/m, min: 0, default: 1}}, q: {{unit: 1, default: 2}}}}
+variables: {{f: {{unit: N}}}}
+equations: ["f = stiffness*(a.x - b.x)*({constant})", a.f = f, b.f = -f]
+"""
+OF_CONSTANTS = """\
+topology: constants
+library: ./parts
+peers: {user: {count: 1}}
+masses: {device: {mass: 0.1 kg, damping: 5 N*s/m}}
+couplers: {own: {type: Constant, a: device, b: ground}}
+"""
+
+
+def _number(rng: random.Random, depth: int) -> str:
+    """Return an expression of numbers, rarely with a parameter, that may be huge, tiny, or no number."""
+    if depth == 0 or rng.random() < 0.1:
+        numbers = ("0", "1", "2", "3", "10", "25", "0.1", "1e9", "1e-9", "1e300", "1e-300", "pi", "700", "q")
+        return rng.choice(numbers)
+    one, other = _number(rng, depth - 1), _number(rng, depth - 1)
+    form = rng.choice(
+        (
+            *(f"{word}({one})" for word in ("exp", "exp", "log", "sin", "tan", "cosh", "sqrt", "atan")),
+            *(f"{word}({one})" for word in ("floor", "abs", "sign", "floor", "abs", "sign")),
+            *(f"({one})^{power}" for power in ("100", "-100", "(1/3)", "2", "99")),
+            *(f"({one}){sign}({other})" for sign in "+-*/"),
+            *(f"{word}({one}, {other})" for word in ("max", "min", "atan2")),
+            f"if {one} < {other} then {one} else {other}",
+        )
+    )
+    return f"({form})" if form.startswith("if") else form
+
+
+def _constant(rng: random.Random) -> Files:
+    """Return a component one of whose equations holds a constant."""
+    text = CONSTANT.format(constant=_number(rng, rng.randrange(1, 7)))
+    return {TOPOLOGY: OF_CONSTANTS.encode(), "parts/constant.yaml": text.encode()}
+
+
 SORTS: tuple[tuple[str, Callable[[random.Random], Files], int], ...] = (
     ("bytes", _bytes, 26),
     ("structure", _structure, 26),
@@ -259,6 +300,7 @@ SORTS: tuple[tuple[str, Callable[[random.Random], Files], int], ...] = (
     ("component", _component, 20),
     ("table", _table, 8),
     ("bomb", _bomb, 2),
+    ("constant", _constant, 4),
     (PLAYED, odd_equations, 3),
     ("vectors", odd_vectors, 6),
 )

@@ -1,0 +1,85 @@
+"""Constants in equations, bounded before anything computes them exactly.
+
+Takes: the sides of equations. Gives: `check_constants`.
+Guarantees: an equation that passes holds no constant whose exact value takes more than MOST_BITS bits, and
+none that leaves the range of floats.
+Does not: refuse constants without a real value, such as 1/0 (see `equations.terms`).
+"""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+from apc.compiler.errors import ApcError, Mistake, Place, place_in
+from apc.compiler.language.evaluation import FaultError, constant_value
+from apc.compiler.language.expression import Call, Expr, Name, Number, children, format_expression
+from apc.compiler.source.reading import brief
+
+# Of the integer coefficients that powers and products can make: a power of a power of a power reaches 2^10^6.
+MOST_BITS = 1 << 15
+LEAST = 2.0**-1022  # the least normal float
+RANGE = "constants between 2.2e-308 and 1.8e308"
+POWERS = ("^", "*", "/", "exp", "sinh", "cosh")
+
+
+def check_constants(expression: Expr, text: str, place: Place) -> None:
+    """Refuse constants that are too large, too small or too long.
+
+    Parameters
+    ----------
+    expression
+        One side of an equation.
+    text, place
+        The equation as written, and its location.
+
+    Raises
+    ------
+    ApcError
+        E331 such a constant.
+    """
+
+    def refuse(node: Expr, why: str) -> None:
+        what = f"{brief(format_expression(node))} {why}"
+        raise ApcError(Mistake("E331", place_in(place, text, node.start), what, RANGE))
+
+    def bits(node: Expr) -> float:
+        """Return a bound on the bits of the coefficients of a subexpression."""
+        if isinstance(node, Number):
+            return float(node.value.numerator.bit_length() + node.value.denominator.bit_length())
+        if isinstance(node, Name):
+            return 0.0
+        inner = [bits(part) for part in children(node)]
+        total = sum(inner)
+        if node.function == "^" and isinstance(exponent := node.arguments[1], Number):
+            total = inner[0] * abs(float(exponent.value)) + inner[1]
+        if total > MOST_BITS:
+            refuse(node, f"makes a coefficient of more than {MOST_BITS} bits")
+        return total
+
+    def is_constant(node: Expr) -> bool:
+        """Return whether a subexpression is constant, its range checked from the inside out."""
+        if not isinstance(node, Call):
+            return isinstance(node, Number)
+        constant = [is_constant(part) for part in children(node)]  # each is checked
+        if not all(constant):
+            return False
+        try:
+            value = constant_value(node)
+        except FaultError as error:
+            if isinstance(error.cause, OverflowError):
+                refuse(node, "is too large for a float")
+            return False  # no real value: nothing computes it
+        if value is None:
+            return False
+        if node.function in POWERS and _is_tiny(value):
+            refuse(node, "is too small for a float")
+        return True
+
+    bits(expression)
+    is_constant(expression)
+
+
+def _is_tiny(value: Fraction | float) -> bool:
+    """Return whether a value is less than the least float, or a product or exponential rounded to zero."""
+    return abs(value) < LEAST and (value != 0 or isinstance(value, float)) and math.isfinite(value)
