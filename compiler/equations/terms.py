@@ -149,6 +149,7 @@ FUNCTIONS: dict[str, Any] = {
     **{name: getattr(sympy, name) for name in ("atan2", *SMOOTH)},
     **{name: type(name, (Condition,), {}) for name in CONDITIONS},
 }
+_IRRATIONAL = {"sqrt", "atan2", *SMOOTH}
 NAMES = {
     sympy.Abs: "abs",
     sympy.sign: "sign",
@@ -190,6 +191,8 @@ def to_term(expression: Expr, differentiate: Callable[[Term], Term] | None = Non
         if name == "der":
             assert differentiate is not None, operands
             return differentiate(*operands)
+        if name in _IRRATIONAL and not all(operand.is_Rational for operand in operands):
+            operands = tuple(map(rounded, operands))  # of constants inside one another
         return FUNCTIONS[name](*operands)
 
     return fold(expression, leaf, term)

@@ -26,6 +26,7 @@ Given: TypeAlias = Fraction | NDArray[np.float64] | Term
 Residue: TypeAlias = Any  # an integer, or one a peer: an array of Python's integers, which outgrow 64 bits
 PRIME = (1 << 61) - 1
 MOST = 200  # nodes beyond which no identity is looked for: simplifying takes its time
+MOST_BITS = 256  # of a number in such an expression
 NEARLY = 1e-20  # how nearly an identity must vanish at a point, of 30 digits
 
 
@@ -77,7 +78,7 @@ class _Residues:
         """Return whether an expression is zero, where numbers differ from peer to peer for one of them."""
         if np.any(np.equal(self(expression), 0)):
             return True
-        if not expression.has(sympy.Function):
+        if not expression.has(sympy.Function) or _is_long(expression):
             return False
         numbers = {
             s: sympy.Rational(number) for s, number in self.given.items() if isinstance(number, Fraction)
@@ -107,6 +108,13 @@ class _Residues:
         if node.is_Pow and node.exp.is_Integer:  # `some` stands for what zero has none of, an inverse
             return _POWER(self(node.base), int(node.exp), some)
         return 0 if self.nonzero is not None and node.is_Symbol and node not in self.nonzero else some
+
+
+def _is_long(expression: Term) -> bool:
+    """Return whether an expression holds a number of more than `MOST_BITS` bits, which SymPy would factor."""
+    return any(
+        max(abs(number.p), number.q).bit_length() > MOST_BITS for number in expression.atoms(sympy.Rational)
+    )
 
 
 def _modular(value: Fraction | float | Term) -> int:
