@@ -9,6 +9,7 @@ Does not: expand anything; find every identity, or look for one in expressions o
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Collection, Mapping, Sequence
 from fractions import Fraction
@@ -19,7 +20,8 @@ import numpy as np
 import sympy
 from numpy.typing import NDArray
 
-from apc.compiler.equations.terms import Abs, Choice, Symbol, Term, in_order, size
+from apc.compiler.equations.terms import NAMES, Abs, Choice, Symbol, Term, in_order, size
+from apc.compiler.plain import ROUNDED
 
 # A number of the scene: one for all peers, one a peer (count,), or an expression over other numbers.
 Given: TypeAlias = Fraction | NDArray[np.float64] | Term
@@ -27,7 +29,7 @@ Residue: TypeAlias = Any  # an integer, or one a peer: an array of Python's inte
 PRIME = (1 << 61) - 1
 MOST = 200  # nodes beyond which no identity is looked for: simplifying takes its time
 MOST_BITS = 256  # of a number in such an expression
-NEARLY = 1e-20  # how nearly an identity must vanish at a point, of 30 digits
+NEARLY = 1e-20  # how nearly an identity must vanish at a point, relative to its largest term, of 30 digits
 
 
 class Divisors:
@@ -131,13 +133,40 @@ _MODULAR: Any = np.frompyfunc(_modular, 1, 1)
 _POWER: Any = np.frompyfunc(_power, 3, 1)
 
 
+def _float_at(node: Term, point: Mapping[Symbol, float]) -> float:
+    """Return the value of an expression at a point in floats; raises what Python's arithmetic raises."""
+    if node.is_Symbol:
+        return point[node]
+    if node.is_Rational:
+        return float(node)
+    values = [_float_at(part, point) for part in node.args]
+    if node.is_Add:
+        return math.fsum(values)
+    if node.is_Mul:
+        return prod(values)
+    if node.is_Pow:
+        return float(values[0] ** values[1])
+    return ROUNDED[NAMES[node.func]](*values)
+
+
 def _is_identity(expression: Term) -> bool:
     """Say whether an expression is zero for all values of its symbols, by what functions have in common."""
     expression = expression.replace(Abs, sympy.Abs)
+    if expression.is_Mul:
+        return any(map(_is_identity, expression.args))
+    if expression.is_Pow:
+        return bool(expression.exp.is_positive) and _is_identity(expression.base)
     if size(expression) > MOST or expression.has(Choice):
         return bool(expression == 0)
     chance = random.Random(0)
     point = {s: sympy.Rational(chance.randrange(1, 999), 499) for s in in_order(expression.free_symbols)}
-    if not abs(complex(expression.xreplace(point).evalf(30, maxn=60))) < NEARLY:
+    try:
+        _float_at(expression, {s: float(number) for s, number in point.items()})
+    except (ArithmeticError, ValueError, KeyError, TypeError):  # no digits are computed of what is no float
+        return False
+    terms = [
+        abs(complex(term.xreplace(point).evalf(30, maxn=60))) for term in sympy.Add.make_args(expression)
+    ]
+    if not abs(complex(expression.xreplace(point).evalf(30, maxn=60))) < NEARLY * max(terms):
         return False
     return any(sympy.simplify(item) == 0 for item in (expression, expression.rewrite(sympy.exp)))
