@@ -16,7 +16,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import with_unit
 from apc.frame.names import Range, overlap, proposed_range, unit_of
 from apc.sweeps.grid import parse_axis
-from apc.vary.periods import refuse_phase
+from apc.vary.timing_values import refuse_phase
 
 PLACE = Place("region")
 

@@ -62,7 +62,7 @@ from apc.vary.growth import (
     refuse_time,
 )
 from apc.vary.leading import Part
-from apc.vary.periods import is_scaled, reaches_period
+from apc.vary.timing_values import is_scaled, reaches_period
 
 if TYPE_CHECKING:
     import pandas

@@ -35,11 +35,12 @@ from apc.regions.survey import HALVINGS
 from apc.vary.batch import batch_evaluator
 from apc.vary.counts import count_pieces
 from apc.vary.crossing import ESTIMATE, search
-from apc.vary.delays import Piece, delay_pieces, pace, system_with_delay
+from apc.vary.delays import Piece, delay_pieces, pace
 from apc.vary.evaluator import closed_at, evaluator_of_many, generic, reaches_count
 from apc.vary.growth import NOMINAL, RadiusEvaluator
 from apc.vary.line import MatrixLine
-from apc.vary.periods import period_pieces, reaches_period
+from apc.vary.periods import period_pieces
+from apc.vary.timing_values import reaches_period, system_with_delay
 
 Floats = NDArray[np.float64]
 

@@ -33,7 +33,7 @@ from apc.result import Look, Result
 from apc.threads import single_threaded
 from apc.vary.counts import count_range
 from apc.vary.crossing import CELL, Crossing, Line, Progress, Search, Verdict, search
-from apc.vary.delays import delay_now, pace
+from apc.vary.delays import pace
 from apc.vary.evaluator import (
     evaluator_of_many,
     many_packets,
@@ -54,7 +54,8 @@ from apc.vary.growth import (
     refuse_time,
 )
 from apc.vary.line import SPAN, CountLine, DelayLine, MatrixLine, delay_reach, judged
-from apc.vary.periods import PeriodLine, reaches_period, refuse_phase
+from apc.vary.periods import PeriodLine
+from apc.vary.timing_values import delay_now, reaches_period, refuse_phase
 
 _PLACE = Place("critical value")
 

@@ -20,7 +20,8 @@ from apc.frame.instance import prepare
 from apc.frame.names import Free, Range
 from apc.moments.changing_delay import loop_gain, unstable_delays
 from apc.unserved import UnservedError
-from apc.vary.delays import delay_pieces, system_with_delay
+from apc.vary.delays import delay_pieces
+from apc.vary.timing_values import system_with_delay
 
 PLACE = Place("box")
 

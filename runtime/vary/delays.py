@@ -1,9 +1,7 @@
 """A system's frame matrices as a delay varies: piece by piece, as far as the order of events stays the same.
 
 Takes: a `CompiledSystem` and a parameter or timing that reaches its delays.
-Gives: `Piece`, `delay_pieces`, `pace`, `borders`, `timing_slopes`; `reaches_parameters`,
-`system_with_delay`,
-`delay_now`.
+Gives: `Piece`, `delay_pieces`, `pace`, `borders`; `reaches_parameters`.
 Guarantees: pieces join on without a gap; events coincide at the values between them and nowhere else.
 Does not: vary periods or phases: another period is another frame.
 
@@ -31,11 +29,11 @@ from apc.compiler.words import no_more, time_left
 from apc.eigen.peers import states_of
 from apc.frame.instance import Prepared, prepared_at
 from apc.frame.names import Free
-from apc.frame.overrides import Override, apply
 from apc.frame.parameters import resolve
 from apc.frame.schedule import Act, Propagate, Schedule
 from apc.vary.batch import BatchEvaluator, batch_evaluator
 from apc.vary.evaluator import Asked
+from apc.vary.timing_values import STEP, delay_now, system_with_delay, timing_slopes
 
 # Pieces of one search: each is some schedules and matrices, a hundredth of a second and more.
 MOST_PIECES = 1_000
@@ -43,9 +41,6 @@ MOST_PIECES = 1_000
 # Where in a piece its schedule is looked at: anywhere inside will do, but no two of its steps should be equal
 # there by accident. No time of a scene is a multiple of one part in this prime number.
 INSIDE = Fraction(28_571, 104_729)
-
-# How far apart two values of a parameter are at which timings tell how fast they follow it.
-STEP = Fraction(1, 1009)
 
 
 # Delays of which it is kept where events coincide: a search asks again and again; pieces of each that are,
@@ -65,19 +60,6 @@ class Piece:
     high: Fraction
     evaluator: BatchEvaluator | None
     inside: CompiledSystem
-
-
-def system_with_delay(system: CompiledSystem, free: Free, value: Fraction) -> CompiledSystem:
-    """Return the system with another value of what reaches its delays."""
-    return apply(system, [Override(free, value)])
-
-
-def delay_now(system: CompiledSystem, free: Free) -> Fraction:
-    """Return the present value of a timing, or of a parameter that reaches one, exactly."""
-    for timing in system.timings:
-        if timing.name == free.name:
-            return timing.value
-    return next(parameter.number for parameter in system.parameters if parameter.name == free.name)
 
 
 def delay_pieces(
@@ -237,14 +219,6 @@ def borders(system: CompiledSystem, free: Free, *, place: Place) -> Callable[[Fr
         return min(nearest, default=value + (now or 1))
 
     return following
-
-
-@lru_cache(maxsize=KEPT)
-def timing_slopes(system: CompiledSystem, free: Free) -> Mapping[str, Fraction]:
-    """Return how fast each timing follows a parameter or timing, by its name."""
-    now = delay_now(system, free)
-    here, there = (resolve(system_with_delay(system, free, value)).timings for value in (now, now + STEP))
-    return {name: (there[name] - here[name]) / STEP for name in here}
 
 
 def reaches_parameters(system: CompiledSystem, free: Free) -> bool:

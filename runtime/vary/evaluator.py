@@ -32,6 +32,7 @@ from apc.frame.overrides import Override, apply
 from apc.frame.parameters import free_rows, scope_of
 from apc.frame.radius import UNIT
 from apc.vary.batch import BatchEvaluator, batch_evaluator
+from apc.vary.timing_values import nearest_period
 from apc.vary.wiring import reduced, wire
 
 Floats = NDArray[np.float64]
@@ -318,8 +319,6 @@ def _exact(system: CompiledSystem, free: Free, number: float) -> Fraction:
     if reaches_count(system, free):
         return Fraction(round(number))
     if reaches_time(system, free):
-        from apc.vary.periods import nearest_period  # which needs the evaluator of delays
-
         return nearest_period(system, free, Fraction(number))
     return Fraction(number)
 

@@ -30,14 +30,8 @@ from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.vary.batch import BatchEvaluator
 from apc.vary.crossing import ESTIMATE, UNSURE, Crossing, OneStretch, Stretch, Verdict
-from apc.vary.delays import (
-    INSIDE,
-    Piece,
-    borders,
-    delay_now,
-    delay_pieces,
-    system_with_delay,
-)
+from apc.vary.delays import INSIDE, Piece, borders, delay_pieces
+from apc.vary.timing_values import delay_now, system_with_delay
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]

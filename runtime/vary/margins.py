@@ -35,7 +35,6 @@ from apc.network.nominal import channel_numbers
 from apc.result import Result
 from apc.threads import single_threaded
 from apc.vary.crossing import ESTIMATE, Search, search
-from apc.vary.delays import delay_now
 from apc.vary.evaluator import evaluator, free_parameters, many_packets, parameters_suffice
 from apc.vary.growth import (
     BOUNDED,
@@ -48,6 +47,7 @@ from apc.vary.growth import (
 )
 from apc.vary.line import DelayLine, MatrixLine, delay_reach
 from apc.vary.sensitivity import not_varied, of_channels
+from apc.vary.timing_values import delay_now
 
 Floats = NDArray[np.float64]
 

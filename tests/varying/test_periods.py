@@ -11,7 +11,7 @@ import apc
 from apc.analysis.analysis import analyze
 from apc.compiler.compiled import CompiledSystem
 from apc.frame.names import Free
-from apc.vary.delays import system_with_delay
+from apc.vary.timing_values import system_with_delay
 from tests.topologies import AVERAGE, compiled
 from tests.varying.closed_forms import built
 

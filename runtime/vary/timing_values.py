@@ -1,0 +1,176 @@
+"""The values of a time, and the clock periods that make short frames with the other clocks.
+
+Takes: a `CompiledSystem` and a timing, or a parameter that a timing depends on.
+Gives: `system_with_delay`, `delay_now`, `timing_slopes`; `reaches_period`, `refuse_phase`, `is_scaled`;
+`nearest_period`, `periods_near`, `period_between`, `common_period`; `MOST_FRAME_TICKS`.
+Guarantees: exact rationals of a second.
+Does not: analyze.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
+from functools import lru_cache
+
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.multiples import common_divisor, common_multiple
+from apc.compiler.words import with_unit
+from apc.frame.names import Free
+from apc.frame.overrides import Override, apply
+from apc.frame.parameters import resolve, scope_of
+
+# Ticks of all clocks in the longest frame that is analyzed: some tenths of a second each.
+MOST_FRAME_TICKS = 400
+# How far apart two values of a parameter are at which timings tell how fast they follow it.
+STEP = Fraction(1, 1009)
+# Digits to which a period is met, the most that serve; periods that are kept for the next question.
+DIGITS, KEPT = 9, 256
+
+
+def system_with_delay(system: CompiledSystem, free: Free, value: Fraction) -> CompiledSystem:
+    """Return the system with another value of what reaches its delays."""
+    return apply(system, [Override(free, value)])
+
+
+def delay_now(system: CompiledSystem, free: Free) -> Fraction:
+    """Return the present value of a timing, or of a parameter that reaches one, exactly."""
+    for timing in system.timings:
+        if timing.name == free.name:
+            return timing.value
+    return next(parameter.number for parameter in system.parameters if parameter.name == free.name)
+
+
+@lru_cache(maxsize=KEPT)
+def timing_slopes(system: CompiledSystem, free: Free) -> Mapping[str, Fraction]:
+    """Return how fast each timing follows a parameter or timing, by its name."""
+    now = delay_now(system, free)
+    here, there = (resolve(system_with_delay(system, free, value)).timings for value in (now, now + STEP))
+    return {name: (there[name] - here[name]) / STEP for name in here}
+
+
+def _clock_times(system: CompiledSystem, *, phases: bool) -> set[str]:
+    return {clock.phase if phases else clock.period for clock in system.clocks}
+
+
+def reaches_period(system: CompiledSystem, free: Free) -> bool:
+    """Say whether the period of some clock is, or depends on, this parameter."""
+    return _reaches(system, free, _clock_times(system, phases=False))
+
+
+def _reaches(system: CompiledSystem, free: Free, times: set[str]) -> bool:
+    return free.name in times or free.name in scope_of(system).needed(sorted(times))
+
+
+def refuse_phase(system: CompiledSystem, free: Free, place: Place, *, code: str = "E844") -> None:
+    """Raise ApcError E844, or another code, for what the phase of a clock depends on, and no period."""
+    if _reaches(system, free, _clock_times(system, phases=True)) and not reaches_period(system, free):
+        what = f"{free.name} sets the phase of a clock: it can't be varied continuously"
+        raise ApcError(Mistake(code, place, what, hint="apc analyze with --set, one value at a time"))
+
+
+def is_scaled(system: CompiledSystem, free: Free, *, delays: bool = False) -> bool:
+    """Say whether all periods and phases are proportional to a number, with `delays` all other times, too."""
+    now, timings = delay_now(system, free), resolve(system).timings
+    names = _clock_times(system, phases=False) | _clock_times(system, phases=True)
+    doubled = resolve(system_with_delay(system, free, 2 * now)).timings
+    slopes = timing_slopes(system, free)
+    return all(
+        timings[name] == slopes[name] * now and doubled[name] == 2 * timings[name]
+        for name in (timings if delays else names)
+    )
+
+
+def _ticks(system: CompiledSystem, free: Free, value: Fraction) -> float:
+    """Return how many ticks all clocks have in a frame at a value, infinite where there is no frame."""
+    try:
+        timings = resolve(system_with_delay(system, free, value)).timings
+    except ApcError:  # beyond what the number may be
+        return math.inf
+    used = {partition.clock for kind in system.kinds for partition in kind.clocks}
+    used |= {link.clock for link in system.links}
+    periods = [timings[clock.period] for clock in system.clocks if clock.name in used]
+    if not all(period > 0 for period in periods):
+        return math.inf
+    frame = common_multiple(periods)
+    return float(sum(frame / period for period in periods))
+
+
+def _simplest(low: Fraction, high: Fraction) -> Fraction:
+    """Return the fraction of the least denominator strictly between two, 0 ≤ low < high."""
+    whole = math.floor(low)
+    if whole + 1 < high:
+        return Fraction(whole + 1)
+    if low == whole:
+        return whole + Fraction(1, math.floor(1 / (high - whole)) + 1)
+    return whole + 1 / _simplest(1 / (high - whole), 1 / (low - whole))
+
+
+def common_period(system: CompiledSystem, free: Free) -> Fraction:
+    """Return the common divisor of the periods that stay, in seconds: periods are fractions of it."""
+    slopes, timings = timing_slopes(system, free), resolve(system).timings
+    fixed = [timings[name] for name in _clock_times(system, phases=False) if not slopes[name]]
+    return common_divisor(fixed) if fixed else delay_now(system, free)
+
+
+def period_between(
+    system: CompiledSystem, free: Free, unit: Fraction, low: Fraction, high: Fraction
+) -> Fraction | None:
+    """Return the simplest value strictly between two whose frame is short enough, None if there is none."""
+    value = unit * _simplest(low / unit, high / unit)
+    return value if _ticks(system, free, value) <= MOST_FRAME_TICKS else None
+
+
+@lru_cache(maxsize=KEPT)
+def nearest_period(system: CompiledSystem, free: Free, value: Fraction) -> Fraction:
+    """Return a period near a value, by powers of ten, whose frame is short; any other time as it is."""
+    if value <= 0 or not reaches_period(system, free) or is_scaled(system, free):
+        return value
+    if _ticks(system, free, value) <= MOST_FRAME_TICKS:
+        return value
+    unit = common_period(system, free)
+    for digits in range(DIGITS, 0, -1):
+        off = value / 10**digits
+        near = period_between(system, free, unit, value - off, value + off)
+        if near is not None:
+            return near
+    return value
+
+
+def periods_near(
+    system: CompiledSystem, free: Free, targets: Sequence[Fraction], place: Place
+) -> list[Fraction]:
+    """Return the simplest periods near some values, those of too long a frame left out.
+
+    Parameters
+    ----------
+    system, free
+        The compiled topology and the number that varies.
+    targets
+        Values in rising order, in seconds; the first and last are taken as they are where they can be.
+    place
+        Where the number was given, for messages.
+
+    Raises
+    ------
+    ApcError
+        E844 fewer than two have a frame of at most `MOST_FRAME_TICKS` ticks.
+    """
+    unit = common_period(system, free)
+    found = {value for value in (targets[0], targets[-1]) if _ticks(system, free, value) <= MOST_FRAME_TICKS}
+    for before, value, after in zip(targets, targets[1:], targets[2:], strict=False):
+        low, high = value - (value - before) / 3, value + (after - value) / 3
+        near = period_between(system, free, unit, low, high)
+        if near is not None:
+            found.add(near)
+    if len(found) < 2:
+        span = " to ".join(with_unit(f"{float(end):g}", "s") for end in (targets[0], targets[-1]))
+        what = (
+            f"periods of {free.label} from {span} make frames of more than {MOST_FRAME_TICKS:,} ticks "
+            "with the other clocks"
+        )
+        hint = f"a range about a multiple of {with_unit(f'{float(unit):g}', 's')}"
+        raise ApcError(Mistake("E844", place, what, hint=hint))
+    return sorted(found)
