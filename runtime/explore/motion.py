@@ -92,7 +92,7 @@ def motion_of(system: CompiledSystem, *, struck: bool) -> Motion:
     x, y = (np.stack([track[:, place] for track in tracks], axis=1) for place in (0, 1))
     angle = np.stack([heading(track[:, 2:]) for track in tracks], axis=1)
     fixed = [(row, surface) for row, view in enumerate(views) for surface in view.surfaces]
-    remarks.append(f"It {played.summary.verdict}.")
+    remarks.append(f"Motion: {played.summary.verdict}.")
     return Motion(
         time=time[texts],
         bodies=shown,

@@ -166,8 +166,12 @@ def _in_time(scheme: Scheme, feet: dict[str, int]) -> tuple[str, str]:
     if scheme.played is None:
         return _marked(NONE, _why(scheme, "played"), feet), NONE
     summary = scheme.played.summary
-    at = {"settles": summary.settled, "diverges": summary.stopped_at}.get(summary.verdict)
-    return f"{summary.verdict}{'' if at is None else f' at {at:.3g} s'}", f"{summary.end:g} s"
+    text = summary.verdict
+    if summary.settled is not None:
+        text += f", settling time {summary.settled:.3g} s"
+    elif summary.stopped_at is not None:
+        text += f" at {summary.stopped_at:.3g} s"
+    return text, f"{summary.end:g} s"
 
 
 def _varied(scheme: Scheme, key: str, feet: dict[str, int]) -> tuple[str, str]:

@@ -11,6 +11,7 @@ matplotlib is loaded when something is drawn and not before.
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.language.vectors import entry, whole_and_index
-from apc.compiler.words import counted, in_hertz, wrapped
+from apc.compiler.words import counted, in_hertz, measured, wrapped
 from apc.optional import need
 from apc.present.forms import (
     Lines,
@@ -35,10 +36,20 @@ from apc.present.forms import (
 )
 from apc.present.pictures import colours_of, new_figure
 from apc.simulation.settings import EXACT
+from apc.simulation.verdicts import (
+    AT_REST,
+    DECAYS,
+    DIVERGES,
+    DRIFTS,
+    DRIVEN,
+    NOT_DETERMINED,
+    OSCILLATES,
+)
 
 if TYPE_CHECKING:
     from apc.simulation.accuracy import ErrorEstimate
     from apc.simulation.buzz import Buzz
+    from apc.simulation.decay import Fit, Oscillation
     from apc.simulation.ensemble import Ensemble, MeanSquare
     from apc.simulation.signals import Signal
     from apc.simulation.trajectory import Played, Provenance, Trajectory
@@ -46,7 +57,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 LABELS = {
-    "settled": "settled at [s]",
+    "settled": "settling time [s]",
     "largest_force": "largest force [N]",
     "copies_apart": "copies apart [m]",
 }
@@ -67,16 +78,17 @@ MOST_LIMITS = 4  # that are told as text; the document has all
 MOST_CURVES = 24  # in a panel: more can't be told apart
 WIDTH, HEIGHT = 9.0, 2.4  # inches: of the figure, of a panel
 PATHS = 2.0  # times as high is a plane
-RECORDED_REST = "No recorded position moves."
 _WORDS = {
-    "rests": "Nothing moves: no force and no start value sets it in motion.",
-    "settles": "From {settled} on every {position} stays within 5 % of its range.",
-    "not judged": "No position was recorded: whether the motion settles is not told.",
-    "dies away": "At the end it still swings, less and less: {swing}.",
-    "shakes": "At the end it swings without dying away: {swing}.",
-    "moves on": "At the end some {position} still moves on.",
-    "diverges": "{stopped} leaves the range of numbers after {stopped_at}.",
+    AT_REST: "No {position} changes.",
+    DECAYS: "The motion decays.",
+    OSCILLATES: "At the end an oscillation neither decays nor grows.",
+    DIVERGES: "The motion grows.",
+    DRIFTS: "At the end a {position} moves on at a constant velocity or acceleration.",
+    DRIVEN: "A force or another equation changes with time until the end.",
 }
+OVERFLOW = "{stopped} leaves the range of numbers after {stopped_at}."
+LEAST_ERROR = 5e-7  # of a value: more digits than six are in the document
+BAND_TEXT = "last sample outside ±5 % of the range around the last value, all positions"
 
 
 def buzz_text(buzz: Buzz) -> Lines:
@@ -106,22 +118,16 @@ def played_text(played: Played) -> Lines:
     """Yield what `apc simulate` prints: the summary, the method if it is not exact, the error if known."""
     summary = played.summary
     units = {extent.name: extent.unit for extent in summary.extents}
-    swing = ""
-    if summary.swing:
-        name, size, rate = summary.swing
-        swing = f"{name} by {_quantity(size, units[name])}, {rate:.3g} times a second"
     yield f"{played.topology}: {summary.verdict}\n"
-    rests_in_part = summary.verdict == "rests" and summary.unrecorded
-    words = RECORDED_REST if rests_in_part else _WORDS[summary.verdict]
-    yield from sentences(
-        words.format(
+    words = f"Not determined from {summary.end:g} s: {summary.reason}."
+    if summary.verdict != NOT_DETERMINED:
+        words = OVERFLOW if summary.stopped else _WORDS[summary.verdict]
+        words = words.format(
             position="recorded position" if summary.unrecorded else "position",
-            settled=_quantity(summary.settled or 0.0, "s"),
-            swing=swing,
             stopped=summary.stopped,
             stopped_at=_quantity(summary.stopped_at or 0.0, "s"),
         )
-    )
+    yield from sentences(words)
     yield ""
     for title, text in _facts(played, units):
         yield from labelled((title, text), width=15)
@@ -156,6 +162,8 @@ def error_text(estimate: ErrorEstimate) -> str:
 def played_document(played: Played) -> Plain:
     """Return what `apc simulate --json` prints."""
     summary = played.summary
+    fit = summary.fit
+    crests = fit.oscillation if fit is not None and summary.oscillating else None
 
     def keyed(values: Sequence[Any] | None, *keys: str) -> Plain | None:
         return None if values is None else dict(zip(keys, values, strict=True))
@@ -163,10 +171,14 @@ def played_document(played: Played) -> Plain:
     return {
         "topology": played.topology,
         "verdict": summary.verdict,
-        "settled_s": summary.settled,
+        "reason": summary.reason or None,
+        "settling_time_s": summary.settled,
+        "settling_time_error_s": summary.settled_error,
+        "decay": None if fit is None else _decay_document(fit),
+        "oscillation": None if crests is None else _oscillation_document(crests, summary.oscillating),
+        "driven_until_s": summary.driven_until,
         "diverged": {"signal": summary.stopped, "time_s": summary.stopped_at} if summary.stopped else None,
         "interrupted": played.interrupted,
-        "swing": keyed(summary.swing, "signal", "size", "frequency_hz"),
         "overshoot": keyed(summary.overshoot, "signal", "part"),
         "limits_broken": document(summary.broken),
         "largest_force": keyed(summary.largest_force, "signal", "N", "time_s"),
@@ -175,10 +187,30 @@ def played_document(played: Played) -> Plain:
         "rows": summary.rows,
         "end_s": summary.end,
         "signals": [
-            record(extent, {"settled": ..., "settled_s": extent.settled}) for extent in summary.extents
+            record(extent, {"settled": ..., "settling_time_s": extent.settled}) for extent in summary.extents
         ],
         "error_estimate": None if played.error is None else _error_document(played.error),
         "provenance": provenance_document(played.provenance),
+    }
+
+
+def _decay_document(fit: Fit) -> Plain:
+    """Return the rate of the slowest exponential as plain data, None where it is not known."""
+    known = math.isfinite(fit.error)
+    return {
+        "rate_per_s": fit.rate if known else None,
+        "rate_error_per_s": fit.error if known else None,
+        "time_constant_s": -1 / fit.rate if fit.decays else None,
+        "window_s": fit.span,
+    }
+
+
+def _oscillation_document(crests: Oscillation, name: str) -> Plain:
+    return {
+        "signal": name,
+        "peak_to_peak": crests.size,
+        "frequency_hz": crests.frequency,
+        "frequency_error_hz": crests.error,
     }
 
 
@@ -400,7 +432,7 @@ def ensemble_text(ensemble: Ensemble) -> Lines:
     yield from table(rows, "<>>>>>>")
     settled = ensemble.statistics("settled")
     if settled is not None and settled.count < n:
-        yield f"  settled at: of the {settled.count} runs that settle"
+        yield f"  settling time: of the {settled.count} runs that reach it"
     if ensemble.mean_square is not None:
         yield from notes(_beside(ensemble, ensemble.mean_square))
     if ensemble.interrupted:
@@ -412,7 +444,7 @@ def _beside(ensemble: Ensemble, mean_square: MeanSquare) -> str:
     n, calm = len(ensemble.runs), ensemble.calm
     if mean_square.why:
         return f"in mean square: not judged: {mean_square.why}"
-    text = f"{mean_square.verdict}, and {calm} of {counted(n, 'run')} settle or die away: "
+    text = f"{mean_square.verdict}, and {calm} of {counted(n, 'run')} decay or are at rest: "
     if mean_square.linearized:
         return (
             f"{text}that verdict is of small motions about the start, the runs are of contacts as they come"
@@ -454,10 +486,36 @@ def ensemble_document(ensemble: Ensemble) -> Plain:
     return record(ensemble, instead)
 
 
+def _fitted(fit: Fit, name: str, units: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    """Yield the time constant and the frequency of the last part of a motion, each with its error."""
+    if fit.decays or fit.grows:
+        constant, off = 1 / abs(fit.rate), fit.error / (abs(fit.rate) * (abs(fit.rate) - fit.error))
+        yield "decay" if fit.decays else "growth", f"time constant {_uncertain(constant, off, 's')}"
+    elif fit.lasts:
+        yield "decay rate", _uncertain(-fit.rate, fit.error, "1/s")
+    if fit.oscillation is not None and math.isfinite(fit.error):
+        frequency = _uncertain(fit.oscillation.frequency, fit.oscillation.error, "Hz")
+        size = _quantity(fit.oscillation.size, units[name])
+        yield "frequency", f"{frequency}, {name}, peak to peak {size} at the end"
+
+
+def _uncertain(value: float, error: float, unit: str) -> str:
+    """Return a number with its error, of six digits at most."""
+    return measured(value, max(error, LEAST_ERROR * abs(value)), unit)
+
+
 def _facts(played: Played, units: Mapping[str, str]) -> Iterator[tuple[str, str]]:
     """Yield what a run amounts to, each fact with its label; `units` are those of its signals by name."""
     summary = played.summary
-    if summary.largest_force and (summary.largest_force[1] or summary.verdict != "rests"):
+    moves = summary.verdict != AT_REST
+    if summary.settled is not None:
+        about = f" (at most {_quantity(summary.settled_error, 's')} less)" if summary.settled_error else ""
+        yield "settling time", f"{_quantity(summary.settled, 's')}{about}: {BAND_TEXT}"
+    elif summary.verdict in (DECAYS, OSCILLATES):
+        yield "settling time", f"not reached in {summary.end:g} s: {BAND_TEXT}"
+    if summary.fit is not None and summary.verdict in (DECAYS, OSCILLATES, DIVERGES, NOT_DETERMINED):
+        yield from _fitted(summary.fit, summary.oscillating, units)
+    if summary.largest_force and (summary.largest_force[1] or moves):
         name, size, at = summary.largest_force
         yield "largest force", f"{_quantity(size, 'N')}, {name} at {_quantity(at, 's')}"
     for broken in summary.broken[:MOST_LIMITS]:
@@ -469,7 +527,7 @@ def _facts(played: Played, units: Mapping[str, str]) -> Iterator[tuple[str, str]
     if summary.overshoot:
         yield "overshoot", f"{100 * summary.overshoot[1]:.3g} %, {summary.overshoot[0]}"
     for name, distance in summary.copies:
-        if distance or summary.verdict != "rests":
+        if distance or moves:
             unit = next(unit for signal, unit in units.items() if signal.endswith(f".{name}"))
             yield "copies", f"{name} differs by {_quantity(distance, unit)} between peers at the end"
     if any(value for _, value in summary.work):

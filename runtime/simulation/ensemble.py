@@ -39,18 +39,20 @@ from apc.processes import (
     this_process,
 )
 from apc.result import Result
+from apc.simulation.driven import driven_until
 from apc.simulation.rows_in_time import blocks
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
 from apc.simulation.summary import BAND, Watch
+from apc.simulation.verdicts import AT_REST, DECAYS, DIVERGES, OSCILLATES
 from apc.threads import single_threaded
 
 Floats = NDArray[np.float64]
 
 QUANTILES = (0.05, 0.5, 0.95)
 SURE = 1.959963984540054  # standard deviations of a normal within which 95 % lie
-# Verdicts of runs that come to rest, and of those that don't.
-CALM, SHAKEN = ("rests", "settles", "dies away"), ("shakes", "diverges")
+# Verdicts of runs that decay, and of those that don't.
+CALM, SUSTAINED = (AT_REST, DECAYS), (OSCILLATES, DIVERGES)
 PART = 100  # runs handed to a process at a time: enough to pay for the way, few enough to share out evenly
 RUN = 300  # bytes of a run that is over
 
@@ -129,7 +131,7 @@ class Ensemble(Result):
             return None
         if mean_square.stable:
             return self.calm == len(self.runs)
-        return any(run.verdict in SHAKEN for run in self.runs)
+        return any(run.verdict in SUSTAINED for run in self.runs)
 
     @property
     def verdicts(self) -> tuple[tuple[str, int], ...]:
@@ -253,8 +255,9 @@ def _runs(simulation: Simulation, numbers: range) -> list[Run]:
     """Play some runs."""
     player, runs = simulation.player(), []
     lengths = {signal.local for signal in simulation.signals if signal.unit == LENGTH}
+    until = driven_until(simulation)
     for number in numbers:
-        watch = Watch(simulation)
+        watch = Watch(simulation, until)
         for block in blocks(simulation, run=number, player=player):
             watch.take(block.time, block.values)
         summary = watch.summary(block)

@@ -89,10 +89,12 @@ class Simulation:
     `lucks` are what chance does on the unreliable links, `seed` is what it begins from: that of the settings,
     or of the experiment. `library` is the machine code, None if there is none. `length` frames are played at
     a time.
+    `topology` is the system as it was given, without stamps on its packets (see `ages.stamped`).
     `tolerances` are of the states that CVODES moves, `sent` the names of those that peers send as they are.
     """
 
     system: CompiledSystem
+    topology: CompiledSystem
     settings: Settings
     population: Population
     signals: tuple[Signal, ...]
@@ -161,6 +163,7 @@ def prepare(
         delay is a range, E913 a step that does not fit; and those of `build_schedules`, `build_population`
         and `routes_of`.
     """
+    topology = system
     refuse_unheard_of(system)
     refuse_range(system)
     with finite_equations(system.origin.topology):
@@ -174,6 +177,7 @@ def prepare(
     timings, quantum = plan.numbers.timings, schedule.quantum
     return Simulation(
         system=system,
+        topology=topology,
         settings=settings,
         population=population,
         signals=listed,

@@ -1,47 +1,80 @@
-"""What a simulated motion amounts to, in numbers and a word: whether it settles, and how far it goes.
+"""What a simulated motion amounts to, in numbers and a word: verdict, settling time, frequency, extremes.
 
-Takes: the rows of a simulation, as they come. Gives: `Watch`, `Summary`, `Extent`, `Broken`.
+Takes: the rows of a simulation, as they come. Gives: `Watch`, `Summary`, `Extent`, `Broken`; `agreed`.
 Guarantees: the memory used does not grow with the duration.
-Does not: prove anything: what it says holds for the time that was simulated (see `analysis` for proof).
+Does not: prove anything: a verdict holds for the duration that was simulated (see `analysis` for proof).
 
-Settled means: from some time on, well before the end, every position stays within `BAND` of its range around
-its last value; the range is the largest that any peer's position of that name goes through. A motion that
-does not settle *shakes* if it turns to and fro without dying away, *dies away* if it turns and gets smaller,
-*diverges* if a number leaves the range of floats, and *moves on* otherwise. It *rests* if no position ever
-changes. Without a position that was recorded it is *not judged*. An angle is a position, too.
+The verdict is one of these. The rates are those of `decay.fit_motion`, of the last half of the motion that is
+visible.
+
+    at rest         no position changes
+    decays          the slowest exponential decays, its error included, or every position has settled
+    oscillates      an oscillation neither decays nor grows, to within the error of its rate
+    diverges        an exponential grows, its error included, or a number leaves the range of floats
+    drifts          a position moves on at a constant velocity or acceleration
+    driven          a force or another equation changes with time until the end
+    not determined  no position was recorded, or the duration is too short to decide
+
+The settling time of a position is the time of its last sample outside `BAND` of its range (highest less
+lowest value) around its last value; that of a motion is the largest of its positions. It is None if it is in
+the last tenth of the duration. A position whose range is rounding beside those of its unit has none. An angle
+is a position, too.
+
+Without forces that change with time the verdict of a linear topology is consistent with that of `analyze`:
+where the two contradict each other (a mode that the motion does not excite, a duration too short) it is "not
+determined" (see `agreed`).
 
 The work a coupler does is ∫ −f v dt over the forces it holds, f the flow into the coupler at each of its
 flanges and v that flange's velocity: exact, as f is constant between events. Positive work feeds the motion.
 
-A limit is of a device's force and reach, and of whatever else declares one; it is looked at in every row of
+A limit is of a device's force and reach, and of whatever else declares one; it is evaluated in every row of
 what is recorded. To keep a motion within it is for equations (`limits: on` of a device).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.analysis.analysis import analyze
 from apc.compiler.compiled import ANGLES, LENGTH, CompiledSystem, Group
+from apc.compiler.errors import ApcError
+from apc.eigen.spectrum import DRIFTS as RADIUS_DRIFTS
+from apc.eigen.spectrum import STABLE as RADIUS_STABLE
+from apc.frame.jacobians import jacobians
+from apc.network.nominal import unreliable
+from apc.simulation.decay import Fit, fit_motion
+from apc.simulation.driven import driven_until
 from apc.simulation.rows_in_time import Block
 from apc.simulation.signals import Signal
 from apc.simulation.simulation import Simulation
+from apc.simulation.verdicts import (
+    AT_REST,
+    DECAYS,
+    DIVERGES,
+    DRIFTS,
+    DRIVEN,
+    NOT_DETERMINED,
+    OSCILLATES,
+)
 
 Floats = NDArray[np.float64]
 
 BAND = 0.05  # of the range: the 5 % of control engineering's settling time
-LATE = 0.9  # of the duration: what settles after that has not been seen to
-TAIL = 0.2  # of the duration: the end, where a motion that goes on is judged
-LEAST_WAY = 0.2  # of the range: a shorter way from first to last has no overshoot to speak of
-POSITIONS = (LENGTH, *ANGLES)  # the units of what decides whether a motion settles
-NOT_JUDGED = "not judged"
-FEWEST_TURNS = 4  # within the tail: two periods
-SMALLER = 0.9  # a swing of less than this part of that in the time before is dying away
-BUCKETS = 512  # times that extremes are kept for
+LATE = 0.9  # of the duration: a settling time after that may be of the duration, not of the motion
+LEAST_STEP = 0.2  # of the range: a smaller difference from first to last value is no step to overshoot
+POSITIONS = (LENGTH, *ANGLES)  # the units that decide the verdict
+ROUNDING = 1e-9  # of the largest range of its unit: a position that moves by less has no settling time
 MOST_EXTREMES = 2**22  # numbers kept for each of three tables: 32 MiB
+FEWEST_GROUPS = 16  # of rows whose extremes are kept together, whatever their number
+MOST_FITTED = 1024  # positions whose last rows are kept for a fit
+SHORT = "the duration is too short, or the motion too irregular, for a decay rate"
+CONTRADICTION = "the motion within this duration does not show the verdict of the linear topology"
+MOST_LINEAR = 60  # peers of a linear topology that is analysed beside a motion
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +95,7 @@ class Broken:
 
 @dataclass(frozen=True, slots=True)
 class Extent:
-    """Where a signal began, ended and went, in SI; `settled` seconds after which it stays, None if never."""
+    """First, last, lowest and highest value of a signal in SI; `settled` is its settling time or None."""
 
     name: str
     unit: str
@@ -77,18 +110,23 @@ class Extent:
 class Summary:
     """A simulation in numbers, SI.
 
-    `verdict` is "rests", "settles", "dies away", "shakes", "moves on", "diverges" or "not judged"; `settled`
-    is the time from which on it stays, in seconds. `overshoot` is a part of the way from first to last.
-    `copies` are (name, distance at the end) of what is sent to the others as it is. `work` is (part, J).
-    `broken` are the limits that recorded signals went beyond, the first one first. `unrecorded` positions of
-    the scene were not looked at.
+    `verdict` is one of those above; `reason` says why it is not determined. `settled` is the settling time in
+    s, at most `settled_error` too large. `fit` is that of the last part of the motion, `oscillating` the name
+    of the position of its oscillation. `driven_until` is the last time in s at which an equation changed with
+    time alone. `overshoot` is a part of the step from first to last. `copies` are (name, distance at the end)
+    of what is sent to the others as it is. `work` is (part, J). `broken` are the limits that recorded signals
+    went beyond, the first one first. `unrecorded` positions of the scene were not evaluated.
     """
 
     verdict: str
+    reason: str
     settled: float | None
+    settled_error: float
+    fit: Fit | None
+    oscillating: str
+    driven_until: float
     stopped: str
     stopped_at: float | None
-    swing: tuple[str, float, float] | None
     overshoot: tuple[str, float] | None
     largest_force: tuple[str, float, float] | None
     copies: tuple[tuple[str, float], ...]
@@ -102,47 +140,54 @@ class Summary:
 
 
 class Watch:
-    """Looks at a simulation's rows as they pass and keeps extremes, bucket by bucket of rows."""
+    """Evaluates a simulation's rows as they pass and keeps extremes, group by group of rows."""
 
-    def __init__(self, simulation: Simulation) -> None:
-        """Begin before the first row of what is played."""
+    def __init__(self, simulation: Simulation, until: float | None = None) -> None:
+        """Begin before the first row of what is played.
+
+        Parameters
+        ----------
+        simulation
+            What is played.
+        until
+            Its `driven_until`, if that is known already.
+        """
         self.simulation, self.signals = simulation, simulation.signals
+        self.until = driven_until(simulation) if until is None else until
         n = len(self.signals)
         self.positions = [i for i, signal in enumerate(self.signals) if is_position(signal)]
         self.forces = [
             i for i, signal in enumerate(self.signals) if signal.unit == "N" and signal.role != "limited"
         ]
         self.limits = _limits(simulation.system, self.signals)
-        self.width = -(-simulation.rows // max(16, min(BUCKETS, MOST_EXTREMES // max(n, 1))))
-        buckets = -(-simulation.rows // self.width)
-        self.low, self.high = np.full((buckets, n), np.inf), np.full((buckets, n), -np.inf)
-        self.turns = np.zeros((buckets, len(self.positions)), np.int64)
-        self.ends = np.zeros(buckets)
-        self.before = np.empty((0, len(self.positions)))  # the last two rows
+        self.width = -(-simulation.rows // max(FEWEST_GROUPS, MOST_EXTREMES // max(n, 1)))
+        groups = -(-simulation.rows // self.width)
+        self.low, self.high = np.full((groups, n), np.inf), np.full((groups, n), -np.inf)
+        self.ends = np.zeros(groups)
+        self.fitted = self.positions[:: -(-len(self.positions) // MOST_FITTED) or 1]
+        kept = min(simulation.rows, MOST_EXTREMES // max(len(self.fitted), 1))
+        self.samples, self.instants = np.zeros((kept, len(self.fitted))), np.zeros(kept)
         self.first, self.last = np.zeros(n), np.zeros(n)
         self.peak, self.peak_at = np.full(n, -1.0), np.zeros(n)
         self.beyond = np.full(len(self.limits), np.nan)
         self.rows = 0
 
     def take(self, time: Floats, values: Floats) -> None:
-        """Look at some rows: `time` (rows,), `values` (rows, signals)."""
+        """Evaluate some rows: `time` (rows,), `values` (rows, signals)."""
         if not len(time):
             return
         if not self.rows:
             self.first = values[0].copy()
         self.last = values[-1].copy()
-        bucket = (self.rows + np.arange(len(time))) // self.width
+        group = (self.rows + np.arange(len(time))) // self.width
+        place = (self.rows + np.arange(len(time)))[-len(self.samples) :] % len(self.samples)
+        self.samples[place] = values[-len(self.samples) :, self.fitted]
+        self.instants[place] = time[-len(self.samples) :]
         self.rows += len(time)
-        touched, starts = np.unique(bucket, return_index=True)
+        touched, starts = np.unique(group, return_index=True)
         self.low[touched] = np.minimum(self.low[touched], np.minimum.reduceat(values, starts))
         self.high[touched] = np.maximum(self.high[touched], np.maximum.reduceat(values, starts))
-        self.ends[bucket] = time
-        moving = np.concatenate([self.before, values[:, self.positions]])
-        way = np.sign(np.diff(moving, axis=0))
-        turned = np.zeros((len(time), len(self.positions)), np.int64)
-        turned[len(time) - max(len(way) - 1, 0) :] = way[1:] * way[:-1] < 0
-        self.turns[touched] += np.add.reduceat(turned, starts)
-        self.before = moving[-2:]
+        self.ends[group] = time
         watched = np.array([*self.forces, *(column for column, _, _ in self.limits)], np.int64)
         size = np.abs(values[:, watched])
         largest = size.max(axis=0)
@@ -154,14 +199,14 @@ class Watch:
         self.beyond[began] = time[over.argmax(axis=0)[began]]
 
     def summary(self, block: Block) -> Summary:
-        """Return what has been seen; `block` is the last."""
+        """Return what the rows amount to; `block` is the last."""
         assert self.rows, "a simulation has a row at time 0"
         number = (self.rows - 1) // self.width + 1
         low, high, ends = self.low[:number], self.high[:number], self.ends[:number]
         with np.errstate(over="ignore", invalid="ignore"):  # of what has diverged
             settled = self._settled(low, high, ends)
-            swing = self._swing(low, high, ends, settled)
-        signals, unsettled = self.signals, np.isnan(settled)
+            fit = self._fit(high.max(axis=0) - low.min(axis=0), float(ends[-1]))
+        signals = self.signals
         numbers = np.stack([self.first, self.last, low.min(axis=0), high.max(axis=0)], axis=1).tolist()
         extents = tuple(
             Extent(signal.name, signal.unit, first, last, least, most, None if np.isnan(since) else since)
@@ -170,29 +215,27 @@ class Watch:
             )
         )
         moved = [extents[i] for i in self.positions]
-        if block.stopped:
-            verdict, swing = "diverges", None
-        elif not self.positions:
-            verdict = NOT_JUDGED
-        elif all(extent.low == extent.high for extent in moved):
-            verdict = "rests"
-        elif not unsettled[self.positions].any():
-            verdict = "settles"
-        else:
-            verdict = "moves on" if swing is None else "dies away" if swing[3] else "shakes"
-        settles = verdict == "settles"
+        all_settled = bool(moved) and not np.isnan(settled[self.positions]).any()
+        verdict, reason = self._verdict(block, moved, fit, float(ends[-1]), settled=all_settled)
+        all_settled &= verdict not in (AT_REST, DIVERGES, DRIVEN)
         largest = max(self.forces, key=lambda i: float(self.peak[i]), default=-1)
         work = tuple(zip(self.simulation.population.parts, block.work.tolist(), strict=True))
         force = None
         if largest >= 0:
             force = signals[largest].name, float(self.peak[largest]), float(self.peak_at[largest])
+        row = float(ends[-1] - ends[-2]) / self.width if number > 2 and self.width > 1 else 0.0
+        oscillating = signals[self.fitted[fit.oscillation.place]].name if fit and fit.oscillation else ""
         return Summary(
             verdict=verdict,
-            settled=float(settled[self.positions].max()) if settles else None,
+            reason=reason,
+            settled=float(settled[self.positions].max()) if all_settled else None,
+            settled_error=row * (self.width - 1),
+            fit=fit,
+            oscillating=oscillating,
+            driven_until=self.until,
             stopped=block.stopped,
             stopped_at=block.stopped_at if block.stopped else None,
-            swing=swing[:3] if swing else None,
-            overshoot=_overshoot(moved) if settles else None,
+            overshoot=_overshoot(moved) if all_settled else None,
             largest_force=force,
             copies=self._copies(),
             # Of a motion without bound the work is as meaningless as it is large.
@@ -205,54 +248,59 @@ class Watch:
             unrecorded=_positions(self.simulation.system) - len(self.positions),
         )
 
+    def _verdict(
+        self, block: Block, moved: Sequence[Extent], fit: Fit | None, end: float, *, settled: bool
+    ) -> tuple[str, str]:
+        """Return the verdict, and why it is not determined."""
+        if block.stopped:
+            return DIVERGES, ""
+        if not moved:
+            return NOT_DETERMINED, "no position was recorded"
+        if self.until > LATE * end:
+            return DRIVEN, ""
+        if all(extent.low == extent.high for extent in moved):
+            return AT_REST, ""
+        if fit is None:
+            return (DECAYS, "") if settled else (NOT_DETERMINED, SHORT)
+        if fit.grows and not fit.ended:
+            return DIVERGES, ""
+        if fit.lasts and not fit.ended:
+            return OSCILLATES, ""
+        if fit.ramp and not fit.ended:
+            return DRIFTS, ""
+        if fit.decays or fit.ended or settled:
+            return DECAYS, ""
+        return NOT_DETERMINED, SHORT
+
     def _settled(self, low: Floats, high: Floats, ends: Floats) -> Floats:
-        """Return when each signal is within its band for good; NaN if that is not well before the end."""
+        """Return the settling time of each signal; NaN if that is too near to the end."""
         span = high.max(axis=0) - low.min(axis=0)
-        names = np.array([signal.local for signal in self.signals])
-        for name in dict.fromkeys(names.tolist()):  # the largest range among the peers
-            span[names == name] = span[names == name].max()
-        outside = (high - self.last > BAND * span) | (self.last - low > BAND * span)
+        units = np.array([signal.unit for signal in self.signals])
+        least = np.zeros(len(span))
+        for unit in dict.fromkeys(units.tolist()):
+            least[units == unit] = ROUNDING * span[units == unit].max()
+        band = np.where(span > least, BAND * span, np.inf)
+        outside = (high - self.last > band) | (self.last - low > band)
         after = np.where(outside.any(axis=0), len(outside) - outside[::-1].argmax(axis=0), 0)
         since = np.append(0.0, ends)[after]
         return np.where(since <= LATE * ends[-1], since, np.nan)
 
-    def _swing(
-        self, low: Floats, high: Floats, ends: Floats, settled: Floats
-    ) -> tuple[str, float, float, bool] | None:
-        """Return the position that turns, does not settle and swings most at the end; None if none does.
-
-        That is, its name, the way to and fro, how often a second, and whether it is dying away.
-        """
-        number = len(ends)
-        tail = max(1, round(TAIL * number))
-        if number < 2 * tail:
+    def _fit(self, span: Floats, end: float) -> Fit | None:
+        """Return the fit of the rows kept after the last change with time, None where there is none."""
+        kept = np.arange(max(self.rows - len(self.samples), 0), self.rows) % len(self.samples)
+        kept = kept[self.instants[kept] >= self.until]
+        if len(kept) < 2 or not self.fitted:
             return None
-        now, then = slice(number - tail, number), slice(number - 2 * tail, number - tail)
-        turns = self.turns[:number][now].sum(axis=0)
-        places = [
-            i
-            for i, many in zip(self.positions, turns, strict=True)
-            if np.isnan(settled[i]) and many >= FEWEST_TURNS
-        ]
-        if not places:
-            return None
-        swing = high[now].max(axis=0) - low[now].min(axis=0)
-        ranges = np.maximum(high.max(axis=0) - low.min(axis=0), np.finfo(float).tiny)
-        units = [
-            signal.unit for signal in self.signals
-        ]  # a length and an angle are each compared with their like
-        span = {
-            unit: max(ranges[i] for i in self.positions if units[i] == unit)
-            for unit in {*map(units.__getitem__, places)}
-        }
-        place = max(places, key=lambda i: float(swing[i] / span[units[i]]))
-        seconds = ends[-1] - (ends[number - tail - 1] if number > tail else 0.0)
-        rate = float(turns[self.positions.index(place)] / 2 / seconds) if seconds > 0 else 0.0
-        earlier = high[then, place].max() - low[then, place].min()
-        return self.signals[place].name, float(swing[place]), rate, bool(swing[place] < SMALLER * earlier)
+        # Lengths are compared with lengths, angles with angles.
+        units = np.array([self.signals[i].unit for i in self.fitted])
+        scale = np.zeros(len(self.fitted))
+        for unit in dict.fromkeys(units.tolist()):
+            scale[units == unit] = span[self.fitted][units == unit].max()
+        step = float(self.instants[kept[-1]] - self.instants[kept[0]]) / (len(kept) - 1)
+        return fit_motion(step, self.samples[kept], scale)
 
     def _copies(self) -> tuple[tuple[str, float], ...]:
-        """Return how far apart the peers' copies of each state that is sent as it is are at the end."""
+        """Return the distance at the end between the peers' copies of each state that is sent as it is."""
         copies = []
         for name in self.simulation.sent:
             places = [
@@ -306,8 +354,42 @@ def _number(group: Group, peer: int, name: str, common: dict[str, float]) -> flo
     return next((value.value for value in group.values if value.name == name), common[name])
 
 
+def agreed(summary: Summary, system: CompiledSystem) -> Summary:
+    """Return the summary of a motion, not determined where it contradicts the analysis of a linear topology.
+
+    Parameters
+    ----------
+    summary
+        That of a motion by exact transitions.
+    system
+        The topology that was simulated.
+    """
+    if summary.verdict in (AT_REST, DRIVEN) or summary.driven_until or system.peers > MOST_LINEAR:
+        return summary
+    if not all(jacobians(kind).affine for kind in system.kinds) or unreliable(system):
+        return summary
+    try:
+        analysis = analyze(system)
+    except ApcError:  # what can't be analysed can be simulated
+        return summary
+    decays, lasts = summary.verdict == DECAYS, summary.verdict in (DECAYS, DRIFTS)
+    drifts = analysis.verdict == RADIUS_DRIFTS
+    contradicted = {
+        True: not lasts or (summary.verdict == DRIFTS and analysis.verdict == RADIUS_STABLE),
+        False: decays or (summary.verdict != DIVERGES and not drifts),
+        None: False,
+    }[analysis.stable]
+    if not contradicted:
+        return summary
+    reason = f"{summary.reason or CONTRADICTION}; apc analyze: {analysis.verdict}"
+    if 0 < analysis.spectral_radius != 1:
+        slowest = analysis.frame_s / abs(math.log(analysis.spectral_radius))
+        reason += f", {'decay' if analysis.spectral_radius < 1 else 'growth'} time constant {slowest:.6g} s"
+    return replace(summary, verdict=NOT_DETERMINED, reason=reason)
+
+
 def is_position(signal: Signal) -> bool:
-    """Say whether a signal is a place, which decides whether a motion settles."""
+    """Return whether a signal is a position, which decides the verdict."""
     return signal.role == "state" and signal.unit in POSITIONS
 
 
@@ -318,11 +400,11 @@ def _positions(system: CompiledSystem) -> int:
 
 
 def _overshoot(extents: Sequence[Extent]) -> tuple[str, float] | None:
-    """Return the largest way beyond the last value, as a part of the way from the first."""
+    """Return the largest excess over the last value, as a part of the step from the first."""
     beyonds = []
     for extent in extents:
-        way = extent.last - extent.first
-        if way and abs(way) > LEAST_WAY * (extent.high - extent.low):
-            beyond = extent.high - extent.last if way > 0 else extent.last - extent.low
-            beyonds.append((extent.name, beyond / abs(way)))
+        step = extent.last - extent.first
+        if step and abs(step) > LEAST_STEP * (extent.high - extent.low):
+            beyond = extent.high - extent.last if step > 0 else extent.last - extent.low
+            beyonds.append((extent.name, beyond / abs(step)))
     return max(beyonds, key=lambda pair: pair[1], default=None)

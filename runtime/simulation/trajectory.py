@@ -26,10 +26,10 @@ from apc.result import Look, Result
 from apc.simulation.accuracy import ErrorEstimate, compare_with
 from apc.simulation.flow import Tolerance
 from apc.simulation.rows_in_time import Block, blocks
-from apc.simulation.settings import DEFAULT, Method, Settings
+from apc.simulation.settings import DEFAULT, EXACT, WHERE_NEEDED, Method, Settings
 from apc.simulation.signals import Signal
 from apc.simulation.simulation import Simulation, check_length, prepare
-from apc.simulation.summary import Summary, Watch
+from apc.simulation.summary import Summary, Watch, agreed
 
 Floats = NDArray[np.float64]
 
@@ -197,7 +197,10 @@ def play(
         if not watch.rows:
             raise
         interrupted = True
-    return watch.summary(block), interrupted
+    summary = watch.summary(block)
+    if simulation.settings.method.name in (EXACT, WHERE_NEEDED):
+        summary = agreed(summary, simulation.topology)
+    return summary, interrupted
 
 
 def simulate(

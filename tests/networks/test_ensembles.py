@@ -91,7 +91,7 @@ def test_runs_agree_with_the_judgedin_mean_square_and_take_the_time_of_its_growt
         assert found.mean_square is not None
         assert found.mean_square.verdict == verdict and found.agrees
     assert stable.calm == 6
-    assert "stable in mean square, and 6 of 6 runs settle or die away: they agree" in said(stable)
+    assert "stable in mean square, and 6 of 6 runs decay or are at rest: they agree" in said(stable)
     told = stable.mean_square
     assert told is not None and told.settles_in is not None
     # After this time the root of a mean square is a twentieth of what it was.

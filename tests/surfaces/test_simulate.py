@@ -26,7 +26,7 @@ def test_the_only_scene_of_a_folder_is_played_for_as_long_as_it_says(cli: Cli) -
     write("scene.yaml", (SCENES / "experiment-average.yaml").read_text(encoding="utf-8"))
     ran = cli("simulate")
     assert (ran.code, ran.err) == (0, "")
-    assert ran.out.startswith("experiment-average: settles\n")
+    assert ran.out.startswith("experiment-average: decays\n")
     assert "3001 rows of 18 signals until 3 s" in ran.out
 
 
@@ -73,9 +73,9 @@ def test_what_is_wrong_is_told_in_one_line(words: str, said: str, moved: Cli) ->
 def test_a_scene_at_rest_is_said_to_rest_and_an_unstable_one_is_an_answer(cli: Cli) -> None:
     write("scene.yaml", AVERAGE)
     assert cli("simulate --duration 1s").out.splitlines() == [
-        "three-users-average: rests",
+        "three-users-average: at rest",
         "",
-        "  Nothing moves: no force and no start value sets it in motion.",
+        "  No position changes.",
         "",
         "  recorded       1001 rows of 24 signals until 1 s",
     ]

@@ -94,13 +94,13 @@ def test_a_scheme_that_is_not_linear_is_judged_in_time_beside_its_linearization(
     assert one.played is not None and one.played.to_dict() == played.to_dict()
     words = str(found).splitlines()
     place = words.index("     in time                            played")
-    settled = f"settles at {played.summary.settled:.3g} s"
+    settled = f"decays, settling time {played.summary.settled:.3g} s"
     assert words[place + 1 : place + 3] == [
         f"  1  {settled:<33}  3 s",
         "  2  as its verdict says: it is linear",
     ]
     column = found.to_dataframe()["in time"]
-    assert column[0] == "settles" and column.isna()[1]
+    assert column[0] == "decays" and column.isna()[1]
 
 
 @pytest.mark.few(1)

@@ -1,0 +1,74 @@
+"""Until when the equations of a simulation change with time alone.
+
+Takes: a `Simulation`. Gives: `driven_until`.
+Guarantees: of equal simulations the same instant. A change that is shorter than a `GRID`-th of the duration
+may be missed, unless the time at which it begins or ends is written in a continuous equation.
+Does not: find the forces that do it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import casadi
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import Kind
+from apc.simulation.simulation import Simulation
+
+Floats = NDArray[np.float64]
+
+GRID = 1024  # instants at which equations are evaluated
+MOST_SITES = 16  # different sites of a group that are evaluated
+STATES = (0.005, 0.01)  # between which the states are drawn, in SI
+CHANGED = 1e-12  # share of a value from which it has changed
+
+
+def driven_until(simulation: Simulation) -> float:
+    """Return the last instant in s at which an equation changes with time alone, 0 if none does."""
+    end = float(simulation.settings.duration)
+    until = 0.0
+    functions: dict[Kind, list[Any]] = {}
+    for member, forces in zip(simulation.population.members, simulation.forces, strict=True):
+        kind = simulation.topology.kinds[simulation.topology.groups[member.group].kind]
+        if kind not in functions:
+            functions[kind] = [function for function in _functions(kind) if _depends_on_time(function)]
+        breaks = [force.breaks[(force.breaks > 0) & (force.breaks < end)] for force in forces]
+        instants = np.unique(np.concatenate([np.linspace(0, end, GRID + 1), *breaks]))
+        for function in functions[kind]:
+            for parameters in member.parameters[:MOST_SITES]:
+                until = max(until, _last_change(function, parameters, instants))
+    return until
+
+
+def _functions(kind: Kind) -> Iterator[Any]:
+    """Yield the functions of a kind over (…, p, t)."""
+    yield kind.derivative
+    for clock in kind.clocks:
+        yield clock.tick
+        yield from (receive.edge for receive in clock.receives if receive.edge is not None)
+    yield from (send.send for send in kind.sends)
+
+
+def _depends_on_time(function: Any) -> bool:
+    return any(function.jac_sparsity(out, function.n_in() - 1).nnz() for out in range(function.n_out()))
+
+
+def _last_change(function: Any, parameters: Floats, instants: Floats) -> float:
+    """Return the last of some instants at which a function differs from the one before, 0 if none does."""
+    draw, last = np.random.default_rng(0), function.n_in() - 1
+    given = [casadi.DM(draw.uniform(*STATES, function.size_in(i))) for i in range(last - 1)]
+    given += [casadi.DM(parameters), casadi.DM(instants).T]
+    inputs = [casadi.repmat(item, 1, len(instants)) for item in given[:-1]]
+    rows = [np.asarray(out, np.float64) for out in _outputs(function.map(len(instants))(*inputs, given[-1]))]
+    values = np.concatenate([row.reshape(-1, len(instants), order="F") for row in rows])
+    size = np.abs(np.nan_to_num(values)).max(axis=1, initial=0.0)[:, None]
+    with np.errstate(invalid="ignore"):
+        changed = (np.abs(np.diff(values, axis=1)) > CHANGED * size).any(axis=0)
+    return float(instants[1:][changed].max(initial=0.0))
+
+
+def _outputs(result: Any) -> tuple[Any, ...]:
+    return result if isinstance(result, tuple) else (result,)
