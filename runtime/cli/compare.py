@@ -66,7 +66,7 @@ def compare_command(
         _compare_run(Path(files[0]), as_json=as_json)
         return
     from apc.comparison.comparison import compare
-    from apc.frame.devices import UNHELD
+    from apc.frame.devices import UNHELD, names_hand
     from apc.inputs import open_scene
     from apc.present.pictures import write_result
 
@@ -79,7 +79,8 @@ def compare_command(
         except ApcError as error:
             if error.mistakes[0].code not in UNHELD:
                 raise
-            system = open_scene(file, settings, {"--out": out})
+            others = [text for text in settings if not names_hand(text)]
+            system = open_scene(file, others, {"--out": out})
             refused[place] = error.mistakes[0].reason
         systems.append(system)
     with status_line() as progress:

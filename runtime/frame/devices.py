@@ -4,7 +4,7 @@ Takes: a kind's Jacobians and exact numbers; a `CompiledSystem`.
 Gives: `Device`, `find_device`, `find_devices`, `devices_of`, `coupled_directly`,
 `directions_of`; `no_device`; `Push`,
 `find_push`; `HANDS`, `with_hands`, `without_hands`, `clamped`, `held`; `replaced_hands`; `refuse_hands`;
-`published`; `refuse_numberless`; `OWN_MASS`, `UNHELD`.
+`published`; `names_hand`, `refuse_numberless`; `OWN_MASS`, `UNHELD`.
 Guarantees: a scene that is clamped or held is a scene as any other: parameters, groups and clocks stay.
 Does not: ask whether it is stable (see `passivity` for hands of every kind).
 
@@ -522,6 +522,11 @@ def with_hands(system: CompiledSystem, hands: str) -> CompiledSystem:
     )
 
 
+def names_hand(text: str) -> bool:
+    """Return whether a text begins with a parameter of the hand that `held` puts on a device."""
+    return bool(_HAND_NAME.match(text.strip()))
+
+
 def refuse_numberless(hands: str, named: Iterable[str]) -> None:
     """Refuse hands that are held but have no number: a hand of 0 kg, 0 N*s/m and 0 N/m is a free hand.
 
@@ -537,7 +542,7 @@ def refuse_numberless(hands: str, named: Iterable[str]) -> None:
     ApcError
         E930 none of `hand.mass`, `hand.damping` and `hand.stiffness` is among them.
     """
-    if hands != HELD or any(_HAND_NAME.match(text.strip()) for text in named):
+    if hands != HELD or any(map(names_hand, named)):
         return
     names = ", ".join(f"{HAND}.{name}" for name, _, _ in _NUMBERS)
     what, got = f"--hands {HELD}", "none, which is a free hand"

@@ -40,6 +40,7 @@ RAMP = 0.05  # share of the range of the window from which a ramp counts
 OPEN = 0.5  # an error of the rate times the window from which it leaves open whether a motion goes on
 LARGE = 0.1  # share of the largest amplitude from which a pole that is not known leaves the rate open
 FADED = 1e-10  # share of the largest second difference from which a sample counts
+STEADY = 0.5  # share of the range of the last quarter that the step to it must be, for a motion that goes on
 KEPT = 0.8  # share of a step that the next but one must keep, for a motion that goes on
 LATE = 0.9  # share of the samples: a motion that ends before has ended
 UNIT = float(np.finfo(np.float64).eps)
@@ -220,7 +221,7 @@ def _poles(step: float, window: Floats) -> _Poles | None:
         return None
     rows = min(PENCIL, len(curve) // 2)
     blocks = [np.lib.stride_tricks.sliding_window_view(column, rows) for column in curve.T / size]
-    triangle = np.linalg.qr(np.concatenate(blocks), mode="r")
+    triangle = np.asarray(np.linalg.qr(np.concatenate(blocks), mode="r"))
     left, singular, _ = np.linalg.svd(triangle.T)
     floor = max(NOISE, rounding / size)
     order = min(int((singular > floor * singular[0]).sum()), POLES, rows // 2)
@@ -271,9 +272,13 @@ def _straightened(window: Floats) -> Floats:
 
 
 def _goes_on(window: Floats) -> bool:
-    """Return whether the mean of some channel moves on from quarter to quarter, by no less each time."""
-    means = np.array([part.mean(axis=0) for part in np.array_split(window, 4)])
-    steps = np.diff(means, axis=0)
+    """Return whether the mean of some channel moves on from quarter to quarter, by no less each time.
+
+    The step to the last quarter must be a large share of its range: what oscillates more does not drift.
+    """
+    quarters = np.array_split(window, 4)
+    steps = np.diff([part.mean(axis=0) for part in quarters], axis=0)
     onwards = (np.sign(steps) == np.sign(steps[0])).all(axis=0)
     kept = np.abs(steps[2]) > KEPT * np.abs(steps[0])
-    return bool((onwards & kept & (np.abs(steps[2]) > RAMP * np.ptp(window, axis=0))).any())
+    large = np.abs(steps[2]) > np.maximum(RAMP * np.ptp(window, axis=0), STEADY * np.ptp(quarters[3], axis=0))
+    return bool((onwards & kept & large).any())
