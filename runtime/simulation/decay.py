@@ -37,7 +37,9 @@ AT_REST = 1e-7  # share of the range of all below which a motion has ended
 SAFETY = 3.0  # times what parts of the samples disagree by
 SEGMENTS, FEWEST_SEGMENTS = 8, 4  # of the window, for the range over time: each of a period or more
 RAMP = 0.05  # share of the range of the window from which a ramp counts
-OPEN = 0.5  # an error of the rate times the window from which it leaves open whether a motion goes on
+# An error of the rate times the window, or of a frequency as a share of it, that leaves open whether a motion
+# oscillates on.
+OPEN = 0.5
 LARGE = 0.1  # share of the largest amplitude from which a pole that is not known leaves the rate open
 FADED = 1e-10  # share of the largest second difference from which a sample counts
 STEADY = 0.5  # share of the range of the last quarter that the step to it must be, for a motion that goes on
@@ -87,8 +89,10 @@ class Fit:
     @property
     def lasts(self) -> bool:
         """Whether an oscillation neither decays nor grows visibly in the window, its error included."""
-        known = (abs(self.rate) + self.error) * self.span < OPEN
-        return self.oscillation is not None and known and not self.decays and not self.grows
+        crests = self.oscillation
+        if crests is None or crests.error > OPEN * crests.frequency:
+            return False
+        return (abs(self.rate) + self.error) * self.span < OPEN and not self.decays and not self.grows
 
 
 # A channel's place, frequency and error.
