@@ -2,8 +2,8 @@
 
 Takes: paths. Gives: `read_file`, `check_file`, `RefusedError`, `files_below`, `listing`, `same_file`;
 `recorded`, `replayed`; `write_file`, `write_bytes`, `write_text`, `write_texts`, `check_target`,
-`unwritable`, `is_special`, `is_stdout`, and for what is written piece by piece `begin_file`, `finish_file`,
-`drop_file`, `partial_name`; `unlink_link`.
+`unwritable`, `is_special`, `is_stdout`, and for what is written piece by piece `Temporary`, `begin_file`,
+`finish_file`, `drop_file`, `partial_name`; `unlink_link`.
 Guarantees: only a regular file of bounded size is read, by whatever links it is reached, and nothing is
 waited for. What is written is there whole or not at all: a file is replaced by one of its mode and owner
 unless it is read-only, a link stays and its file is written; a device or pipe, or what standard output writes
@@ -22,6 +22,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, suppress
 from contextvars import ContextVar
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Literal, TypeVar
@@ -235,13 +236,13 @@ def write_file(path: Path, write: Callable[[Path], object]) -> None:
 
 def _write_all(writers: Mapping[Path, Callable[[Path], object]]) -> None:
     """Fill a temporary file for each path, then put all where they belong, or none. Raises ApcError E601."""
-    ready: dict[Path, Path] = {}
+    ready: dict[Path, Temporary] = {}
     try:
         for path, write in writers.items():
             with _writing(path, *NO_NAME):
                 ready[path] = begin_file(path)
             with _writing(path, OSError):
-                write(ready[path])
+                write(ready[path].path)
         for path in writers:
             with _writing(path, OSError):
                 finish_file(ready[path], path)
@@ -288,7 +289,21 @@ def unwritable(path: Path, error: Exception) -> ApcError:
     return ApcError(Mistake("E601", Place(str(path)), f"can't be written: {_reason(error)}", hint=hint))
 
 
-def begin_file(path: Path) -> Path:
+@dataclass(frozen=True, slots=True)
+class Temporary:
+    """A temporary file: `name` in the folder of descriptor `folder`, open for writing as `descriptor`.
+
+    `path` is where to write: by the descriptor where the system has such names, so that a link that somebody
+    else puts in place of the file is not followed.
+    """
+
+    path: Path
+    descriptor: int
+    folder: int | None
+    name: Path
+
+
+def begin_file(path: Path) -> Temporary:
     """Make the empty temporary file of a path: beside what it leads to, so that a rename puts it there.
 
     Raises
@@ -307,13 +322,19 @@ def begin_file(path: Path) -> Path:
         folder = Path(tempfile.gettempdir())
     elif target.exists() and not (target.stat().st_mode & 0o222 and os.access(target, os.W_OK)):
         raise PermissionError(None, "it is read-only")
-    # The name of the target need not fit: a temporary's is longer.
-    handle, name = tempfile.mkstemp(".unfinished", f".{target.name[:24]}.", folder)
-    os.close(handle)
-    return Path(name)
+    # The name of the target need not fit: a temporary's is longer. No link is followed, and no file opened.
+    descriptor, text = tempfile.mkstemp(".unfinished", f".{target.name[:24]}.", folder)
+    name, by_descriptor = Path(text), Path(f"/proc/{os.getpid()}/fd/{descriptor}")
+    try:
+        directory = os.open(folder, os.O_RDONLY | os.O_DIRECTORY) if os.rename in os.supports_dir_fd else None
+    except OSError:
+        os.close(descriptor)
+        name.unlink(missing_ok=True)
+        raise
+    return Temporary(by_descriptor if by_descriptor.exists() else name, descriptor, directory, name)
 
 
-def finish_file(temporary: Path, path: Path) -> None:
+def finish_file(temporary: Temporary, path: Path) -> None:
     """Put a temporary file where it belongs: in place of a file, with its mode; into a device or pipe.
 
     Then there is no temporary file any more: its name may be that of another writer's.
@@ -321,10 +342,10 @@ def finish_file(temporary: Path, path: Path) -> None:
     Raises
     ------
     OSError
-        It can't be put there.
+        It can't be put there, or another user has put something else in its place.
     """
     if is_special(path):
-        with temporary.open("rb") as source, os.fdopen(_drain(path), "wb") as drain:
+        with temporary.path.open("rb") as source, os.fdopen(_drain(path), "wb") as drain:
             shutil.copyfileobj(source, drain)
         drop_file(temporary)
         return
@@ -333,13 +354,44 @@ def finish_file(temporary: Path, path: Path) -> None:
         before = target.stat()
         mode = stat.S_IMODE(before.st_mode)
         with suppress(OSError, AttributeError):  # only root may give it away; and not on Windows
-            os.chown(temporary, before.st_uid, before.st_gid)
+            os.fchown(temporary.descriptor, before.st_uid, before.st_gid)
     except FileNotFoundError:
         mask = os.umask(0)
         os.umask(mask)
         mode = 0o666 & ~mask
-    temporary.chmod(mode)
-    temporary.replace(target)
+    if hasattr(os, "fchmod"):
+        os.fchmod(temporary.descriptor, mode)
+    else:
+        temporary.name.chmod(mode)
+    if not _is_ours(temporary, temporary.name.name):
+        raise OSError(None, "another program has replaced its temporary file")
+    if temporary.folder is None:
+        os.close(temporary.descriptor)
+        temporary.name.replace(target)
+        return
+    os.replace(temporary.name.name, target.name, src_dir_fd=temporary.folder, dst_dir_fd=temporary.folder)
+    if not _is_ours(temporary, target.name):
+        raise OSError(None, "another program has replaced it")
+    _close(temporary)
+
+
+def _is_ours(temporary: Temporary, name: str) -> bool:
+    """Return whether a name in the folder is that of the temporary file, and no link."""
+    try:
+        found = os.stat(
+            name if temporary.folder is not None else temporary.name,
+            dir_fd=temporary.folder,
+            follow_symlinks=False,
+        )
+    except FileNotFoundError:
+        return False
+    return os.path.samestat(found, os.fstat(temporary.descriptor))
+
+
+def _close(temporary: Temporary) -> None:
+    for descriptor in (temporary.descriptor, temporary.folder):
+        with suppress(OSError, TypeError):
+            os.close(descriptor)  # type: ignore[arg-type] # None where folders have no descriptors
 
 
 def partial_name(path: Path) -> Path:
@@ -359,9 +411,13 @@ def unlink_link(path: Path) -> None:
             path.unlink()
 
 
-def drop_file(temporary: Path) -> None:
+def drop_file(temporary: Temporary) -> None:
     """Remove a temporary file that was not put where it belongs."""
-    temporary.unlink(missing_ok=True)
+    if _is_ours(temporary, temporary.name.name):
+        os.unlink(
+            temporary.name.name if temporary.folder is not None else temporary.name, dir_fd=temporary.folder
+        )
+    _close(temporary)
 
 
 def _target(path: Path) -> Path:

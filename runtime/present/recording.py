@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.files import begin_file, drop_file, finish_file, is_special, partial_name
+from apc.compiler.files import Temporary, begin_file, drop_file, finish_file, is_special, partial_name
 from apc.memory import refuse_beyond
 from apc.present.simulation_output import provenance_json
 from apc.simulation.rows_in_time import Block
@@ -114,7 +114,7 @@ class Recording:
     def __init__(self, path: Path, simulation: Simulation) -> None:
         self.path = path
         self._until = 0.0  # seconds, the last row's time
-        self._files: dict[Path, str] = {}  # temporary, and what its name adds to that of the file
+        self._files: dict[Temporary, str] = {}  # temporary, and what its name adds to that of the file
         about = provenance_json(provenance_of(simulation))
         columns = [Column("time", "s"), *(Column(signal.name, signal.unit) for signal in simulation.signals)]
         try:
@@ -178,7 +178,7 @@ class Recording:
     def _temporary(self, added: str) -> Path:
         temporary = begin_file(self._place(added))
         self._files[temporary] = added
-        return temporary
+        return temporary.path
 
     def _place(self, added: str) -> Path:
         return self.path.with_name(f"{self.path.name}{added}")

@@ -118,7 +118,17 @@ def common_period(system: CompiledSystem, free: Free) -> Fraction:
 def period_between(
     system: CompiledSystem, free: Free, unit: Fraction, low: Fraction, high: Fraction
 ) -> Fraction | None:
-    """Return the simplest value strictly between two whose frame is short enough, None if there is none."""
+    """Return the simplest value strictly between two whose frame is short enough, None if there is none.
+
+    Parameters
+    ----------
+    system, free
+        The compiled topology and the number that varies.
+    unit
+        From `common_period`, in seconds.
+    low, high
+        The two values, in seconds.
+    """
     value = unit * _simplest(low / unit, high / unit)
     return value if _ticks(system, free, value) <= MOST_FRAME_TICKS else None
 

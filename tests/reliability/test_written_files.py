@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import stat
+import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -146,9 +148,9 @@ def test_a_device_is_written_to_and_stays_a_device() -> None:
     before = null.stat()
     write_file(OUT, fill("gone"))
     temporary = begin_file(null)
-    assert temporary.parent != null.parent, "nothing is made among the devices"
+    assert temporary.name.parent != null.parent, "nothing is made among the devices"
     finish_file(temporary, null)
-    assert not temporary.exists()
+    assert not temporary.name.exists()
     assert (before.st_ino, before.st_mode) == (null.stat().st_ino, null.stat().st_mode)
     assert OUT.is_symlink()
 
@@ -175,13 +177,86 @@ def test_standard_output_is_written_to_whatever_it_is_and_goes_on(capfd: pytest.
 
 def test_what_others_are_writing_stays() -> None:
     first, second = begin_file(OUT), begin_file(OUT)
-    first.write_text("first", encoding="utf-8")
+    first.path.write_text("first", encoding="utf-8")
     write_file(OUT, fill("third"))
-    second.write_text("second", encoding="utf-8")
+    second.path.write_text("second", encoding="utf-8")
     for temporary, text in ((first, "first"), (second, "second")):
         finish_file(temporary, OUT)
         assert OUT.read_text() == text
     assert folder() == ["r.csv"]
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="files have no names by descriptor here")
+@pytest.mark.parametrize("when", ["before it is written", "before it is finished"])
+@pytest.mark.parametrize("existing", [True, False])
+def test_a_link_in_place_of_the_temporary_file_changes_nothing_else(when: str, existing: bool) -> None:
+    """Whoever may write in the folder puts a link to a private file where the temporary file was."""
+    private = Path("private")
+    private.write_text("secret", encoding="utf-8")
+    private.chmod(0o600)
+    if existing:
+        OUT.write_text("old", encoding="utf-8")
+        OUT.chmod(0o666)
+
+    def attack(temporary: Path) -> None:
+        if when == "before it is finished":
+            temporary.write_text("new", encoding="utf-8")
+        (placed,) = [name for name in Path().iterdir() if name.name.endswith(".unfinished")]
+        placed.unlink()
+        placed.symlink_to(private.absolute())
+        if when == "before it is written":
+            temporary.write_text("new", encoding="utf-8")
+
+    with pytest.raises(ApcError, match="another program has replaced"):
+        write_file(OUT, attack)
+    assert private.read_text() == "secret"
+    assert stat.S_IMODE(private.stat().st_mode) == 0o600
+    assert not OUT.is_symlink()
+    assert (OUT.read_text() == "old") if existing else not OUT.exists()
+
+
+ATTACK = """
+import os, sys, time
+os.setgid({user}); os.setuid({user}); os.chdir(sys.argv[1])
+print("ready", flush=True)
+while True:
+    for name in os.listdir("."):
+        if name.endswith(".unfinished"):
+            try:
+                os.rename(name, "taken-" + name)
+                os.symlink("/" + sys.argv[2].lstrip("/"), name)
+            except OSError:
+                pass
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="another user is needed")
+def test_another_user_of_a_shared_folder_changes_no_file_of_the_writer(tmp_path: Path) -> None:
+    private = tmp_path / "private"
+    private.write_text("secret", encoding="utf-8")
+    private.chmod(0o600)
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder).chmod(0o777)
+        code = ATTACK.format(user=65534)
+        words = [sys.executable, "-c", code, folder, str(private)]
+        attacker = subprocess.Popen(words, stdout=subprocess.PIPE)
+        try:
+            assert attacker.stdout is not None
+            assert attacker.stdout.readline() == b"ready\n"
+            out = Path(folder, "out.csv")
+            for number in range(300):
+                try:
+                    write_file(out, fill(f"{number}\n" * 1000))
+                except ApcError as error:
+                    assert "replaced" in str(error) or "No such file" in str(error)
+                else:
+                    assert not out.is_symlink()
+                    assert out.read_text() == f"{number}\n" * 1000
+                assert private.read_text() == "secret"
+                assert stat.S_IMODE(private.stat().st_mode) == 0o600
+        finally:
+            attacker.kill()
+            attacker.wait()
 
 
 @pytest.mark.whole
