@@ -371,7 +371,9 @@ def finish_file(temporary: Temporary, path: Path) -> None:
         return
     os.replace(temporary.name.name, target.name, src_dir_fd=temporary.folder, dst_dir_fd=temporary.folder)
     if not _is_ours(temporary, target.name):
-        raise OSError(None, "another program has replaced it")
+        with suppress(OSError):  # what came in its place leads elsewhere
+            os.unlink(target.name, dir_fd=temporary.folder)
+        raise OSError(None, "another program has replaced its temporary file")
     _close(temporary)
 
 
@@ -423,7 +425,13 @@ def drop_file(temporary: Temporary) -> None:
 def _target(path: Path) -> Path:
     """Return what a path leads to, whether or not it is there."""
     try:
-        return path.resolve() if path.is_symlink() and not is_special(path) else path
+        if not path.is_symlink() or is_special(path):
+            return path
+        link, folder = path.lstat(), path.parent.stat()
+        # As Linux's protected_symlinks: nobody else's link in a folder of ours or of a third user.
+        if hasattr(os, "geteuid") and link.st_uid not in (os.geteuid(), folder.st_uid):
+            raise PermissionError(None, "it is a link of another user")
+        return path.resolve()
     except RuntimeError as error:  # a loop of links
         raise OSError(None, "its links lead to one another") from error
 
