@@ -46,7 +46,8 @@ def oddities(
             warnings.add("W271", entry.place, f"nobody uses the link {name}")
         if entry.section == "links" and isinstance(entry.body.get("delay"), ListNode):
             what = (
-                f"{name}.delay is a range: analyze and tune are for all of it, other answers for its middle"
+                f"{name}.delay is a range: analyze and tune are for every constant delay in it, and report "
+                "delays that change from packet to packet; other answers are for its middle"
             )
             what += "; simulate and export want one delay"
             warnings.add("W275", entry.place, what)

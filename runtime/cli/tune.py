@@ -51,7 +51,8 @@ def tune_command(
     ),
     subject: tuple[str, ...] = option(
         'Beside stability: "decay=60 dB in 2 s"; "feel.impedance at 5 Hz < 20 N*s/m", or feel.transmitted in '
-        "m/s/N, feel.error in m/N, feel.damping, feel.error_h2, feel.error_hinf. May be repeated.",
+        "m/s/N, feel.error in m/N, feel.damping, feel.error_h2, feel.error_hinf, or delay=changing: "
+        "stable, too, where the delay of --over changes from packet to packet. May be repeated.",
         "DEMAND",
     ),
     against: str = option(

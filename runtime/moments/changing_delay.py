@@ -41,8 +41,9 @@ from apc.unserved import UnservedError
 # What a link whose packets come late is like: the newest that has arrived is heard, until there is another.
 HOLDING = Channel(None, None, "uniform", "newest", "hold", None)
 
-# Packets in a row that are tried, of the least delay and then of the largest.
-LONGEST = 8
+# Packets in a row that are tried, of the least delay and then of the largest: all up to so many, and of more
+# a third, a half and two thirds of the least delay.
+LONGEST, LONGER = 8, 12
 
 # A gain is proved to be below so much more than it is: rounding takes a part of what lies between.
 ABOVE = 1 + 1e-3
@@ -119,9 +120,11 @@ def unstable_delays(
     Parameters
     ----------
     system, delay, low, high
-        As for `loop_gain`; None where no such delays of at most `LONGEST` packets are proved unstable.
+        As for `loop_gain`; None where no such delays of at most `LONGER` packets are proved unstable.
     """
-    turns = ((first, total - first) for total in range(2, LONGEST + 1) for first in range(1, total))
+    turns = [(first, total - first) for total in range(2, LONGEST + 1) for first in range(1, total)]
+    more = range(LONGEST + 1, LONGER + 1)
+    turns += [(total * share // 6, total - total * share // 6) for total in more for share in (2, 3, 4)]
     for first, then in turns:
         trace = np.array([float(low)] * first + [float(high)] * then)
         channel = replace(HOLDING, trace=trace)

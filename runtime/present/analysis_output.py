@@ -349,11 +349,11 @@ def box_proof_text(box_proof: BoxProof) -> Lines:
         yield from wrapped(f"more cells may decide it: --cells {MORE_CELLS * box_proof.cells}")
     if box_proof.changing is not None:
         yield ""
-        yield from wrapped(_changing(box_proof.changing, box_proof.ranges[0]))
+        yield from wrapped(changing_text(box_proof.changing, box_proof.ranges[0]))
     yield from notes(*box_proof.notes)
 
 
-def _changing(changing: ChangingDelay, over: Range) -> str:
+def changing_text(changing: ChangingDelay, over: Range) -> str:
     """Return what is proved of a delay that changes from packet to packet, in a sentence."""
     low, high = (quantity(float(number), over.unit, 9) for number in (over.low, over.high))
     said = [changing.note or "open whether it stays stable"]

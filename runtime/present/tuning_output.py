@@ -19,8 +19,20 @@ from apc.compiler.compiled import LENGTH
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import counted, enumerated, in_hertz, wrapped
 from apc.frame.overrides import Override, apply
-from apc.present.analysis_output import range_document, range_text
-from apc.present.forms import MEANT, Lines, Plain, labelled, notes, quantity, record, span, table, uncertain
+from apc.present.analysis_output import changing_text, range_document, range_text
+from apc.present.forms import (
+    MEANT,
+    Lines,
+    Plain,
+    labelled,
+    notes,
+    picked,
+    quantity,
+    record,
+    span,
+    table,
+    uncertain,
+)
 from apc.present.pictures import COLOURS, legend_below, new_figure
 from apc.present.region_picture import draw_panel
 from apc.regions.panels import Panel
@@ -70,6 +82,7 @@ def tuning_text(tuning: Tuning) -> Lines:
         ("margin", _margin(tuning) if tuning.met else ""),
     )
     yield from _proof_lines(tuning)
+    yield from _changing_lines(tuning)
     if tuning.binding:
         yield "\n  what binds" if tuning.met else "\n  what is in the way"
         for binding in tuning.binding:
@@ -84,7 +97,13 @@ def _sentence(tuning: Tuning) -> str:
     if tuning.decay != 1:
         stable = f"motions die out by {-20 * math.log10(tuning.decay):.6g} dB a second"
     stable += " and what is felt is as asked" if tuning.felt else ""
-    over = f" for {enumerated([range_text(interval) for interval in tuning.over])}" if tuning.over else ""
+    ranges = [
+        range_text(interval) + ", at every constant delay" * (interval == tuning.delay)
+        for interval in tuning.over
+    ]
+    if tuning.demanded and tuning.delay:
+        ranges.append(f"{tuning.delay.free.label} changing from packet to packet")
+    over = f" for {enumerated(ranges)}" if ranges else ""
     if not tuning.met:
         return f"{tuning.topology}: no gains were found in these ranges with which {stable}{over}"
     proved = "proved" if tuning.proved else "not proved"
@@ -141,6 +160,20 @@ def _proof_lines(tuning: Tuning) -> Lines:
         yield from labelled(("not proved", "the time was up before any proof"))
 
 
+def _changing_lines(tuning: Tuning) -> Lines:
+    """Yield what is proved of the gains where the delay changes from packet to packet."""
+    if tuning.delay is None:
+        return
+    told: dict[str, list[str]] = {}
+    for counts, found in tuning.changing:
+        numbers = ", ".join(f"{label} {number}" for label, number in counts)
+        told.setdefault(changing_text(found, tuning.delay), []).append(numbers)
+    for text, where in told.items():
+        yield from wrapped(text, "  ", "    ")
+        if any(where):
+            yield from wrapped(f"with {'; '.join(where)}", "    ", "    ")
+
+
 def _where(binding: Binding) -> str:
     return ", ".join(f"{label} {quantity(value, unit)}" for label, value, unit in binding.where)
 
@@ -148,6 +181,8 @@ def _where(binding: Binding) -> str:
 def _binding_lines(tuning: Tuning, binding: Binding) -> Lines:
     other = "what is felt" if tuning.felt else tuning.aim if _is_felt(tuning) else "stability"
     mode = f"{binding.shape} mode" if binding.shape else "" if math.isnan(binding.frequency_hz) else other
+    if not mode and tuning.demanded and not tuning.felt:
+        mode = "the bound for a delay that changes from packet to packet"
     mode += f" at {in_hertz(binding.frequency_hz)}" if mode and not math.isnan(binding.frequency_hz) else ""
     yield from wrapped(": ".join(filter(None, [_where(binding), mode])) or other, "    ", "      ")
     for label, value, unit, better in (
@@ -276,4 +311,12 @@ def tuning_document(tuning: Tuning) -> Plain:
         | {"cells": proof.proof.cells, "open_share": proof.proof.open_share}
         for proof in tuning.proofs
     ]
-    return record(tuning, {"over": [range_document(interval) for interval in tuning.over], "proofs": proofs})
+    ranges = {
+        "over": [range_document(interval) for interval in tuning.over],
+        "delay": None if tuning.delay is None else range_document(tuning.delay),
+        "changing": [
+            {"counts": dict(counts), **picked(found, "proved_to", "unstable", "note")}
+            for counts, found in tuning.changing
+        ],
+    }
+    return record(tuning, {**ranges, "proofs": proofs})

@@ -32,6 +32,9 @@ from apc.vary.growth import MEAN_SQUARE, NOMINAL, PASSIVE, criterion_of, refuse_
 PLACE = Place("tune")
 FREE, SUBJECT, OVER, AGAINST = (Place(f"--{text}") for text in ("free", "subject", "over", "against"))
 
+# The demand that a delay may change from packet to packet.
+CHANGING = "delay=changing"
+
 # What may be minimized beside a gain.
 RADIUS, SETTLING = "spectral_radius", "settling_time"
 
@@ -100,7 +103,8 @@ class Demands:
     `counts` are numbers of peers, every one from the low end to the high one; `delay` is a link's, at every
     constant value; `box` are other numbers. `decay` is the factor by which motions have to die out in a
     second, 1 where it is enough that they do. `felt` is what hands may feel at most. `criterion` is one of
-    those of `vary.growth`.
+    those of `vary.growth`. `changing` demands stability, too, where the delay changes from packet to packet
+    within its range.
     """
 
     free: tuple[Range, ...]
@@ -111,6 +115,7 @@ class Demands:
     decay: float
     felt: tuple[Felt, ...]
     criterion: str
+    changing: bool = False
 
     @property
     def columns(self) -> tuple[Range, ...]:
@@ -161,7 +166,8 @@ def read_demands(
         One of them: what is to be best, a gain, `spectral_radius`, `settling_time`, what is felt such as
         `feel.error at 1 Hz`, or a weighted sum of these in SI, `feel.damping - 0.01*coordination.stiffness`.
     subject
-        Demands beside stability: `decay=60 dB in 2 s`, `feel.impedance at 5 Hz < 20 N*s/m`.
+        Demands beside stability: `decay=60 dB in 2 s`, `feel.impedance at 5 Hz < 20 N*s/m`,
+        `delay=changing`.
     over
         What has to be borne: `user.count=2:10`, `device.mass=±20%`, `lan.delay=8 ms:20 ms`.
     criterion
@@ -211,14 +217,20 @@ def read_demands(
         for gain in (*gains, *box):
             refuse_time(system, gain.free, PLACE, chosen)
     felt = tuple(_felt(text) for text in subject if text.strip().startswith("feel."))
-    decay = min((_decay(text) for text in subject if not text.strip().startswith("feel.")), default=1.0)
+    changing = [text for text in subject if "".join(text.split()) == CHANGING]
+    decays = [text for text in subject if text not in changing and not text.strip().startswith("feel.")]
+    decay = min(map(_decay, decays), default=1.0)
     best = _aim(gains, maximize, minimize)
     if chosen == PASSIVE and (decay < 1 or best.column is None):
         asked = "a decay" if decay < 1 else best.label
         what = f"{asked} and --hands passive don't go together: what hands can draw has no modes that decay"
         raise ApcError(Mistake("E930", SUBJECT if decay < 1 else PLACE, what, hint="--hands clamped"))
     delay = delays[0] if delays else None
-    return Demands(tuple(gains), best, counts, delay, box, decay, felt, chosen)
+    if changing and (delay is None or chosen != NOMINAL):
+        what = f"{CHANGING} is of a link's delay with a range, and of the criterion {NOMINAL}"
+        hint = next((f'--over "{link.delay}=8 ms:20 ms"' for link in system.links), "")
+        raise ApcError(Mistake("E996", SUBJECT, what, hint=hint if delay is None else ""))
+    return Demands(tuple(gains), best, counts, delay, box, decay, felt, chosen, bool(changing))
 
 
 def held_as_studied(system: CompiledSystem) -> tuple[CompiledSystem, str | None]:
@@ -327,7 +339,7 @@ def _decay(text: str) -> float:
     name, _, value = (item.strip() for item in text.partition("="))
     size, within, time = (text.strip() for text in value.partition(" in "))
     if name != "decay" or not (within and size.lower().endswith("db")):
-        wants = "decay=… dB in … or feel.… at … < …"
+        wants = f"decay=… dB in …, feel.… at … < … or {CHANGING}"
         raise ApcError(Mistake("E996", SUBJECT, "a demand", wants, text[:80], '"decay=60 dB in 2 s"'))
     decibels = _part(size[:-2].strip(), "decibels", "1", "decay=60 dB in 2 s", SUBJECT)
     seconds = _part(time, "a time", "s", "decay=60 dB in 2 s", SUBJECT)

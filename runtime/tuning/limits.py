@@ -33,6 +33,7 @@ from apc.eigen.eigenpairs import eigenvalues
 from apc.frame.instance import Prepared
 from apc.frame.overrides import Override, apply
 from apc.hands.frequency_response import COUPLED, feel
+from apc.moments.changing_delay import loop_gain
 from apc.threads import load_pool
 from apc.tuning.demands import HINF, PLACE, SUBJECT, Aim, Demands, Felt
 from apc.vary.batch import BatchEvaluator, MatrixSource
@@ -105,6 +106,7 @@ class Limits:
     samples: dict[Scenario, Floats] = field(default_factory=dict)
     felt: dict[tuple[int, tuple[float, ...], int], Floats] = field(default_factory=dict)
     frequencies: list[float] = field(default_factory=lambda: [SLOWEST])
+    loop_gains: dict[tuple[tuple[Override, ...], tuple[float, ...]], float] = field(default_factory=dict)
 
     @cached_property
     def settings(self) -> list[tuple[tuple[Override, ...], CompiledSystem]]:
@@ -143,7 +145,8 @@ class Limits:
     @property
     def slow(self) -> bool:
         """Whether one point takes milliseconds."""
-        return bool(self.demands.measured) or not isinstance(self.family(0), BatchEvaluator)
+        asked = self.demands.measured or self.demands.changing
+        return bool(asked) or not isinstance(self.family(0), BatchEvaluator)
 
     def every(self) -> list[Scenario]:
         """Return the middle and the corners of the box in every setting."""
@@ -239,7 +242,7 @@ class Limits:
     def asked(
         self, setting: int, points: Floats, *, bounded: bool = False, view: Demands | None = None
     ) -> Floats:
-        """Return how far points (k, m + b) are from the demands on what is felt, and the level (k, q).
+        """Return how far points (k, m + b) are from the demands beside stability, and the level (k, q).
 
         Parameters
         ----------
@@ -268,8 +271,31 @@ class Limits:
             far = beyond / aim.scale
             far = np.where(far > 1, 1 + np.log(np.maximum(far, 1)), far)
             values = np.column_stack([values, far])
+        if demands.changing:
+            values = np.column_stack([values, self.changing(setting, self._numbers(points))])
         values = np.nan_to_num(values, nan=BEYOND, posinf=BEYOND, neginf=NONE)
         return np.asarray(np.maximum(values, NONE))
+
+    def changing(self, setting: int, numbers: Floats) -> Floats:
+        """Return ln of the loop gain under a delay that changes, (k,), with gains and box (k, n).
+
+        It is proved from above (see `changing_delay.loop_gain`), and the same for every constant delay.
+        """
+        overrides, _ = self.settings[setting]
+        counts, delay = overrides[: len(self.demands.counts)], self.demands.delay
+        assert delay is not None, "a demand on a delay has its range"
+        free = [interval.free for interval in (*self.demands.free, *self.demands.box)]
+        values = np.full(len(numbers), math.inf)
+        for place, point in enumerate(map(tuple, numbers.tolist())):
+            if (counts, point) not in self.loop_gains:
+                if place and self.late:
+                    break
+                pairs = zip(free, map(Fraction, point), strict=True)
+                scene = apply(self.system, [*counts, *(Override(*pair) for pair in pairs)])
+                gain = loop_gain(scene, delay.free, delay.low, delay.high)
+                self.loop_gains[counts, point] = math.log(max(gain, TINY))
+            values[place] = self.loop_gains[counts, point]
+        return values
 
     def sums(self, scenarios: Sequence[Scenario], chosen: Floats) -> Floats:
         """Return the aim's weighted sum in each scenario (s, k) with columns (k, m), NaN of none."""
@@ -318,6 +344,7 @@ class Limits:
         aim = [felt for _, felt in self.demands.aim.terms if isinstance(felt, Felt)]
         peaks = [felt.name == HINF for felt in self.demands.felt]
         peaks += [any(felt.name == HINF for felt in aim)] * bool(self.demands.aim.terms)
+        peaks += [False] * self.demands.changing
         for place, scenario in enumerate(scenarios):
             point = np.append(chosen, scenario.point)
             family = self.family(scenario.setting)

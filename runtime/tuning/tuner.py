@@ -16,7 +16,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from decimal import ROUND_CEILING, ROUND_FLOOR, ROUND_HALF_EVEN, Decimal
 from fractions import Fraction
@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import analyze, near_start
-from apc.analysis.box_proof import UNDECIDED, BoxProof
+from apc.analysis.box_proof import UNDECIDED, BoxProof, ChangingDelay
 from apc.answer import proved_at
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake
@@ -36,15 +36,18 @@ from apc.frame.instance import prepare
 from apc.frame.names import Free, Range, value_now
 from apc.frame.overrides import Override, apply
 from apc.hands.passivity import passive_hands
+from apc.moments.changing_delay import loop_gain
 from apc.network.nominal import left_out
 from apc.result import Result
 from apc.threads import single_threaded
 from apc.tuning.bound import none_better
-from apc.tuning.demands import HINF, PLACE, Demands, Felt
+from apc.tuning.demands import CHANGING, HINF, PLACE, SUBJECT, Demands, Felt
 from apc.tuning.limits import BEYOND, RESPONSES, Limits, Scenario, felt_in
 from apc.tuning.optimum import BINDS, Optimum, Search
+from apc.unserved import UnservedError
 from apc.vary.crossing import Progress
-from apc.vary.growth import MEAN_SQUARE, PASSIVE
+from apc.vary.delay_box import changing
+from apc.vary.growth import MEAN_SQUARE, NOMINAL, PASSIVE
 
 Floats = NDArray[np.float64]
 
@@ -67,6 +70,10 @@ SLOWER = "stable is proved; how fast motions die out, or what is felt, is only l
 
 # What is said where every passive hand is to be borne in a box.
 ONE_BY_ONE = "no box is proved with every passive hand: it is so in the scenarios looked at"
+
+# What is reported where a delay that changes has no proof, and where there is a box as well.
+CHANGES = "with a delay that changes from packet to packet it is not proved stable"
+CHANGES_IN_BOX = "no box is proved with a delay that changes: it is so in the scenarios evaluated"
 
 # What is said where one point takes too long to look for the worst of a box.
 CORNERS = (
@@ -134,6 +141,9 @@ class Tuning(Result):
     whether any gains meet all demands in floats; `proved` whether all was proved of these. `worst` is the
     largest limit (see `limits`), as how much faster than allowed the fastest motion grows in a frame,
     ln |λ| less the `allowed`, below 0 if all are met. `decay` is a factor a second.
+    `delay` is the one of `over` that a link has, at every constant value; `changing` is what is proved of
+    the gains where it changes from packet to packet, by numbers of peers as in `proofs`, all else at its
+    present value, and `demanded` whether stability was asked for there.
     `scenes` are those of `binding`, or one if nothing binds. `looked` points were looked at.
     `bounded` is in how many cells it is proved that no gains of these ranges do better by `bound.SHARE`, None
     where it is not.
@@ -156,6 +166,9 @@ class Tuning(Result):
     criterion: str
     decay: float
     felt: tuple[Felt, ...]
+    delay: Range | None
+    changing: tuple[tuple[tuple[tuple[str, int], ...], ChangingDelay], ...]
+    demanded: bool
     frame_s: float
     allowed: float
     proofs: tuple[Proved, ...]
@@ -233,6 +246,11 @@ class _Work:
         )
         first = len(self.every) // len(self.limits.settings)
         self.scenarios = list(dict.fromkeys((self.every[0], self.every[-first])))
+        if self.demands.changing:
+            try:
+                self.limits.changing(0, np.array([[*self.present, *self.every[0].point]]))
+            except UnservedError as why:
+                raise ApcError(Mistake("E996", SUBJECT, f"{CHANGING} can't be decided: {why}")) from None
         if self.demands.aim.terms:
             self._with_level()
 
@@ -440,12 +458,40 @@ class _Work:
                 proof = replace(_unlooked(self.system.name, ranges), notes=(error.mistakes[0].what,))
             if proof.stable and (self._unproved or not self._felt(numbers, point)):
                 proof = replace(proof, verdict=UNDECIDED, stable=None, notes=(*proof.notes, SLOWER))
+            if proof.stable and self.demands.changing and not self._stable_if_changing(scene):
+                note = CHANGES_IN_BOX if self.demands.box else CHANGES
+                proof = replace(proof, verdict=UNDECIDED, stable=None, notes=(*proof.notes, note))
             proveds.append(Proved(named, proof))
             if proof.stable is False:
                 return proveds, self._failed(numbers, proof, ranges)
             if not (proof.stable or whole):
                 break
         return proveds, None
+
+    def _stable_if_changing(self, scene: CompiledSystem) -> bool:
+        """Return whether a scene is proved stable under a delay that changes, where nothing else varies."""
+        delay = self.demands.delay
+        return bool(
+            delay and not self.demands.box and loop_gain(scene, delay.free, delay.low, delay.high) < 1
+        )
+
+    def _changing(
+        self, gains: Sequence[Fraction], proofs: Sequence[Proved]
+    ) -> Iterator[tuple[tuple[tuple[str, int], ...], ChangingDelay]]:
+        """Yield what is proved under a delay that changes, with each number of peers that has a proof."""
+        demands = self.demands
+        if demands.delay is None or demands.criterion != NOMINAL:
+            return
+        pairs = zip(demands.free, gains, strict=False)
+        changes = [Override(interval.free, value) for interval, value in pairs]
+        for item in proofs:
+            found = item.proof.changing
+            if found is None and item.proof.stable is not False and not self.late:
+                values = zip(demands.counts, item.counts, strict=True)
+                counts = [Override(count.free, Fraction(number)) for count, (_, number) in values]
+                found = changing(apply(self.system, [*changes, *counts]), demands.delay)
+            if found is not None:
+                yield item.counts, found
 
     def _felt(self, numbers: tuple[Override, ...], point: Floats) -> bool:
         """Say whether it is proved that what is felt is as asked, where only numbers of peers vary."""
@@ -525,6 +571,9 @@ class _Work:
             criterion=demands.criterion,
             decay=demands.decay,
             felt=demands.felt,
+            delay=demands.delay,
+            changing=tuple(self._changing(gains, proofs)) if met else (),
+            demanded=demands.changing,
             frame_s=float(self.limits.prepared.schedules[0].frame_s),
             allowed=self.limits.allowed,
             proofs=tuple(proofs),
@@ -561,6 +610,7 @@ class _Work:
             or not optimum.multipliers.any()
             or self.limits.by_growth
             or demands.measured
+            or demands.changing
             or demands.aim.level
         ):
             return None

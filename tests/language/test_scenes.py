@@ -291,8 +291,8 @@ links: {lan: {clock: tick, delay: 2 ms, graph: star}}
 
 # ---- what a topology seldom means ----
 
-RANGE = "is a range: analyze and tune are for all of it, other answers for its middle; simulate and "
-RANGE += "export want one delay."
+RANGE = "is a range: analyze and tune are for every constant delay in it, and report delays that change "
+RANGE += "from packet to packet; other answers are for its middle; simulate and export want one delay."
 UNSHARED = (
     "follows the other peers' by coordination and is not shared: its mass counts once a peer. "
     "Write: shared: true, or shared: false where each is a mass of its own"

@@ -6,16 +6,20 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pytest
 
 import apc
+from apc.frame.names import Free
+from apc.moments.changing_delay import loop_gain
 from apc.present.tuning_output import panels_of
 from apc.tuning.demands import read_against, read_demands
 from apc.tuning.front import front
 from tests.commands import Cli, write
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced, told, wall
+from tests.varying.test_boxes import with_delays
 
 K, B, CONTACT, MASS = "coordination.stiffness", "coordination.damping", "contact.stiffness", "device.mass"
 RANGE = {K: (10.0, 7000.0)}
@@ -204,6 +208,37 @@ def test_what_the_study_asks_is_written_into_the_topology(cli: Cli) -> None:
     assert 0.99 * limit <= next(one.value for one in model.parameters if one.name == K) <= limit
 
 
+def test_a_range_of_a_delay_is_of_constant_delays_and_changing_ones_are_reported_or_demanded() -> None:
+    """A program of its own, packet by packet: 4 at 20 ms and 8 at 60 ms grow by 1.001684 a frame."""
+    model = compiled(
+        replaced(
+            AVERAGE,
+            ("count: 3", "count: 2"),
+            ("delay: 8 ms}", "delay: [20 ms, 60 ms]}"),
+            ("500 N/m, clock: haptic, delay: 1 ms", "200 N/m, damping: 1 N*s/m, clock: haptic"),
+        )
+    )
+    found = apc.tune(model, {K: "300 N/m:340 N/m"}, maximize=K)
+    text = " ".join(str(found).split())
+    assert found.proved and found.value == 319.2
+    assert "stable for lan.delay from 20 ms to 60 ms, at every constant delay; it is proved" in text
+    assert "unstable if by turns 4 packets take 20 ms and 8 60 ms" in text
+    by_turns = [0.02] * 4 + [0.06] * 8
+    assert with_delays(apc.set_parameters(model, {K: found.value}), by_turns) == pytest.approx(
+        1.001684, rel=1e-6
+    )
+    asked = apc.tune(model, {K: "100 N/m:340 N/m"}, maximize=K, subject=["delay=changing"])
+    ((_, proved),) = asked.changing
+    assert asked.proved and 180 < asked.value < 313.67 and proved.proved_to == 0.06
+    assert "packet; it is proved" in " ".join(str(asked).split())
+    luck, stable = np.random.default_rng(5), apc.set_parameters(model, {K: asked.value})
+    assert max(with_delays(stable, luck.uniform(0.02, 0.06, 6).tolist()) for _ in range(5)) < 1
+    assert with_delays(stable, by_turns) < 1
+    # A part in fifty higher nothing is proved.
+    more = apc.set_parameters(model, {K: 1.02 * asked.value})
+    assert loop_gain(more, Free("lan.delay"), Fraction("0.02"), Fraction("0.06")) > 1
+
+
 def test_what_cannot_be_asked_is_refused() -> None:
     def refused(free: dict[str, str], **given: object) -> str:
         return told(lambda: apc.tune(compiled(AVERAGE), free, **({"maximize": K} | given)))[0]  # type: ignore[arg-type]
@@ -215,3 +250,5 @@ def test_what_cannot_be_asked_is_refused() -> None:
     assert refused(good, over={"user.count": "9:2"}).endswith("Write: user.count=2:9")
     assert refused(good, maximize=MASS).endswith(f"Write: --maximize {K}")
     assert refused(good, subject=["decay=fast"]).startswith("--subject: E996")
+    message = refused(good, subject=["delay = changing"])
+    assert message.startswith("--subject: E996") and message.endswith('Write: --over "lan.delay=8 ms:20 ms"')
