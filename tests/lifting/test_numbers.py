@@ -121,9 +121,10 @@ couplers: {o: {type: Outer, a: device, b: cube, k: 1 N/m, clock: haptic}}
         ([], (2, 14), (1, 2)),
         (["o.k=3 N/m"], (6, 6), (1, 2)),
         (["two.o.k=3 N/m"], (2, 6), (1, 2)),
-        (["o.lag=5 ms"], (2, 14), (5, 2)),
+        (["o.lag=5 ms"], (2, 14), (5, 5)),
         (["two.o.lag=5 ms"], (2, 14), (1, 5)),
         (["o.lag=5 ms", "two.o.lag=3 ms"], (2, 14), (5, 3)),
+        (["two.o.lag=3 ms", "o.lag=5 ms"], (2, 14), (5, 3)),
         (["o.slack=1 ms"], (2, 14), (2, 3)),
     ],
 )

@@ -106,6 +106,41 @@ def test_the_commands_that_set_vary_or_play_a_delay_agree(
     assert np.interp(200, points[:, 1], points[:, 0]) == pytest.approx(LIMIT, rel=1e-3)
 
 
+def test_a_box_and_tuned_gains_are_those_of_the_delay_that_is_set(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("t.yaml").write_text(TWO, encoding="utf-8")
+    Path("both.yaml").write_text(written(TWO, "20 ms"), encoding="utf-8")
+    gain = "coordination.stiffness=10 N/m:400 N/m"
+    found = []
+    for words in (["t.yaml", "--set", f"{NAME}=20 ms"], ["both.yaml"]):
+        capsys.readouterr()
+        assert run(["tune", *words, "--free", gain, "--maximize", "coordination.stiffness", "--json"]) == 0
+        found.append(json.loads(capsys.readouterr().out)["value"])
+        for high, stable in ((0.99, True), (1.01, False)):
+            box = f"coordination.stiffness=100 N/m:{high * found[0]} N/m"
+            assert run(["analyze", *words, "--no-margins", "--box", box, "--json"]) == 0
+            assert json.loads(capsys.readouterr().out)["box"]["stable"] is stable
+    assert found[0] == found[1]
+
+
+def test_the_delay_of_a_pair_is_a_number_of_its_own_in_every_command(tmp_path: Path) -> None:
+    text = replaced(TWO, ("delay: 2 ms}", "delay: 2 ms, delays: {a: {b: 4 ms}}}"))
+    system = compiled(text)
+    there = compiled(replaced(text, ("delay: 2 ms, delays", "delay: 8 ms, delays")))
+    truth = apc.analyze(there).spectral_radius
+    assert apc.analyze(system, set={"lan.delay": "8 ms"}).spectral_radius == pytest.approx(truth, rel=1e-12)
+    for name, value in (("lan.delay", "8 ms"), ("lan.delays.a.b", "4 ms")):
+        path = tmp_path / f"{name}.csv"
+        apc.sweep(there, {name: [value, "40 ms"]}, out=path)
+        radius = float(path.read_text().splitlines()[1].split(",")[2])
+        assert radius == pytest.approx(truth, rel=1e-12), name
+    assert apc.critical(system, "lan.delays.a.b", set={"lan.delay": "8 ms"}).value == pytest.approx(
+        apc.critical(there, "lan.delays.a.b").value, rel=1e-9
+    )
+
+
 def test_what_a_name_without_a_group_replaces_can_not_be_varied_beside_it() -> None:
     with pytest.raises(ApcError, match="E902"):
         apc.region(compiled(TWO), x=f"{NAME}=1 ms:9 ms", y=f"b.{NAME}=1 ms:9 ms")
