@@ -156,9 +156,8 @@ def critical(
     ------
     ApcError
         E622 no such parameter, E623 the number of peers, E842 a range that is none, E843 a limit out of the
-        parameter's bounds, E844 a phase, or periods
-        that all make too long a frame, E845 a delay of a scene that isn't linear, E896 a number
-        of an unreliable link; and those of `units.quantity`.
+        parameter's bounds, E844 a phase, or periods that all make too long a frame, E845 a delay of a scene
+        that isn't linear, E896 a number of an unreliable link; and those of `units.quantity`.
     """
     free = find(system, name.strip(), _PLACE, counts=True)
     chosen_criterion = criterion_of(system, criterion, _PLACE, [free])
@@ -193,7 +192,7 @@ def critical(
                     return judge_at(changed, prepared, [], _PLACE, criterion=chosen_criterion)
                 return judged(changed, prepared)
 
-            result = search(PeriodLine(system, free, decide, *limits, _PLACE), progress=progress)
+            result = search(PeriodLine(system, free, decide, limits[0], limits[1], _PLACE), progress=progress)
         elif by_growth:
             refuse_time(system, free, _PLACE, chosen_criterion)
             result = search(_singly(system, free, ends, prepared, chosen_criterion), progress=progress)
