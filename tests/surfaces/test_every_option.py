@@ -1,4 +1,4 @@
-"""Every option of every command on every shipped topology ends in an answer or a diagnostic, never in a bug."""
+"""Every option of every command on every shipped topology ends in an answer or a diagnostic."""
 
 from __future__ import annotations
 
