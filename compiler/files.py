@@ -66,7 +66,7 @@ def _during(variable: ContextVar[T], value: T) -> Iterator[None]:
 def recorded(texts: dict[str, bytes]) -> AbstractContextManager[None]:
     """Put the bytes of every file that is read meanwhile into `texts`, by its path.
 
-    Of a folder, by its path and a slash, these are the files that were listed of it, a line each.
+    Of a folder, by its path and a slash, these are the names of the files in it (see `listing`).
     """
     return _during(_record, texts)
 
@@ -184,11 +184,11 @@ def files_below(folder: Path, suffix: str) -> tuple[Path, ...]:
     texts = _replay.get()
     names = listing(folder, suffix) if texts is None else _replayed(f"{folder}/", texts)
     _note(f"{folder}/", names)
-    return tuple(folder / name for name in os.fsdecode(names).split("\n") if name)
+    return tuple(folder / name for name in os.fsdecode(names).split("\0") if name)
 
 
 def listing(folder: Path, suffix: str) -> bytes:
-    """Return the names, from the folder, of the files that `files_below` gives, a line each."""
+    """Return the names, from the folder, of the files that `files_below` gives, NUL between two."""
     paths: list[Path] = []
     kernels, entries = _kernels_devices(), 0
     with _refusing():
@@ -202,7 +202,7 @@ def listing(folder: Path, suffix: str) -> bytes:
             if entries > MOST_ENTRIES:
                 raise RefusedError("large", f"holds more than {MOST_ENTRIES} files and folders")
             paths += [below / file for file in files if file.endswith(suffix)]
-    return os.fsencode("\n".join(map(str, sorted(paths))))
+    return os.fsencode("\0".join(map(str, sorted(paths))))
 
 
 def _raise(error: OSError) -> None:

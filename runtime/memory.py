@@ -94,8 +94,8 @@ def hold_to_memory() -> None:
 
 
 def lacking(command: str) -> Mistake:
-    """Return what to tell of a command that came to the end of the memory."""
-    what = f"takes more memory than there is, {size_text(free_memory())} when all was given back"
+    """Return the message of a command that ran out of memory."""
+    what = "ran out of memory"
     return Mistake(
         "E820", Place(command), what, hint="fewer peers that differ, fewer states, or a shorter time"
     )

@@ -50,8 +50,11 @@ def _at_home(module: str) -> Iterator[None]:
     except OSError:  # it was removed, with all that was in it
         yield
         return
+    backend = os.environ.pop("MPLBACKEND", None)  # of windows, which apc opens none of; an unknown one raises
     os.chdir(HOME)
     try:
         yield
     finally:
         os.chdir(before)
+        if backend is not None:
+            os.environ["MPLBACKEND"] = backend
