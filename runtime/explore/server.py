@@ -20,6 +20,7 @@ import traceback
 from asyncio import AbstractEventLoop
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from functools import partial
 from html import escape
 from pathlib import Path
 from tempfile import NamedTemporaryFile
@@ -177,6 +178,8 @@ def run(server: BaseServer, link: str, *, browser: bool) -> None:
     for name in ("tornado.access", "tornado.general", "bokeh.server.views.ws"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     logging.getLogger("bokeh.server.protocol_handler").addFilter(_shortened)
+    for handler in logging.getLogger().handlers or filter(None, [logging.lastResort]):
+        handler.addFilter(partial(_without_token, link.partition(f"{TOKEN}=")[2]))
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # even where Ctrl-C is ignored
     server.start()
     try:
@@ -202,6 +205,17 @@ def _opened(loop: IOLoop, link: str) -> Iterator[None]:
         file.flush()
         loop.add_callback(webbrowser.open, Path(file.name).as_uri())
         yield
+
+
+def _without_token(token: str, record: logging.LogRecord) -> bool:
+    """Log a failed request in one line, without the token; a fault of ours keeps its traceback."""
+    text = record.getMessage().partition("\n")[0]
+    _, error, reached = record.exc_info or (None, None, None)
+    ours = any(frame.f_globals["__name__"].startswith("apc.") for frame, _ in traceback.walk_tb(reached))
+    if error is not None and not ours:
+        text, record.exc_info, record.exc_text = f"a request failed: {error!r:.200}", None, None
+    record.msg, record.args = text.replace(token, "…"), ()
+    return True
 
 
 def _shortened(record: logging.LogRecord) -> bool:
