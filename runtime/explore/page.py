@@ -317,7 +317,11 @@ class Page:
         values = {
             slider.free: slider.texts[place] for slider, place in self._pairs() if place != slider.start
         }
-        text = with_values(self.scene.text, self.system, values)
+        try:
+            text = with_values(self.scene.text, self.system, values)
+        except ApcError as error:  # the number is in a table of peers
+            self.message.say("The topology can't be written:", *(item.sentence for item in error.mistakes))
+            return
         self.out.data = {"name": [f"{self.system.name}.yaml"], "text": [text]}
 
     def _ask_numbers(self) -> None:

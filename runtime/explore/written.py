@@ -119,10 +119,10 @@ def _check(
     meant, found = _numbers(result), _numbers(written)
     for name in dict.fromkeys((*meant, *found)):
         if meant.get(name) != found.get(name):
-            shown = [_shown(numbers.get(name)) for numbers in (meant, found)]
-            what = f"the topology written would have another {name}"
-            hint = "--set with the same values, and the unchanged topology"
-            raise ApcError(Mistake("E997", place, what, *shown, hint))
+            expected, got = (_shown(numbers.get(name)) for numbers in (meant, found))
+            what = f"{name} in the topology to be written"
+            hint = " ".join(f'--set "{free.label}={value}"' for free, value in values.items())
+            raise ApcError(Mistake("E997", place, what, expected, got, hint))
     return result
 
 
@@ -174,7 +174,7 @@ def _paths(root: _Node, system: CompiledSystem, free: Free) -> list[Sequence[str
     own = [
         _in_set(root, group.name, free.name)
         for group in system.groups
-        if free.name in {item.name for item in (*group.values, *group.columns)}
+        if free.name in {*(value.name for value in group.values), *(column.name for column in group.columns)}
     ]
     for section in PARTS:
         part = _at(root, (section, first))
@@ -258,12 +258,13 @@ def _tree(text: str) -> _Node:
             items: list[_Node] = []
             while not isinstance(last := next(events), yaml.CollectionEndEvent):
                 items.append(tree(last))
-            end = last.end_mark.index if event.flow_style else items[-1].end
+            flow = bool(event.flow_style)
+            end = int(last.end_mark.index) if flow and last.end_mark else items[-1].end
             if isinstance(event, yaml.SequenceStartEvent):
-                node = _List(start=start, end=end, flow=event.flow_style, items=tuple(items))
+                node = _List(start=start, end=end, flow=flow, items=tuple(items))
             else:
                 pairs = zip(items[::2], items[1::2], strict=True)
-                node = _Map(start=start, end=end, flow=event.flow_style, entries=tuple(pairs))
+                node = _Map(start=start, end=end, flow=flow, entries=tuple(pairs))
         if event.anchor is not None:
             anchors[event.anchor] = node
         return node

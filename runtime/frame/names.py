@@ -262,7 +262,7 @@ def _beside_a_time(system: CompiledSystem, free: Free) -> Iterator[str]:
 
 def notes_for_all_groups(system: CompiledSystem, frees: Iterable[Free]) -> list[str]:
     """Return what a name without a group replaces, or leaves as it is, where the groups differ."""
-    notes = []
+    notes: list[str] = []
     for free in frees:
         notes += _beside_a_time(system, free)
         pairs = values_by_group(system, free)
