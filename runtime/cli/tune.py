@@ -139,11 +139,18 @@ def tune_command(
         return
     with status_line() as progress:
         tuning = tune(system, demands, seconds=read_seconds(time), progress=progress)
+    refused: ApcError | None = None
     if write is not None and tuning.met:
-        _write(system, tuning, settings, write)
+        try:
+            _write(system, tuning, settings, write)
+        except ApcError as error:  # the gains are shown all the same
+            refused = error
     if plot is not None:
         write_picture(tuning.plot, plot)
-    print_result(tuning, as_json=as_json, written=[write if tuning.met else None, plot])
+    written = write if tuning.met and refused is None else None
+    print_result(tuning, as_json=as_json, written=[written, plot])
+    if refused is not None:
+        raise refused
 
 
 def _write(system: CompiledSystem, tuning: Tuning, settings: Sequence[str], path: Path) -> None:

@@ -243,3 +243,12 @@ def test_tune_writes_the_topology_that_it_proved(cli: Cli) -> None:
     rows = listed(apc.compile("o.yaml"))
     assert rows["user.cube.damping"] == (20.0, 20.0) and rows["user.device.damping"] == (5.0, 5.0)
     assert rows["lan.delay"] == (0.004, 0.004)
+
+
+def test_gains_that_can_not_be_written_are_shown_with_the_reason(cli: Cli) -> None:
+    write("users.csv", "device.mass [kg]\n0.1\n0.2\n")
+    write("t.yaml", HEAD + "peers: {user: {table: users.csv}}\n" + MASSES + COUPLERS + LINKS)
+    Path("else").mkdir()
+    ran = cli(f"tune t.yaml --free '{K}=10 N/m:100 N/m' --maximize {K} --write else/o.yaml")
+    assert ran.code == 1 and "100 N/m is the largest" in ran.out and "users.csv" in ran.err
+    assert not Path("else/o.yaml").exists()
