@@ -18,7 +18,7 @@ from itertools import product
 
 from apc.compiler.components.component import Component, Inner, Joined, Named, Number, Reference, Settable
 from apc.compiler.components.parts import GROUND, MOST_PARTS, PartEntry, Scope, read_entry
-from apc.compiler.errors import ApcError, Place
+from apc.compiler.errors import Mistakes, Place
 from apc.compiler.language.recordings import TimeTable, read_time_table
 from apc.compiler.language.values import PEERS, Binding, Value, renamed, settle
 from apc.compiler.language.vectors import entries, whole_and_index
@@ -132,7 +132,7 @@ class PartReader:
         self.parts.append(part)
         if len(self.parts) <= MOST_PARTS:
             for inner in part.component.inner:
-                self._add(_inside(part, inner, self.numbers.peers))
+                self._add(_inside(part, inner, self.numbers.peers, self.numbers.mistakes))
         elif len(self.parts) == MOST_PARTS + 1:
             what = f"a peer would have more than {MOST_PARTS} parts, those inside parts included"
             hint = "fewer or smaller arrays and components"
@@ -198,8 +198,11 @@ def _shared(entry: PartEntry) -> bool:
     return node.value
 
 
-def _inside(part: Part, inner: Inner, peers: int) -> Part:
-    """Return a part inside a part; its numbers are expressions over the outer one's, in whole names."""
+def _inside(part: Part, inner: Inner, peers: int, mistakes: Mistakes) -> Part:
+    """Return a part inside a part; its numbers are expressions over the outer one's, in whole names.
+
+    `mistakes` takes those of numbers without a value.
+    """
     entry, references = inner.entry, dict(part.references)
     tables = {table.name: table for table in part.tables}
     numbers: dict[tuple[str, ...], Fraction] = {(name,): value.number for name, value in part.values}
@@ -211,7 +214,7 @@ def _inside(part: Part, inner: Inner, peers: int) -> Part:
     def settled(bindings: Named[Binding]) -> Named[Value]:
         pairs = []
         for name, binding in bindings:
-            with suppress(ApcError, KeyError):  # what the outer part has no value for was reported there
+            with mistakes, suppress(KeyError):  # what the outer part has no value for was reported there
                 value = settle(binding, numbers.__getitem__)
                 tree = value.expression and renamed(value.expression, whole)
                 pairs.append((name, replace(value, place=part.place, expression=tree)))
