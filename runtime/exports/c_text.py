@@ -23,7 +23,7 @@ import numpy as np
 from apc.compiler.plain import straight
 from apc.compiler.weights import sum_weights
 from apc.distribution import program_version
-from apc.exports.identifiers import identifier, unique
+from apc.exports.identifiers import prefixed
 from apc.exports.peer_step import Line, Move, Peer, has_edge
 from apc.exports.texts import filled, number
 from apc.simulation.machine import straight_lines
@@ -113,7 +113,7 @@ def source(peer: Peer, include: str) -> str:
         constants=[
             item
             for item in zip(names, kind.parameters, peer.parameters.tolist(), strict=True)
-            if item[0].startswith("P_")
+            if item[0].startswith("PARAMETER_")
         ],
         units=parameter_units(peer),
         kinds=kinds,
@@ -144,7 +144,7 @@ def _sum(terms: Iterable[tuple[float, str]]) -> str:
 
 
 def _parameters(peer: Peer) -> list[str]:
-    names = [f"P_{own}" for own in unique(map(identifier, peer.kind.parameters))]
+    names = [*prefixed("PARAMETER", peer.kind.parameters)]
     for k, place in enumerate(peer.settable):
         names[place] = f"peer->p[{k}]"
     return names
@@ -245,7 +245,7 @@ def driver(peer: Peer, include: str) -> str:
             read += [("%d", f"{begin}.missing", f"{label} missing")] if line.missing else []
     shown = [("%.17g", f"out.{own}", force.name) for own, force in peer.forces.items()]
     for line in peer.sending:
-        shown.append(("%d", f"out.{line.name}_sent", f"{line.link} sent"))
+        shown.append(("%d", f"out.sent_{line.name}", f"{line.link} sent"))
         own = f"out.{line.name}"
         shown += [("%.17g", f"{own}.{entry.member}", f"{line.link} {entry.name}") for entry in line.packet]
     shown += [

@@ -1,8 +1,8 @@
 """Names out of a scene as other tools want them.
 
-Takes: names such as `left[2].cube.x`. Gives: `Port`, `words`; `identifier`; `unique`.
-Guarantees: an identifier is made of letters, digits and `_`, begins with a letter, and is none of C's words;
-of several no two are equal.
+Takes: names such as `left[2].cube.x`. Gives: `Port`, `words`; `identifier`; `prefixed`; `unique`.
+Guarantees: an identifier is made of letters, digits and `_`, begins with a letter, and is no reserved word of C;
+of several no two are equal. A prefixed identifier is no word or macro of C or C++ either.
 Does not: say which tool wants that.
 """
 
@@ -12,11 +12,11 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-# Words of C, and names of its library and of the texts, that nothing else may be called.
+# Keywords of C, and names of its library that an identifier without a prefix could have.
 _TEXT = """
 auto break case char const continue default do double else enum extern float for goto if inline int long
 register restrict return short signed sizeof static struct switch typedef union unsigned void volatile while
-main quanta instant missing y0 y1 yn j0 j1 jn gamma
+main y0 y1 yn j0 j1 jn gamma M_SQRT1_2
 """
 RESERVED = frozenset(_TEXT.split())
 
@@ -40,14 +40,25 @@ def identifier(name: str) -> str:
     return f"n{text}" if text[0].isdigit() else f"{text}_" if text in RESERVED else text
 
 
+def prefixed(prefix: str, names: Iterable[str]) -> tuple[str, ...]:
+    """Return an identifier for each of some names, such as `link_lan`, of which no two are equal.
+
+    No keyword, macro or identifier that a template writes itself begins with such a prefix and `_`.
+    """
+    return unique(
+        f"{prefix}_{word}" for word in (re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_") for name in names)
+    )
+
+
 def unique(names: Iterable[str], taken: Iterable[str] = ()) -> tuple[str, ...]:
     """Return names of which none is equal to another or taken: a repeated one gets a number behind."""
-    used, texts = set(taken), []
+    used, texts, counts = set(taken), list[str](), dict[str, int]()
     for base in names:
-        name, count = base, 1
+        name, count = base, counts.get(base, 1)
         while name in used:
             count += 1
             name = f"{base}_{count}"
+        counts[base] = count
         used.add(name)
         texts.append(name)
     return tuple(texts)

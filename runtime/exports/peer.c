@@ -24,7 +24,7 @@ static double ${name}_now(const ${name} *peer) {
 % for line in peer.sending
 % set send = peer.kind.sends[line.sending]
 % set lines, values = computed(send.send)
-static void ${name}_${line.name}_own(const ${name} *peer, const ${name}_in *in, ${name}_${line.name} *packet) {
+static void ${name}_own_${line.name}(const ${name} *peer, const ${name}_in *in, ${name}_${line.name} *packet) {
   const double t = ${name}_now(peer);
   (void)in;
   (void)t;
@@ -49,7 +49,7 @@ static void ${name}_tick_${p}(${name} *peer, const ${name}_in *in, double t) {
   (void)t;
 % for line in own_of
   ${name}_${line.name} own_${line.name};
-  ${name}_${line.name}_own(peer, in, &own_${line.name});
+  ${name}_own_${line.name}(peer, in, &own_${line.name});
 % endfor
 % for one in receives
 % set r = "r" ~ loop.index0
@@ -139,14 +139,14 @@ void ${name}_send(const ${name} *peer, const ${name}_in *in, ${name}_out *out) {
   (void)in;
   (void)out;
 % for line in peer.sending
-  out->${line.name}_sent = 0;
+  out->sent_${line.name} = 0;
 % endfor
   switch (${name}_kind(peer)) {
 % for one in kinds
   case ${loop.index0}:
 % for partition in one.sends
-    ${name}_${over[partition]}_own(peer, in, &out->${over[partition]});
-    out->${over[partition]}_sent = 1;
+    ${name}_own_${over[partition]}(peer, in, &out->${over[partition]});
+    out->sent_${over[partition]} = 1;
 % endfor
     break;
 % endfor

@@ -1,6 +1,10 @@
 % include "title.c"
-#ifndef ${name | upper}_H
-#define ${name | upper}_H
+#ifndef APC_${name}_H
+#define APC_${name}_H
+
+#ifdef __cplusplus
+extern "C" {
+#endif
 
 % for line in peer.lines
 /* A packet of ${line.link | comment}. */
@@ -36,7 +40,7 @@ double ${own} | the force on ${force.name.rpartition(".")[0]} [N]
 % endfor
 % for line in peer.sending
 ${name}_${line.name} ${line.name} | what it sends
-int ${line.name}_sent | whether it does now
+int sent_${line.name} | whether it does now
 % endfor
 % endfilter
 } ${name}_out;
@@ -66,7 +70,7 @@ double ${name}_time(const ${name} *peer);
 /* The time of the instant after that, in quanta. */
 long long ${name}_next(const ${name} *peer);
 
-/* What is sent at this instant: where a member "..._sent" is 1, a packet goes out. */
+/* What is sent at this instant: where a member "sent_..." is 1, a packet goes out. */
 void ${name}_send(const ${name} *peer, const ${name}_in *in, ${name}_out *out);
 
 /* Compute what is due at this instant, of what is measured and heard now. */
@@ -77,5 +81,9 @@ void ${name}_move(${name} *peer);
 
 /* All of one instant: send, force, move. Call it at ${name}_time. */
 void ${name}_tick(${name} *peer, const ${name}_in *in, ${name}_out *out);
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif

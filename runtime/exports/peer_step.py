@@ -30,7 +30,7 @@ from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.interpolation import jacobian
 from apc.compiler.language.vectors import whole_and_index
-from apc.exports.identifiers import identifier, unique
+from apc.exports.identifiers import identifier, prefixed
 from apc.frame import schedule as frames
 from apc.frame.devices import Device, coupled_directly, find_device, find_devices
 from apc.frame.discretize import moved_together
@@ -219,13 +219,10 @@ def peer_of(
     outside = _outside(system, label, site, vector, device)
     instants, lengths = _instants(schedule)
     lines, channels = lines_of(plan, number)
-    names = [line.name for line in lines]
     looked_at = sorted(outside & _read(kind))
-    measured = unique((identifier(kind.states[row].name) for row in looked_at), names)
+    measured = prefixed("measured", (kind.states[row].name for row in looked_at))
     forces = _forces(system, label, site, vector, outside)
-    pushed = unique(
-        (identifier(force.name) for force in forces), [*names, *(f"{line}_sent" for line in names)]
-    )
+    pushed = prefixed("force", (force.name for force in forces))
     x, _, memories = start_values(site, [float(item) for item in vector])
     return Peer(
         system=system,
@@ -495,9 +492,7 @@ def lines_of(plan: Plan, number: int) -> tuple[tuple[Line, ...], dict[tuple[int,
     }
     lines: list[Line] = []
     places: dict[tuple[int, int], tuple[int, ...]] = {}
-    for name, (link, declared) in zip(
-        unique(map(identifier, exchange.links)), exchange.links.items(), strict=True
-    ):
+    for name, (link, declared) in zip(prefixed("link", exchange.links), exchange.links.items(), strict=True):
         sent = {sent.channel for sent in schedule.sent if sent.link == link}
         of = {key: site.pattern.ticks[key[0]].channels[key[1]] for key, text in read.items() if text == link}
         hears = {channel for channels in of.values() for channel in channels}
@@ -512,7 +507,7 @@ def lines_of(plan: Plan, number: int) -> tuple[tuple[Line, ...], dict[tuple[int,
         used = [i for i, channel in enumerate(send_partition.channels) if i in hears or channel in sent]
         places |= {key: tuple(map(used.index, channels)) for key, channels in of.items()}
         channels = tuple(send_partition.channels[i] for i in used)
-        members = unique(map(identifier, channels))
+        members = prefixed("value", channels)
         senders = [*heard_of(plan.system, plan.exchange, link, number)] if hears else []
         if len(senders) > MOST_HEARD:
             what = f"{exchange.peer_name(number)} hears {len(senders):,} peers over {link}"

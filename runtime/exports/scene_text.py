@@ -22,7 +22,7 @@ from fractions import Fraction
 from typing import Any
 
 from apc.exports.c_text import memory, parameter_units
-from apc.exports.identifiers import identifier, unique
+from apc.exports.identifiers import identifier, prefixed
 from apc.exports.peer_step import (
     MOST_HEARD,
     Peer,
@@ -159,7 +159,8 @@ def c_scene(plan: Plan, method: Method) -> CScene:
         raise refused(system, what, alone)
     first = sites_of(plan)
     sites = [*dict.fromkeys(first)]
-    names = unique(identifier(exchange.peer_name(site)) for site in sites)
+    # The place of a site keeps `a[1]` and `A[1]` distinct, and `a_1_link_b` of a link from that of a peer.
+    names = [f"site{k}_{identifier(exchange.peer_name(site))}" for k, site in enumerate(sites)]
     codes = tuple(peer_of(plan, site, method, name=name) for site, name in zip(sites, names, strict=True))
     placed: Counter[int] = Counter()
     peers = []
@@ -188,7 +189,7 @@ def _links(plan: Plan, quantum: Fraction) -> tuple[Link, ...]:
             ways.setdefault(line.link, []).extend((sender.peer, peer) for sender in line.senders)
     clocks = {clock.name: clock for clock in plan.system.clocks}
     links = []
-    for name, (link, channels) in zip(unique(map(identifier, used)), used.items(), strict=True):
+    for name, (link, channels) in zip(prefixed("link", used), used.items(), strict=True):
         clock = clocks[exchange.links[link].clock]
         period, phase = (int(timings[text] / quantum) for text in (clock.period, clock.phase))
         delays = [

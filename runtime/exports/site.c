@@ -30,7 +30,7 @@ static void send_${s}(model *m, long long at) {
     if (m->stage${s}[i] == 0 && m->peer${s}[i].quanta == at) {
       ${code.identifier}_send(&m->peer${s}[i], &m->in${s}[i], &m->out${s}[i]);
 % for link, line, members in links if line.sending >= 0
-      if (m->out${s}[i].${line.name}_sent) {
+      if (m->out${s}[i].sent_${line.name}) {
         double *to = m->${link.name}[newest_${link.name}(at) % ${link.ring}][numbers[i]];
 % for k, own in members
         to[${k}] = m->out${s}[i].${line.name}.${own};
