@@ -8,9 +8,9 @@ Does not: compute.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -19,8 +19,10 @@ from apc.cli.progress import at_work
 from apc.compiler.errors import ApcError, Mistake, Place
 
 if TYPE_CHECKING:
-    from apc.present.report_output import KeptScene
+    from apc.present.report_output import KeptScene, Page
     from apc.reports.contents import Report
+
+MOST_LINES = 20  # of a page, that are reported one by one
 
 
 @command
@@ -71,35 +73,73 @@ def _check(path: Path) -> None:
     """Compute a report anew. Raises ApcError (E991) with everything that differs."""
     import tempfile  # most commands need none
 
-    from apc.present.report_output import kept_report, scene_again
+    from apc.present.report_output import damaged, read_page, scene_again
     from apc.reports.contents import report
 
-    kept = kept_report(path)
-    mistakes, notes = [], []
-    for item in kept["scenes"]:
-        with tempfile.TemporaryDirectory(prefix="apc-report-") as folder, at_work("reporting"):
-            again = report([scene_again(item, Path(folder))], item["settings"])
-        place = Place(f"{path}: {item['name']}")
-        mistakes += [Mistake("E991", place, what) for what in _differs(item, again)]
-        made = dict(again.scenes[0].origin)
+    read = read_page(path)
+    mistakes, notes = list[Mistake](), list[str]()
+    with tempfile.TemporaryDirectory(prefix="apc-report-") as folder, at_work("reporting"):
+        topologies = []
+        for k, item in enumerate(read.kept["scenes"]):
+            topologies.append(scene_again(item, Path(folder, str(k))))
+        again = report(topologies, read.kept["scenes"][0]["settings"])
+        lines = [*_lines_that_differ(path, read, again)]
+    for item, now, scene in zip(read.kept["scenes"], again.to_dict()["scenes"], again.scenes, strict=True):
+        place = Place(f"{path}: {item['name'][:80]}")
+        try:
+            mistakes += [Mistake("E991", place, what) for what in _differs(item, now)]
+        except (OverflowError, RecursionError):
+            raise damaged(path) from None
+        made, texts = dict(scene.origin), dict(item["texts"])
         changed = [name for name, digest in item["origin"] if made.get(name) != digest]
-        notes += [f"{name} is another one than the report was made with" for name in changed]
-        was = dict(kept["versions"])
-        other = [(name, now) for name, now in again.versions if was.get(name) != now]
-        notes += [f"{name} was {was.get(name, 'not there')}, and is {now} here" for name, now in other]
+        mistakes += [
+            Mistake("E991", place, f"the SHA-256 of {name[:80]} is not that of its text")
+            for name in changed
+            if name in texts
+        ]
+        notes += [
+            f"{name} is another one than the report was made with" for name in changed if name not in texts
+        ]
+    was = read.kept["versions"]
+    other = [(name, now) for name, now in again.versions if was.get(name) != now]
+    notes += [f"{name} was {was.get(name, 'not there')}, and is {now} here" for name, now in other]
     for text in dict.fromkeys(notes):
         tell(f"note: {text}", err=True)
-    if mistakes:
-        raise ApcError(mistakes)
+    if lines or mistakes:
+        raise ApcError([*lines, *mistakes])
     tell(f"{path}: every number is the same, computed anew")
 
 
-def _differs(kept_scene: KeptScene, again: Report) -> Iterator[str]:
+def _lines_that_differ(path: Path, read: Page, again: Report) -> Iterator[Mistake]:
+    """Yield what the page shows that it would not show if rendered from the report computed anew.
+
+    Versions and digests are shown as the page holds them; where they differ here, a note says so.
+    """
+    from dataclasses import replace
+
+    from apc.present.report_output import report_page, split_page
+    from apc.reports.shown_lines import line_differences
+
+    origins = [tuple((name, digest) for name, digest in item["origin"]) for item in read.kept["scenes"]]
+    scenes = tuple(replace(scene, origin=own) for scene, own in zip(again.scenes, origins, strict=True))
+    versions = tuple(read.kept["versions"].items())
+    expected, json = split_page(report_page(replace(again, scenes=scenes, versions=versions)))
+    differences = [*line_differences(read.shown, expected, exact=json == read.json)]
+    for each in differences[:MOST_LINES]:
+        what = f"shows {each.shown!r}, but computed anew it is {each.expected!r}"
+        yield Mistake("E991", Place(str(path), each.line, 1), what)
+    if len(differences) > MOST_LINES:
+        yield Mistake("E991", Place(str(path)), f"{len(differences) - MOST_LINES:,} more lines differ")
+
+
+def _differs(kept_scene: KeptScene, now: Mapping[str, Any]) -> Iterator[str]:
     """Yield what differs between the sections of a scene that a report keeps and those made anew."""
     from apc.present.report_output import TITLES
     from apc.reports.contents import differences
 
-    [now] = again.to_dict()["scenes"]
+    for key in ("name", "about"):
+        if kept_scene[key] != now[key]:
+            yield f"{key} is {now[key]}, not {kept_scene[key]}"
     before = {item["key"]: item for item in kept_scene["sections"]}
     for section in now["sections"]:
         title, old = TITLES[section["key"]], before.get(section["key"])

@@ -1,8 +1,8 @@
 """Names out of a scene as other tools want them.
 
 Takes: names such as `left[2].cube.x`. Gives: `Port`, `words`; `identifier`; `prefixed`; `unique`.
-Guarantees: an identifier is made of letters, digits and `_`, begins with a letter, and is no reserved word of C;
-of several no two are equal. A prefixed identifier is no word or macro of C or C++ either.
+Guarantees: an identifier is made of letters, digits and `_`, begins with a letter, and is no reserved word of
+C; of several no two are equal. A prefixed identifier is no word or macro of C or C++ either.
 Does not: say which tool wants that.
 """
 

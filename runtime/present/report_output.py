@@ -1,7 +1,7 @@
 """A report as one page of HTML, as a PDF, as text and as data; and read again from its page.
 
 Takes: a `Report`. Gives: `report_text`, `report_document`, `report_page`; `check_report_path`, `save_report`;
-`kept_report`, `scene_again`.
+`Page`, `read_page`, `split_page`, `kept_report`, `scene_again`.
 Guarantees: the page holds everything in itself and forbids its reader to load anything; what a scene says is
 text in it and never markup; its numbers stand in it as JSON too. A report read again is data: what it names
 is written nowhere but in a folder of its own.
@@ -13,12 +13,11 @@ A PDF is printed by Chromium, where there is one.
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import subprocess
 import tempfile
 from pathlib import Path, PurePosixPath
-from typing import Any, TypedDict
+from typing import Any, NamedTuple, TypedDict
 
 import msgspec
 
@@ -47,7 +46,7 @@ TITLES = {
 }
 # What differs from run to run, from machine to machine, or with which of equal motions is named first.
 UNLIKE = {"provenance", "origin", "points", "handles", "participation"}
-_KEPT = re.compile(r'<script type="application/json" id="apc-report">(.*?)</script>', re.DOTALL)
+EMBEDDED = '<script type="application/json" id="apc-report">', "</script>"
 
 
 def report_text(report: Report) -> Lines:
@@ -179,23 +178,52 @@ class KeptReport(TypedDict):
     scenes: list[KeptScene]
 
 
-def kept_report(path: Path) -> KeptReport:
-    """Return what a report's page keeps of itself.
+class Page(NamedTuple):
+    """A page that was read: the HTML without its embedded data, these as JSON, and decoded."""
+
+    shown: str
+    json: str
+    kept: KeptReport
+
+
+def split_page(text: str) -> tuple[str, str]:
+    """Return the HTML of a page without its embedded data, and these as JSON."""
+    begin, end = EMBEDDED
+    before, _, rest = text.partition(begin)
+    kept, _, after = rest.partition(end)
+    return f"{before}{begin}{end}{after}", kept
+
+
+def read_page(path: Path) -> Page:
+    """Return a report's page and the data that it holds.
 
     Raises
     ------
     ApcError
-        E990 it is no page that `apc report` wrote, or is damaged.
+        E990 `apc report` did not write it, or it is damaged, or it has no topology.
     """
     try:
-        search = _KEPT.search(read_file(path, LARGEST).decode("utf-8"))
-        return msgspec.json.decode(search[1] if search else "", type=KeptReport)
+        shown, text = split_page(read_file(path, LARGEST).decode("utf-8-sig"))
+        kept = msgspec.json.decode(text, type=KeptReport)
     except RefusedError as refused:
         raise ApcError(Mistake("E990", Place(str(path)), refused.words)) from None
     except (ValueError, RecursionError):
-        what = "is no report that apc has written, or is damaged"
-        hint = "apc report scene.yaml --out report.html"
-        raise ApcError(Mistake("E990", Place(str(path)), what, hint=hint)) from None
+        raise damaged(path) from None
+    if not kept["scenes"]:
+        raise damaged(path, "holds no topology: nothing in it can be computed anew")
+    if any(item["settings"] != kept["scenes"][0]["settings"] for item in kept["scenes"]):
+        raise damaged(path, "holds topologies with different settings, which no report has")
+    return Page(shown, text, kept)
+
+
+def kept_report(path: Path) -> KeptReport:
+    """Return the data that a report's page holds. Raises ApcError as `read_page`."""
+    return read_page(path).kept
+
+
+def damaged(path: Path, what: str = "is no report that apc has written, or is damaged") -> ApcError:
+    """Return the message E990 of a page."""
+    return ApcError(Mistake("E990", Place(str(path)), what, hint="apc report scene.yaml --out report.html"))
 
 
 def scene_again(kept_scene: KeptScene, folder: Path) -> Path:
@@ -204,7 +232,7 @@ def scene_again(kept_scene: KeptScene, folder: Path) -> Path:
     Raises
     ------
     ApcError
-        E990 a name among them leads out of the folder.
+        E990 a name among them leads out of the folder or can't be a file's, or none is the topology's.
     """
     for name, text in kept_scene["texts"]:
         parts = PurePosixPath(name).parts
@@ -212,6 +240,13 @@ def scene_again(kept_scene: KeptScene, folder: Path) -> Path:
             what = f"names a file outside of the scene's folder: {name[:80]}"
             raise ApcError(Mistake("E990", Place(kept_scene["name"][:80]), what))
         path = folder.joinpath(*parts)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-    return folder / PurePosixPath(kept_scene["file"]).name
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+        except (OSError, ValueError):
+            what = f"names a file that can't be written: {name[:80]!r}"
+            raise ApcError(Mistake("E990", Place(kept_scene["name"][:80]), what)) from None
+    file = PurePosixPath(kept_scene["file"]).name
+    if file not in dict(kept_scene["texts"]):
+        raise ApcError(Mistake("E990", Place(kept_scene["name"][:80]), f"holds no text of {file[:80]!r}"))
+    return folder / file

@@ -23,19 +23,24 @@ from tests.hand_over.in_c import compiler
 from tests.topologies import compiled
 
 C_WORDS = """
-auto break case char const continue default do double else enum extern float for goto if inline int long register
-restrict return short signed sizeof static struct switch typedef union unsigned void volatile while asm typeof
+auto break case char const continue default do double else enum extern float for goto if inline int
+long register restrict return short signed sizeof static struct switch typedef union unsigned void
+volatile while asm typeof
 """
 CPP_WORDS = """
-alignas alignof and and_eq bitand bitor bool catch char16_t char32_t class compl const_cast constexpr decltype delete
-dynamic_cast explicit export false friend mutable namespace new noexcept not not_eq nullptr operator or or_eq private
-protected public reinterpret_cast static_assert static_cast template this thread_local throw true try typeid typename
-using virtual wchar_t xor xor_eq override final import module
+alignas alignof and and_eq bitand bitor bool catch char16_t char32_t class compl const_cast
+constexpr decltype delete dynamic_cast explicit export false friend mutable namespace new noexcept
+not not_eq nullptr operator or or_eq private protected public reinterpret_cast static_assert
+static_cast template this thread_local throw true try typeid typename using virtual wchar_t xor
+xor_eq override final import module
 """
-MACROS = "NAN INFINITY M_PI M_E HUGE_VAL MATH_ERRNO FP_NAN FP_ZERO isnan linux unix NULL EOF stdin y0 y1 yn j0 gamma"
+MACROS = """
+NAN INFINITY M_PI M_E HUGE_VAL MATH_ERRNO FP_NAN FP_ZERO isnan linux unix NULL EOF stdin y0 y1 yn j0
+gamma
+"""
 OWN = """
-in out start unheard time tick next send force move p p_sent x y u t k late quanta instant missing none model peer
-begin run real flag given own link value state packet
+in out start unheard time tick next send force move p p_sent x y u t k late quanta instant missing
+none model peer begin run real flag given own link value state packet
 """
 LANGUAGE = {"else", "if", "and", "not", "or", "time"}  # no names of a topology
 NAMES = [

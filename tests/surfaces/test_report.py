@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import functools
 import html
 import json
@@ -19,6 +20,7 @@ from apc.explore.motion import motion_of
 from apc.present import report_output as pages
 from apc.present.report_output import kept_report, report_page
 from apc.reports.contents import Report, differences
+from apc.reports.shown_lines import line_differences
 from tests.commands import Cli, folder, write
 from tests.topologies import AVERAGE, SCENES, replaced
 
@@ -195,12 +197,99 @@ def test_differences_are_by_more_than_roundings_and_their_own_errors(
     assert [*differences(old, new)] == told
 
 
+def in_figure(page: str, old: str, new: str) -> str:
+    """Return a page in whose figures a text is another one."""
+
+    def changed(found: re.Match[str]) -> str:
+        drawn = base64.b64decode(found[1]).decode("utf-8").replace(old, new)
+        return f"base64,{base64.b64encode(drawn.encode('utf-8')).decode('ascii')}"
+
+    return re.sub(r"base64,([^\"]+)", changed, page)
+
+
+@pytest.mark.whole
+def test_what_a_page_shows_is_what_is_checked(cli: Cli) -> None:
+    write("scene.yaml", LONE)
+    assert cli("report scene.yaml --out r.html").code == 0
+    text = Path("r.html").read_text(encoding="utf-8")
+    [radius] = re.findall(r"(spectral radius +[0-9.]+)", text)[:1]
+    kept = text[text.index(SCRIPT) :]
+    changes = {
+        "a digit": text.replace(radius, f"{radius[:-1]}{(int(radius[-1]) + 1) % 10}"),
+        "a verdict": text.replace("lone: ", "lone: proved "),
+        "a mass": text.replace("<pre>" + LONE, "<pre>" + LONE.replace("1 kg", "2 kg")),
+        "a figure": in_figure(text, "</text>", "0</text>"),
+        "a curve": in_figure(text, "L 1", "L 2"),
+        "what no figure is": re.sub("base64,....", "base64,?", text),
+        "a command": text.replace("apc analyze", "apc analyse"),
+        "a style": text.replace("</style>", "pre { display: none; }\n</style>"),
+        "an inserted line": text.replace("<header>", "<p>gain margin 9</p>\n<header>"),
+        "a removed section": re.sub(r'<section id="verdict">.*?</section>\n', "", text, flags=re.DOTALL),
+        "the end": text.replace("</body>", "").replace("</html>", ""),
+        "a second one": text.replace("</body>", kept.partition("</script>")[0] + "</script></body>"),
+        "a version": text.replace(f"apc              {apc.__version__}", "apc              9.9.9"),
+    }
+    for what, page in changes.items():
+        assert page != text, what
+        write("r.html", page)
+        ran = cli("report --check r.html")
+        assert ran.code == 1, what
+        assert re.search(r"^r\.html:\d+:1: E991 shows ", ran.err, re.MULTILINE), (what, ran.err)
+        assert "every number" not in ran.out
+    write("r.html", text)
+    assert cli("report --check r.html").code == 0
+
+
+@pytest.mark.parametrize(
+    ("shown", "expected", "same"),
+    [
+        ("radius 0.957171 ± 7e-16 per frame", "radius 0.957172 ± 3e-16 per frame", True),
+        ("radius 0.95717138962509 ±", "radius 0.95717138962511 ±", True),
+        ("radius 0.957171", "radius 0.957181", False),
+        ("margin 1.6", "margin 1.7", False),
+        ("margin 3", "margin 4", False),
+        ("1,000,000 peers", "1,000,001 peers", True),
+        ("± 7e-16", "± 7e-14", False),
+        ("stable", "unstable", False),
+        ("-1", "1", False),
+        ("a 1 b", "a 1 b 2", False),
+        ("1e999", "1e998", False),
+        ("a\nb", "a", False),
+        ("", "a", False),
+    ],
+)
+def test_lines_differ_by_more_than_roundings(shown: str, expected: str, same: bool) -> None:
+    assert (not [*line_differences(shown, expected, exact=False)]) == same
+    assert [*line_differences(shown, expected, exact=True)]
+
+
+def test_a_line_that_differs_is_named_once_and_by_its_number() -> None:
+    [found] = line_differences("a\nb\nX\nd", "a\nb\nc\nd", exact=True)
+    assert (found.line, found.shown, found.expected) == (3, "X", "c")
+    [found] = line_differences("a\nb\nX\nc\nd", "a\nb\nc\nd", exact=True)
+    assert (found.line, found.shown, found.expected) == (3, "X", "nothing")
+    [found] = line_differences("a\nb\nd", "a\nb\nc\nd", exact=True)
+    assert (found.line, found.shown, found.expected) == (3, "nothing", "c")
+
+
 SCRIPT = '<script type="application/json" id="apc-report">'
 
 
 @pytest.mark.parametrize(
     "kept",
-    ["", "<html></html>", f"{SCRIPT}[]</script>", f'{SCRIPT}{{"scenes": [{{"name": 3}}]}}</script>', None],
+    [
+        "",
+        "<html></html>",
+        "<html><script type='application/json'>{}</script></html>",
+        SCRIPT,
+        f"{SCRIPT}</script>",
+        f"{SCRIPT}{{</script>",
+        f"{SCRIPT}[]</script>",
+        f"{SCRIPT}{'[' * 100_000}</script>",
+        SCRIPT * 10_000,
+        f'{SCRIPT}{{"scenes": [{{"name": 3}}]}}</script>',
+        None,
+    ],
 )
 def test_what_is_no_report_is_refused(kept: str | None, cli: Cli) -> None:
     if kept is not None:
@@ -251,3 +340,72 @@ def test_a_pdf_is_printed(tmp_path: Path) -> None:
     pages.save_report(apc.report([tmp_path / "scene.yaml"]), tmp_path / "r.pdf")
     assert (tmp_path / "r.pdf").read_bytes().startswith(b"%PDF")
     assert sorted(one.name for one in tmp_path.iterdir()) == ["r.pdf", "scene.yaml"]
+
+
+def made_up(**fields: object) -> str:
+    """Return a page of one topology with some other fields."""
+    scene = {"name": "n", "about": "", "file": "s.yaml", "settings": [], "texts": [["s.yaml", LONE]]}
+    scene |= {"origin": [], "sections": []} | fields
+    return f"{SCRIPT}{json.dumps({'versions': {}, 'scenes': [scene]})}</script>"
+
+
+HUGE = [{"key": "verdict", "refused": "", "results": [{"spectral_radius": 10**400}]}]
+
+
+@pytest.mark.parametrize(
+    ("page", "told"),
+    [
+        (f'{SCRIPT}{{"versions": {{}}, "scenes": []}}</script>', "holds no topology"),
+        (made_up(file=""), "holds no text of ''"),
+        (made_up(file="other.yaml"), "holds no text of 'other.yaml'"),
+        (
+            made_up(texts=[["s.yaml", LONE], ["a", ""], ["a/b", ""]]),
+            "names a file that can't be written: 'a/b'",
+        ),
+        (made_up(texts=[["s.yaml", LONE], ["a" * 300, ""]]), "names a file that can't be written: 'aaa"),
+        (made_up(texts=[["s.yaml", LONE], ["a\0b", ""]]), "names a file that can't be written"),
+        (made_up(sections=HUGE), "is no report that apc has written, or is damaged"),
+    ],
+)
+def test_what_another_program_put_into_a_page_is_refused(page: str, told: str, cli: Cli) -> None:
+    write("r.html", page)
+    ran = cli("report --check r.html")
+    assert ran.code == 1 and f"E990 {told}" in ran.err
+    assert folder() == ["r.html"]
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-32", "latin-1"])
+def test_a_page_in_another_encoding_is_refused(encoding: str, cli: Cli) -> None:
+    Path("r.html").write_bytes(f"é{made_up()}".encode(encoding))
+    ran = cli("report --check r.html")
+    assert ran.code == 1 and "E990" in ran.err
+
+
+def test_a_folder_is_no_report(cli: Cli) -> None:
+    Path("r.html").mkdir()
+    ran = cli("report --check r.html")
+    assert ran.code == 1 and "E990 is a folder" in ran.err
+
+
+@pytest.mark.whole
+def test_a_digest_that_is_not_that_of_its_text_is_found(cli: Cli) -> None:
+    write("scene.yaml", LONE)
+    assert cli("report scene.yaml --out r.html").code == 0
+    text = Path("r.html").read_text(encoding="utf-8")
+    digest = dict(kept_report(Path("r.html"))["scenes"][0]["origin"])["scene.yaml"]
+    write("r.html", text.replace(digest, "0" * 64))
+    ran = cli("report --check r.html")
+    assert ran.code == 1 and "the SHA-256 of scene.yaml is not that of its text" in ran.err
+
+
+@pytest.mark.whole
+def test_several_topologies_are_checked_side_by_side(cli: Cli) -> None:
+    write("a.yaml", LONE)
+    write("b.yaml", LONE.replace("1 kg", "2 kg"))
+    assert cli("report a.yaml b.yaml --out r.html").code == 0
+    assert cli("report --check r.html").code == 0
+    text = Path("r.html").read_text(encoding="utf-8")
+    compared = text.index('<section id="compared">')
+    write("r.html", text[:compared] + text[compared:].replace("lone", "alone", 1))
+    ran = cli("report --check r.html")
+    assert ran.code == 1 and "E991 shows" in ran.err
