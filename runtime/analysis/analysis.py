@@ -165,7 +165,8 @@ def _of_sides(names: Sequence[str]) -> tuple[str, ...]:
     """Return the limitation of an answer at a kink."""
     if len(names) < 2:
         return ()
-    return (f"peers start at a kink ({'; or '.join(names)}): the worse side decides",)
+    shown = " or ".join(names) if len(names) == 2 else f"{len(names)} combinations of sides"
+    return (f"the start is at a kink ({shown}): the worst side decides",)
 
 
 def _near_start(groups: Sequence[PeerGroup]) -> tuple[str, ...]:

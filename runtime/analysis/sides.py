@@ -25,8 +25,8 @@ from apc.frame.decisions import SwitchedKind, find_switches
 from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Instance, Prepared, instance
 from apc.frame.jacobians import DECIDING, SiteJacobians, with_equations
-from apc.frame.kinks import EQUAL, Piece, Point, at_a_kink, kink_indicators, names_of, one_sided, pieces_at
-from apc.frame.linearize import at_start, linearize_rows, start_values
+from apc.frame.kinks import EQUAL, Piece, Point, at_a_kink, names_of, one_sided, pieces_at, tie_indicators
+from apc.frame.linearize import at_start, of_rows, start_values
 from apc.frame.start_classes import StartClasses
 
 # Combinations of pieces that are analyzed one by one.
@@ -117,7 +117,7 @@ def _smooth(site: SiteJacobians) -> bool:
     """Return whether no decision changes a slope of a kind, whatever the point."""
     if site.affine and not site.edges:
         return True
-    return not site.edges and site.walkable and kink_indicators(site.equations) is None
+    return not site.edges and site.walkable and tie_indicators(site.equations) is None
 
 
 def _pieces_of_groups(scene: Instance) -> list[tuple[Piece, ...]]:
@@ -146,10 +146,10 @@ def _near_a_kink(scene: Instance, place: int) -> bool:
     if _smooth(site):
         return False
     start = at_start(site)
-    if start is None or start.kinks is None:
+    if start is None or start.ties is None:
         return start is None
-    rows = linearize_rows(start, scene.numbers.parameters[place])
-    return bool(np.isnan(rows).any())
+    (ties,) = of_rows(start.ties, {4: scene.numbers.parameters[place]})
+    return bool((ties > 0).any())
 
 
 def _points(starting: StartClasses, g: int) -> Iterable[Point]:

@@ -112,8 +112,8 @@ class SiteJacobians:
     structure; `shapes` cuts it.
     `edges` are those of its receives by (clock partition, receive). `timed` says that some entry depends on
     time, if only on whether something has switched (see `switches.varying_slopes`). `equations` is the kind
-    whose functions are differentiated: `kind`, or one of its pieces. `kinks`, where the start values are put
-    in, is a function of the parameters that is above 0 at a kink (see `frame.kinks`).
+    whose functions are differentiated: `kind`, or one of its pieces. `ties`, where the start values are put
+    in, is a function of the parameters that is above 0 at a tie (see `frame.kinks`).
     """
 
     kind: Kind
@@ -124,7 +124,7 @@ class SiteJacobians:
     timed: bool
     edges: Mapping[tuple[int, int], Edge]
     equations: Kind
-    kinks: Any | None = None  # casadi.Function
+    ties: Any | None = None  # casadi.Function
 
     @property
     def parameters_suffice(self) -> bool:

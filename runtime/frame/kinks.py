@@ -1,7 +1,7 @@
 """Kinks: points where an equation of a peer has different slopes on different sides.
 
 Takes: a kind of a `CompiledSystem`, a point at which it is linearized.
-Gives: `Point`, `Piece`, `pieces_at`, `one_sided`, `names_of`; `kink_indicators`, `at_a_kink`.
+Gives: `Point`, `Piece`, `pieces_at`, `one_sided`, `names_of`; `tie_indicators`, `refuse_kinks`, `at_a_kink`.
 Guarantees: a piece is selected by some direction of motion away from the point, to first order: slopes that
 no side has are never returned. A one-sided kind has the values of the kind itself, and at the point the
 slopes of its piece.
@@ -95,7 +95,7 @@ def pieces_at(switched: SwitchedKind, point: Point) -> tuple[Piece, ...]:
     switched
         The kind with its decisions laid open.
     point
-        Where it is linearized.
+        Where it is linearized; columns that are left out are zero.
 
     Raises
     ------
@@ -105,7 +105,7 @@ def pieces_at(switched: SwitchedKind, point: Point) -> tuple[Piece, ...]:
     if not switched.decisions:
         return (Piece((), (), np.zeros(0), np.zeros((0, 0))),)
     functions, count = _guards(switched), len(switched.decisions)
-    columns = [list(point[name]) for name in switched.columns]
+    columns = [list(point.get(name, [0.0] * c.numel())) for name, c in switched.columns.items()]
     leaves: list[tuple[dict[int, bool], dict[int, float]]] = []
 
     def follow(symbols: list[float], tied: dict[int, bool], ties: dict[int, float]) -> None:
@@ -244,64 +244,49 @@ def one_sided(switched: SwitchedKind, taken: Mapping[int, bool], ties: Mapping[i
     return decided_kind(switched, expressions)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Indicators:
-    """Where a kind has kinks: `function` is above 0 at each, in the order of `names`."""
-
-    function: Any  # casadi.Function
-    names: tuple[str, ...]
-
-    def refuse(self, where: str, values: Any) -> None:
-        """Raise ApcError E808 if a value of the function (n,) is above 0."""
-        kinks = [
-            name for name, value in zip(self.names, np.asarray(values).ravel(), strict=True) if value > 0
-        ]
-        if kinks:
-            raise at_a_kink(where, f"{', '.join(dict.fromkeys(kinks))} of {where} has a kink there")
-
-
 @functools.lru_cache(maxsize=KEPT)
-def kink_indicators(kind: Kind) -> Indicators | None:
-    """Return a function (x, u, m, r, p, t) -> (n,) that is above 0 where a decision is a kink.
+def tie_indicators(kind: Kind) -> Any | None:
+    """Return a function (x, u, m, r, p, t) -> (n,) that is above 0 where a decision is tied.
 
-    Its arguments are those of `SiteJacobians.function`. None where no slope depends on a decision, where a
-    nonlinear loop hides the decisions, or where values of single senders decide.
+    Its arguments are those of `SiteJacobians.function`. Not every tie is a kink: see `pieces_at`. None where
+    nothing depends on a decision, where a nonlinear loop hides the decisions, or where values of single
+    senders decide.
     """
     switched = find_switches(kind)
     if not switched.decisions:
         return None
+    columns = switched.columns
+    everything = casadi.vertcat(*columns.values())
     symbols = [decision.symbol for decision in switched.decisions]
-    everything = casadi.vertcat(*switched.columns.values())
-    moving = casadi.vertcat(*(c for name, c in switched.columns.items() if name not in ("p", "t")))
     outputs = casadi.vertcat(*(item.output for item in switched.functions if item.where[0] != "edge"))
-    slopes = jacobian(outputs, moving)
-    slopes = slopes.nz[:] if slopes.nnz() else casadi.SX(0, 1)
-    sizes = TIE * casadi.fabs(jacobian(outputs, everything)) @ casadi.fabs(everything)
+    guards = casadi.vertcat(*(decision.guard for decision in switched.decisions))
     expressions: list[Any] = []
-    indicators: list[Any] = []
-    names: list[str] = []
+    ties: list[Any] = []
     for place, decision in enumerate(switched.decisions):
         guard = decision.guard
         if place:
             guard = casadi.substitute(guard, casadi.vertcat(*symbols[:place]), casadi.vertcat(*expressions))
         expressions.append(decision.holds(guard))
-        if casadi.depends_on(outputs, symbols[place]):
-            ends = [casadi.substitute([slopes, outputs], [symbols[place]], [casadi.SX(d)]) for d in (1, 0)]
-            steeper, jump = (casadi.fabs(one - other) for one, other in zip(*ends, strict=True))
+        if casadi.depends_on(casadi.vertcat(outputs, guards), symbols[place]):
             terms = casadi.fabs(jacobian(guard, everything)) @ casadi.fabs(everything)
-            differs = casadi.logic_not(casadi.vertcat(steeper <= 0, jump <= sizes))  # or no number
-            indicators.append(casadi.if_else(casadi.fabs(guard) <= TIE * terms, casadi.sum1(differs), 0))
-            names.append(", ".join(names_of(switched, [place])) or "an equation")
-    if not indicators:
+            ties.append(casadi.fabs(guard) <= TIE * terms)
+    if not ties:
         return None
-    column = casadi.substitute(
-        casadi.vertcat(*indicators), casadi.vertcat(*symbols), casadi.vertcat(*expressions)
-    )
-    columns = switched.columns
-    parts = [*kind.clocks]
-    m = casadi.vertcat(*(columns.get(f"m{p}", casadi.SX(0, 1)) for p in range(len(parts))))
-    r = casadi.vertcat(*(columns.get(f"r{p}", casadi.SX(0, 1)) for p in range(len(parts))))
-    arguments = [columns["x"], columns["u"], m, r, columns["p"], columns["t"]]
+    column = casadi.vertcat(*ties)
     if any(casadi.depends_on(column, c) for name, c in columns.items() if name.startswith("s")):
         return None
-    return Indicators(casadi.Function("kinks", arguments, [casadi.densify(column)]), tuple(names))
+    m, r = (
+        casadi.vertcat(*(columns.get(f"{letter}{p}", casadi.SX(0, 1)) for p in range(len(kind.clocks))))
+        for letter in "mr"
+    )
+    arguments = [columns["x"], columns["u"], m, r, columns["p"], columns["t"]]
+    return casadi.Function("ties", arguments, [casadi.densify(column)])
+
+
+def refuse_kinks(kind: Kind, where: str, point: Point) -> None:
+    """Refuse a point at which slopes differ from side to side: ApcError E808."""
+    switched = find_switches(kind)
+    pieces = pieces_at(switched, point)
+    if len(pieces) > 1:
+        names = names_of(switched, [place for place, _ in pieces[0].taken])
+        raise at_a_kink(where, f"{', '.join(names) or 'an equation'} of {where} has a kink there")

@@ -10,6 +10,7 @@ Does not: decide when anything happens (see `scheduling`); ask who hears whom (s
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -24,7 +25,7 @@ from apc.compiler.compiled import PEERS, CompiledSystem, Kind
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import SiteJacobians
-from apc.frame.kinks import kink_indicators
+from apc.frame.kinks import refuse_kinks, tie_indicators
 from apc.frame.names import Free
 from apc.frame.parameters import exact_numbers, scope_of
 from apc.frame.site import LinearSite, assemble, cut, every_matrix, with_own_parts
@@ -133,15 +134,14 @@ def at_start(site: SiteJacobians, *, silent: bool = False) -> SiteJacobians | No
             return None
         flat = casadi.substitute(flat, heard, casadi.SX.zeros(heard.shape))
     built = replace(site, function=casadi.Function("jacobians", symbols, [flat]), affine=True, timed=False)
-    indicators = kink_indicators(site.equations)
-    if indicators is None:
+    ties = tie_indicators(site.equations)
+    if ties is None:
         return built
     point = [casadi.vertcat(*x), casadi.vertcat(*u), casadi.vertcat(*m)]
-    received = casadi.SX.zeros(heard.shape) if silent else heard
-    column = indicators.function(*point, received, parameters, 0)
+    column = ties(*point, casadi.SX.zeros(heard.shape) if silent else heard, parameters, 0)
     if casadi.depends_on(column, heard):
         return None
-    return replace(built, kinks=casadi.Function("kinks", symbols, [column]))
+    return replace(built, ties=casadi.Function("ties", symbols, [column]))
 
 
 def start_arguments(
@@ -241,21 +241,32 @@ def _finite_slopes(
             _refuse_kinks(site, parameters, listening)
         arguments = start_arguments(site, [float(value) for value in parameters], float, listening)
         flat = np.asarray(site.function(*arguments), dtype=np.float64).ravel()
-    if site.kinks is not None and np.isnan(flat).all():
-        indicators = kink_indicators(site.equations)
-        assert indicators is not None
-        indicators.refuse(site.kind.name, of_rows(site.kinks, {4: np.asarray(parameters)[None]})[0])
+    if site.ties is not None and np.isnan(flat).all():
+        refuse_kinks(site.equations, site.kind.name, _start_point(site, parameters))
     _refuse_infinite(site, flat)
     return flat
 
 
 def _refuse_kinks(site: SiteJacobians, parameters: NDArray[np.float64], listening: Listening | None) -> None:
     """Refuse a point at which slopes differ from side to side."""
-    indicators = kink_indicators(site.equations)
-    if indicators is not None:
-        numbers = [float(value) for value in parameters]
-        values = indicators.function(*start_arguments(site, numbers, float, listening))
-        indicators.refuse(site.kind.name, np.asarray(values))
+    ties = tie_indicators(site.equations)
+    if ties is not None:
+        arguments = start_arguments(site, [float(value) for value in parameters], float, listening)
+        if np.asarray(ties(*arguments)).any():
+            refuse_kinks(site.equations, site.kind.name, _start_point(site, parameters, arguments[3]))
+
+
+def _start_point(
+    site: SiteJacobians, parameters: NDArray[np.float64], received: Sequence[float] | None = None
+) -> dict[str, Sequence[float]]:
+    """Return where a site starts, by the columns of `kinks.Point`; by default it receives zeros."""
+    numbers = [float(value) for value in parameters]
+    x, u, m = start_values(site, numbers)
+    point: dict[str, Sequence[float]] = {"x": x, "u": u, "p": numbers, "t": [0.0]}
+    rest = iter(received or itertools.repeat(0.0))
+    for p, (partition, memory) in enumerate(zip(site.equations.clocks, m, strict=True)):
+        point |= {f"m{p}": memory, f"r{p}": [next(rest) for _ in partition.receives]}
+    return point
 
 
 def check_start(
@@ -328,9 +339,13 @@ def linearize_rows(site: SiteJacobians, parameters: NDArray[np.float64]) -> NDAr
     rows = np.zeros((count, width))
     (values,) = of_rows(function, {4: parameters})
     rows[:, places] = values + 0.0  # −0 and 0 are one number
-    if site.kinks is not None:
-        (indicators,) = of_rows(site.kinks, {4: parameters})
-        rows[(indicators > 0).any(axis=1)] = np.nan
+    if site.ties is not None:
+        (ties,) = of_rows(site.ties, {4: parameters})
+        for row in np.flatnonzero((ties > 0).any(axis=1)):
+            try:
+                refuse_kinks(site.equations, site.kind.name, _start_point(site, parameters[row]))
+            except ApcError:
+                rows[row] = np.nan
     return rows
 
 

@@ -157,8 +157,21 @@ def analysis_text(result: Analysis) -> Lines:
         ("left out", unfelt if result.unfelt else ""),
     )
     yield ""
+    yield from _side_table(result)
     yield from _mode_table(result.modes)
     yield from notes(*result.notes)
+
+
+def _side_table(result: Analysis) -> Lines:
+    """Yield the verdict of each side of the kinks at which peers start."""
+    if not result.sides:
+        return
+    rows = [("spectral radius", "verdict", "side of the kink")]
+    for side in result.sides:
+        error = max(side.spectral_radius_error, SHOWN if abs(side.spectral_radius - 1) > NEAR else 0.0)
+        rows.append((radius_text(side.spectral_radius, error, None), side.verdict, side.name))
+    yield from table(rows, "<<<")
+    yield ""
 
 
 def analysis_document(result: Analysis) -> Plain:

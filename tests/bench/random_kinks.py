@@ -1,8 +1,8 @@
 """`python -m tests.bench.random_kinks --count 1000 --seed 1`: starts on, before and behind kinks.
 
-A mass carries a sampled force that is piecewise linear in its position and velocity: a random expression of max,
-min, abs and if. An independent program moves a little in many directions from the start, takes the slopes of the
-force there by differences, and steps the mass exactly. Every side and the worst must agree, or the exit code is 1.
+A mass carries a sampled force, piecewise linear in its position and velocity: a random expression of
+max, min, abs and if. An independent program moves a little in many directions from the start, takes slopes
+of the force there by differences, and steps the mass exactly. The exit code is 1 unless all sides agree.
 """
 
 from __future__ import annotations
@@ -52,6 +52,8 @@ def radius(stiffness: float, gain: float) -> float:
     values = np.linalg.eigvals(np.array([[1.0, reach], [0.0, decay]]) - push @ [[stiffness, gain]])
     if abs(stiffness) < 1e-3:  # nothing holds the position
         values = np.delete(values, np.argmin(abs(values - 1)))
+        if abs(values - 1).min() < 1e-6:
+            return math.nan  # nor slows it: it drifts
     return float(abs(values).max())
 
 
@@ -96,6 +98,8 @@ def compare(rng: random.Random, folder: Path) -> str:
     x = rng.choice((0.0, 0.0, 0.0, 1e-3, -1e-3))
     by_hand = sides_by_hand(python, x)
     truths = sorted({round(radius(*slopes), 10) for slopes in by_hand})
+    if any(map(math.isnan, truths)):
+        return ""
     try:
         found = apc.analyze(model(python, text, x, folder))
     except ApcError as error:
