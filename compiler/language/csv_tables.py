@@ -103,7 +103,9 @@ def read_table(path: Path, named_at: Place) -> Table:
     """
     with open_table(path, named_at) as opened:
         headings = opened.headings
-        cells, lines = opened.numbers(range(len(headings)), plain_float, "a cell", "a finite number")
+        cells, lines = opened.numbers(
+            range(len(headings)), [plain_float] * len(headings), "a cell", "a finite number"
+        )
     numbers = cells.reshape(len(lines), len(headings))
     columns = tuple(
         Column(name, unit, numbers[:, i] * float(unit.scale), place)
@@ -123,7 +125,7 @@ class Opened:
     def numbers(
         self,
         columns: Sequence[int],
-        number: Callable[[str], float],
+        readers: Sequence[Callable[[str], float]],
         what: str,
         expected: str,
         *,
@@ -135,8 +137,8 @@ class Opened:
         ----------
         columns
             Which columns, counted from 0.
-        number
-            Gives the number of a cell, or raises ValueError.
+        readers
+            For each of them, what gives the number of a cell, or raises ValueError.
         what, expected
             What a cell is and has to be, for messages.
         empty_too
@@ -161,7 +163,7 @@ class Opened:
                 mistakes.add("E703", place, reason)
                 faulty.add(place.line)
             else:
-                for column in columns:
+                for column, number in zip(columns, readers, strict=True):
                     try:
                         numbers.append(number(cells[column]))
                     except ValueError:
@@ -218,13 +220,13 @@ def _is_table(headings: list[str], texts: Collection[str]) -> bool:
     )
 
 
-def read_bytes(path: Path, named_at: Place) -> bytes:
+def read_bytes(path: Path, named_at: Place, *, any_text: bool = False) -> bytes:
     """Return a file's bytes, unpacked if it is called .gz.
 
     Raises
     ------
     ApcError
-        E701 it can't be read, or isn't UTF-8 text all of it.
+        E701 it can't be read, or isn't UTF-8 text all of it, unless any text will do.
     """
     try:
         data = read_file(path, MAX_BYTES)
@@ -232,7 +234,8 @@ def read_bytes(path: Path, named_at: Place) -> bytes:
             with gzip.open(io.BytesIO(data)) as packed:
                 data = packed.read(MAX_BYTES + 1)
         if len(data) <= MAX_BYTES:
-            data.decode("utf-8-sig")  # all of it: what decodes piece by piece counts from where it is
+            if not any_text:
+                data.decode("utf-8-sig")  # all of it: what decodes piece by piece counts from where it is
             return data
         what = f"{path.name} unpacks to more than {MAX_BYTES >> 20} MiB"
     except RefusedError as refused:

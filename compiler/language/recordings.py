@@ -9,6 +9,7 @@ Does not: know what reads them.
 from __future__ import annotations
 
 import math
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,14 +20,13 @@ from apc.compiler.digits import plain_float
 from apc.compiler.errors import Place
 from apc.compiler.language.csv_tables import Headings, open_table, read_bytes, read_table
 from apc.compiler.language.dimensions import SECOND
-from apc.compiler.language.probes import read_probe
+from apc.compiler.language.probes import LATEST_DELAY, read_probe
 from apc.compiler.language.units import NO_UNIT, Unit
 from apc.compiler.source.reading import brief, fault
 
 DELAY = "delay"  # the column of a trace that is read
 TABLE_SUFFIX = ".csv"  # a file of another suffix may be what ping or irtt wrote
 RECORDINGS = "packets as ping or irtt wrote them, or a table with a column delay [ms]"
-LATEST_DELAY = 1e9  # seconds: a longer one is no packet's, and its square would leave the range of floats
 LOST = "lost"  # a packet that never arrived, in a trace; so is a cell with nothing in it
 
 
@@ -100,11 +100,14 @@ def read_trace(path: Path, named_at: Place) -> Trace:
     ------
     ApcError
         E701 it can't be read, E702 there is no column `delay` in a unit of time, E703 a row or cell is at
-        fault, or there is none.
+        fault, or there is none; E704 a recording of ping or irtt contradicts itself, or holds two runs.
     """
     if path.suffix.lower() != TABLE_SUFFIX:
-        text = read_bytes(path, named_at).decode("utf-8-sig")
-        if (probe := read_probe(text)) is not None:
+        data = read_bytes(path, named_at, any_text=True)
+        # Windows writes UTF-16 from PowerShell, else a code page, in which the digits are those of ASCII.
+        encoding = "utf-16" if data[:2] in (BOM_UTF16_LE, BOM_UTF16_BE) else "utf-8-sig"
+        text = data.decode(encoding, "replace")
+        if (probe := read_probe(text, str(path))) is not None:
             return Trace(probe.delays, probe.program, probe.interval)
         if DELAY not in text.partition("\n")[0]:
             raise fault("E702", Place(str(path), 1, 1), "a recording", RECORDINGS)
@@ -121,7 +124,7 @@ def read_trace(path: Path, named_at: Place) -> Trace:
             return seconds
 
         expected = f"a time from 0 to {LATEST_DELAY:.0e} s, or {LOST}"
-        delays, _ = opened.numbers([column], delay, "a delay", expected, empty_too=True)
+        delays, _ = opened.numbers([column], [delay], "a delay", expected, empty_too=True)
     return Trace(delays)
 
 

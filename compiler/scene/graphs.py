@@ -11,12 +11,14 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
 from apc.compiler.compiled import MOST_PLACED, Graph
+from apc.compiler.digits import plain_float
 from apc.compiler.errors import Mistakes, Place
-from apc.compiler.language.csv_tables import Table, read_table
+from apc.compiler.language.csv_tables import open_table
 from apc.compiler.language.dimensions import SECOND
 from apc.compiler.language.values import AlreadyReportedError, Value
 from apc.compiler.scene.named_numbers import NamedNumbers
@@ -74,16 +76,18 @@ def read_graph(node: Node, numbers: NamedNumbers) -> Graph:
     [(key, pairs)] = body.nodes.items()
     if key not in PAIRS:
         raise AlreadyReportedError
+    numbered = _peers(numbers.counts)
     if isinstance(pairs, Scalar) and pairs.text.endswith(".csv"):
-        table = numbers.files.read(pairs.text, partial(read_table, named_at=pairs.place))
-        items = () if table is None else _pairs_of(table)
+        if "peers" in numbers.faulty:
+            raise AlreadyReportedError
+        reader = partial(_read_pairs, named_at=pairs.place, numbered=numbered)
+        items = numbers.files.read(pairs.text, reader) or ()
     elif isinstance(pairs, Sequence):
         items = pairs.items
     else:
         raise fault("E203", pairs.place, key, "a list of pairs or a .csv file", form(pairs), f"{key}: {hint}")
     if "peers" in numbers.faulty:
         raise AlreadyReportedError
-    numbered = _peers(numbers.counts)
     result: dict[tuple[int, int], float] = {}
     for pair in items:
         with mistakes:
@@ -96,20 +100,35 @@ def read_graph(node: Node, numbers: NamedNumbers) -> Graph:
     return Graph("arcs", np.array([*result], np.int64).reshape(-1, 2), np.array([*result.values()]))
 
 
-def _pairs_of(table: Table) -> tuple[Node, ...]:
-    """Return the rows of a table with the columns from, to and weight or none as pairs."""
-    names, place = [column.name for column in table.columns], table.columns[0].place
-    if names not in (["from", "to"], ["from", "to", "weight"]):
-        expected = "the headings from, to and weight or none"
-        raise fault("E702", place, "a table of pairs", expected, brief(", ".join(names)))
+def _read_pairs(path: Path, named_at: Place, numbered: Mapping[str, int]) -> tuple[Node, ...]:
+    """Return the rows of a table with the columns from, to and weight or none as pairs.
+
+    A peer is written by its number or by its name, as in YAML. Raises ApcError (E701 to E703).
+    """
+
+    def peer(text: str) -> float:
+        number = numbered.get(text.strip())
+        return plain_float(text) if number is None else number + 1
+
+    with open_table(path, named_at) as opened:
+        names, place = [name for name, _, _ in opened.headings], opened.headings[0][2]
+        if names not in (["from", "to"], ["from", "to", "weight"]):
+            expected = "the headings from, to and weight or none"
+            raise fault("E702", place, "a table of pairs", expected, brief(", ".join(names)))
+        readers = (peer, peer, plain_float)[: len(names)]
+        expected = f"a finite number, or the name of a peer such as {_example(numbered)} in from and to"
+        numbers, lines = opened.numbers(range(len(names)), readers, "a cell", expected)
     pairs = []
-    for line, *numbers in zip(
-        table.lines, *(column.numbers.tolist() for column in table.columns), strict=True
-    ):
-        at = Place(place.file, line, 1)
-        values = (int(number) if number.is_integer() else number for number in numbers)
+    for line, *row in zip(lines, *numbers.reshape(-1, len(names)).T.tolist(), strict=True):
+        at = Place(opened.file, line, 1)
+        values = (int(number) if number.is_integer() else number for number in row)
         pairs.append(Sequence(tuple(Scalar(str(value), value, True, at) for value in values), at))
     return tuple(pairs)
+
+
+def _example(numbered: Mapping[str, int]) -> str:
+    """Return the name of a peer."""
+    return next((name for name in numbered if name.endswith("]")), "user[1]")
 
 
 def _peers(counts: Mapping[str, int]) -> dict[str, int]:
@@ -129,8 +148,8 @@ def _arc(pair: Node, what: str, numbered: Mapping[str, int], mistakes: Mistakes)
             quoted = isinstance(node, Scalar) and node.text.isdigit() and not node.plain
             text = node.text if isinstance(node, Scalar) and not quoted else ""
             if text not in numbered:
-                first = next((name for name in numbered if name.endswith("]")), "user[1]")
-                numbers = f'a number from 1 to {len(numbered) // 2}, or a name in quotes such as "{first}"'
+                numbers = f"a number from 1 to {len(numbered) // 2}, or a name in quotes such as "
+                numbers += f'"{_example(numbered)}"'
                 raise fault("E213", node.place, "a peer", numbers, form(node))
             ends.append(numbered[text])
     weight = 1.0

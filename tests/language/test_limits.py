@@ -55,6 +55,30 @@ def test_a_table_is_read_in_one_pass_and_told_of_at_the_line_a_row_begins_in(
     assert line.startswith(f"users.csv:{expected}")
 
 
+@pytest.mark.parametrize("key", ["edges", "arcs"])
+def test_peers_in_a_file_of_pairs_have_numbers_or_names(tmp_path: Path, key: str) -> None:
+    """The graph is that of the same names in YAML."""
+    rows = ['"user[1]",2,1', "user[2], user[3] ,0.5", "3,user[1],2"]
+    (tmp_path / "net.csv").write_text("\n".join(["from,to,weight", *rows, ""]), encoding="utf-8")
+    pairs = '[["user[1]", 2, 1], ["user[2]", "user[3]", 0.5], [3, "user[1]", 2]]'
+    graphs = []
+    for written in ("net.csv", pairs):
+        changed = replaced(AVERAGE, (DELAY, f"delay: 8 ms, graph: {{{key}: {written}}}}}"))
+        (tmp_path / "scene.yaml").write_text(changed, encoding="utf-8")
+        graphs.append(apc.compile(tmp_path / "scene.yaml").links[0].graph)
+    assert graphs[0].arcs.tolist() == graphs[1].arcs.tolist()
+    assert graphs[0].weights.tolist() == graphs[1].weights.tolist()
+
+
+@pytest.mark.parametrize("row", ["user[4],2,1", "1,user,1", "1,2,user[1]"])
+def test_other_names_in_a_file_of_pairs_are_refused(tmp_path: Path, row: str) -> None:
+    edges = (DELAY, "delay: 8 ms, graph: {edges: users.csv}}")
+    [line] = tabled(tmp_path, f"from,to,weight\n{row}\n", edges)
+    column = 1 + max(row.find("user"), 0)
+    assert line.startswith(f"users.csv:2:{column}: E703 a cell wants a finite number, or the name of a peer")
+    assert "such as user[1]" in line
+
+
 def test_a_heading_without_end_is_told_in_a_few_words(tmp_path: Path) -> None:
     edges = (DELAY, "delay: 8 ms, graph: {edges: users.csv}}")
     [line] = tabled(tmp_path, f"from,to,{LONG}\n1,2,1\n", edges)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,16 @@ from tests.lossy import LINK
 from tests.topologies import AVERAGE, replaced
 
 LOST = math.inf
+LANGUAGES = "cs de es fi fr id it ja ka kab ko pt_BR ro tr uk zh_CN zh_Hant"  # po/LINGUAS of iputils
+# One table of samples: each program and language, and what is refused.
+SAMPLES = [
+    (*heading.split(": ", 1), text)
+    for heading, text in re.findall(
+        r"^## (.+)\n((?:(?!## ).*\n)*)",
+        Path(__file__).with_name("pings.txt").read_text(encoding="utf-8"),
+        re.MULTILINE,
+    )
+]
 
 IPUTILS = """\
 PING host.example (192.0.2.7) 56(84) bytes of data.
@@ -114,6 +125,62 @@ def test_every_packet_has_its_delay_in_the_order_of_sending(
     assert found.interval == pytest.approx(interval, rel=1e-4, nan_ok=True)
 
 
+@pytest.mark.parametrize(("name", "expected", "text"), SAMPLES, ids=[name for name, _, _ in SAMPLES])
+def test_each_program_and_language_is_read_or_refused(name: str, expected: str, text: str) -> None:
+    """Its packets and interval are those of the heading; its statistics agree with them."""
+    if expected[0] in "123456789" and ";" not in expected:
+        line, words = expected.split(" ", 1)
+        with pytest.raises(ApcError) as caught:
+            read_probe(text.rstrip("\n"), "lan.txt")
+        [mistake] = caught.value.mistakes
+        assert (mistake.code, mistake.place.line) == ("E704", int(line)), str(mistake)
+        assert words in mistake.sentence
+        return
+    listed, interval = expected.split("; ")
+    found = read_probe(text.rstrip("\n"), "lan.txt")  # one was killed within a line
+    assert found is not None
+    delays = [LOST if word == "-" else float(word) for word in listed.split()]
+    np.testing.assert_allclose(found.delays * 1e3, delays, rtol=1e-12)
+    between = math.nan if interval == "?" else float(interval) * 1e-3
+    assert found.interval == pytest.approx(between, rel=1e-9, nan_ok=True)
+
+
+def test_all_languages_of_iputils_are_among_the_samples() -> None:
+    names = " ".join(name.removeprefix("iputils ") for name, _, _ in SAMPLES if name.startswith("iputils "))
+    assert {*names.split()} >= {*re.findall(r"\w+", LANGUAGES)}
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-8-sig", "cp850", "cp1252"])
+def test_windows_writes_in_code_pages_and_in_utf_16(tmp_path: Path, encoding: str) -> None:
+    texts = {name: text for name, _, text in SAMPLES}
+    for name, lost in {"Windows de": 4, "Windows fr": 3}.items():
+        text = texts[name].replace("’", "'").replace("12 ms", "12\xa0ms").replace("\n", "\r\n")
+        mark = "\ufeff" if encoding == "utf-16-le" else ""
+        (tmp_path / "lan.txt").write_bytes((mark + text).encode(encoding))
+        found = describe(tmp_path / "lan.txt")
+        assert (found.lost.count, found.lost.of - found.lost.count, found.longest) == (lost, 2, 0.006)
+
+
+@pytest.mark.parametrize(
+    ("changed", "of"), [({"packets_sent": 4}, "packets"), ({"packets_received": 3}, "answers")]
+)
+def test_statistics_of_irtt_agree_with_its_packets(changed: dict[str, int], of: str) -> None:
+    """A duplicate is received, and answers no packet."""
+    written = json.loads(irtt(16.0, "true", 17.0))
+    written["stats"] = {"packets_sent": 3, "packets_received": 3, "duplicates": 1}
+    assert read_probe(json.dumps(written)) is not None
+    written["stats"] |= {"duplicates": 0, "packets_received": 2, **changed}
+    with pytest.raises(ApcError, match=f"E704 the number of {of} in a recording"):
+        read_probe(json.dumps(written))
+
+
+@pytest.mark.parametrize("interval", [0, -8_000_000, 1e300])
+def test_an_interval_of_irtt_that_is_none_is_not_known(interval: float) -> None:
+    found = read_probe(irtt(16.0, 17.0).replace("8000000", str(interval)))
+    assert found is not None
+    assert math.isnan(found.interval)
+
+
 def test_no_text_is_taken_for_a_recording_that_is_none() -> None:
     """Neither text with numbers nor other JSON."""
     huge = "9" * 5000
@@ -129,8 +196,15 @@ def test_no_text_is_taken_for_a_recording_that_is_none() -> None:
         "icmp_seq=1 time=1 ms\nicmp_seq=999999999999 time=1 ms",
         irtt("true").replace("0", "-1", 1),
         irtt(-1.0),
+        irtt(1.0).replace('"seqno": 0', '"seqno": Infinity'),
+        "The hosts:\nfirst\nsecond\n\nThe networks:\nthird: 5\n",
+        "In 2019, 45 hosts, 30 % of all",
     ):
-        probe = read_probe(text)
+        try:
+            probe = read_probe(text)
+        except ApcError as error:
+            assert {one.code for one in error.mistakes} == {"E704"}
+            continue
         assert probe is None or not np.isfinite(probe.delays).any()
 
 
