@@ -1,5 +1,5 @@
 # ruff: noqa: E501 -- scenes, and lists of hostile values, read best as they are
-"""Damaged and forged files: compiled models, what `apc play` recorded of a peer, parts of a sweep.
+"""Damaged and forged files: compiled models, what `apc play` recorded of a peer, parts of a sweep, networks.
 
 Takes: a seed. Gives: `FORGERIES`; `zipped`, `recorded`.
 Guarantees: of equal seed comes equal input, but for what a clock says in a recording; no forged model has a
@@ -41,6 +41,7 @@ from apc.loop.run_folder import read_run
 from apc.processes import digest_of
 from apc.sweeps.finished_parts import open_parts
 from tests.fuzz.inputs import MODELS, Input, any_value, mutated
+from tests.fuzz.networks import ask_network, make_network, whole_networks
 from tests.fuzz.trees import Pairs, Tree, as_json, changed, of_json
 from tests.topologies import AVERAGE, replaced
 
@@ -315,15 +316,21 @@ def _ask_part() -> str:
 
 @dataclass(frozen=True, slots=True)
 class Forgery:
-    """Makes a file of a seed, asks what it is asked in its folder, and has whole ones, which are answered."""
+    """Makes a file of a seed, asks what it is asked in its folder, and has whole ones, which are answered.
+
+    `seconds` of processor time and `memory` in bytes are the most that one may take.
+    """
 
     make: Callable[[str], Input]
     ask: Callable[[], str]
     whole: Callable[[], list[Input]]
+    seconds: float = 60.0
+    memory: int = 1 << 30
 
 
 FORGERIES = {
     "models": Forgery(_forge_model, lambda: ask(Path(FILE)), _whole_models),
     "recordings": Forgery(_forge_recording, _ask_recording, lambda: [_forge_recording("")]),
     "parts": Forgery(_forge_part, _ask_part, lambda: [_forge_part("")]),
+    "networks": Forgery(make_network, ask_network, whole_networks, seconds=1.0, memory=200 << 20),
 }

@@ -37,7 +37,6 @@ from tests.fuzz.models import FORGERIES, Forgery
 
 SECONDS = 5.0  # of processor time, the longest an input may take to compile
 PLAYED_SECONDS = 10.0  # and to compile, check itself, be analysed and simulated
-QUESTIONS = 60.0  # the same for all that is asked of a forged model
 PATIENCE = 300.0  # seconds until a process that says nothing is taken to hang, on however busy a machine
 MEMORY = 1 << 30  # bytes an input may ask for beyond what is in use
 BATCH = 4000  # inputs a process runs before a fresh one takes over
@@ -78,6 +77,7 @@ class Kind:
     warm_up: Callable[[], None]
     make: Callable[[str], Input]
     judge: Callable[[Input], tuple[str, str]]
+    memory: int = MEMORY
 
 
 def run_all(
@@ -108,7 +108,7 @@ def run_all(
                 key, told = kind.judge(given)
                 tell(index, key, told or given.sort)
 
-        for index, key, told in _watched(work, following, stop):
+        for index, key, told in _watched(work, following, stop, kind.memory):
             following = index + 1
             if key in FINE:
                 outcomes[f"{told}: {key}"] += 1
@@ -128,7 +128,7 @@ def kind_of(what: str, sort: str | None = None) -> Kind:
     if what == "inputs":
         return Kind(_warm_up, lambda seed: make_input(random.Random(seed), sort), _judged)
     forgery = FORGERIES[what]
-    return Kind(partial(_warm_files, forgery), forgery.make, partial(_asked, forgery))
+    return Kind(partial(_warm_files, forgery), forgery.make, partial(_asked, forgery), forgery.memory)
 
 
 def _warm_files(forgery: Forgery) -> None:
@@ -138,7 +138,7 @@ def _warm_files(forgery: Forgery) -> None:
 
 
 def _asked(forgery: Forgery, given: Input) -> tuple[str, str]:
-    return _traced(given, lambda: (forgery.ask(), ""), QUESTIONS)
+    return _traced(given, lambda: (forgery.ask(), ""), forgery.seconds)
 
 
 def _warm_up() -> None:
@@ -161,7 +161,7 @@ def _warm_up() -> None:
 
 
 def _watched(
-    work: Callable[[Callable[[int, str, str], None]], object], start: int, stop: int
+    work: Callable[[Callable[[int, str, str], None]], object], start: int, stop: int, memory: int
 ) -> Iterator[tuple[int, str, str]]:
     """Yield (index, outcome, text) of inputs run in a process of their own; ends early if that is killed.
 
@@ -169,7 +169,7 @@ def _watched(
     """
     context = multiprocessing.get_context("fork")
     heard, tell = context.Pipe(duplex=False)
-    child = context.Process(target=_become_worker, args=(work, tell))
+    child = context.Process(target=_become_worker, args=(work, tell, memory))
     child.start()
     tell.close()
     following = start
@@ -188,10 +188,12 @@ def _watched(
         yield following, "takes for ever" if silent else f"process ended with code {child.exitcode}", ""
 
 
-def _become_worker(work: Callable[[Callable[[int, str, str], None]], object], pipe: Connection) -> None:
+def _become_worker(
+    work: Callable[[Callable[[int, str, str], None]], object], pipe: Connection, memory: int
+) -> None:
     """Do the work, with little memory, no output and what it causes noted."""
     in_use = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (in_use + MEMORY, in_use + MEMORY))
+    resource.setrlimit(resource.RLIMIT_AS, (in_use + memory, in_use + memory))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, 1)

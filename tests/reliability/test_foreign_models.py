@@ -93,7 +93,7 @@ def serialized(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 @pytest.mark.whole
 def test_forged_files_of_every_sort_do_nothing_else_and_end() -> None:
     """Each is opened and asked in a process that notes commands, libraries, sockets and files written."""
-    options = "--inputs 0 --models 40 --recordings 40 --parts 40 --seed 7"
+    options = "--inputs 0 --models 40 --recordings 40 --parts 40 --networks 400 --seed 7"
     command = f"cd {ROOT}; {sys.executable} -m tests.fuzz {options} --out {Path.cwd()}/failures"
     assert os.system(command) == 0
 
