@@ -15,6 +15,7 @@ import numpy as np
 from apc.analysis.plan import make_plan
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
+from apc.frame.ages import linear_sites, of_one_delay
 from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import instance, prepare
 from apc.frame.jacobians import edge_name
@@ -63,7 +64,12 @@ def needs(system: CompiledSystem) -> Needs:
 
 
 def _needs(system: CompiledSystem) -> Needs:
-    prepared = prepare(system)
+    refused = ""
+    try:
+        prepared = prepare(system)
+    except ApcError as error:  # ages of several delays, which a simulation needs no single value of
+        refused = error.mistakes[0].sentence
+        prepared = prepare(system, linear_sites(of_one_delay(system)))
     schedule_of = {
         group.kind: schedule
         for group, schedule in reversed(list(zip(system.groups, prepared.schedules, strict=True)))
@@ -74,12 +80,15 @@ def _needs(system: CompiledSystem) -> Needs:
         )
         for place, kind in enumerate(system.kinds)
     )
+    method: str = ""
+    systems: tuple[tuple[int, int], ...] = ()
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # the sizes count here, not the numbers
-            plan = make_plan(instance(system, prepared))
-        method, systems, refused = plan.method, plan.systems, ""
+            plan = None if refused else make_plan(instance(system, prepared))
+        if plan is not None:
+            method, systems = plan.method, plan.systems
     except ApcError as error:  # a scene that can't be analysed may still be run
-        method, systems, refused = "", (), error.mistakes[0].sentence
+        refused = error.mistakes[0].sentence
     frame = prepared.schedules[0].frame_s
     return Needs(
         system.peers,

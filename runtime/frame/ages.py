@@ -55,6 +55,11 @@ def linear_sites(
     return tuple(jacobians(kind) for kind in nominal(system, timings, order).kinds)
 
 
+def of_one_delay(system: CompiledSystem) -> CompiledSystem:
+    """Return a system in which all pairs have the delay of their link, so that each tick has one age."""
+    return replace(system, links=tuple(replace(link, delays=()) for link in system.links))
+
+
 def at_timings(
     system: CompiledSystem,
     sites: tuple[SiteJacobians, ...],

@@ -104,16 +104,24 @@ class Instance:
         return all(site.affine for site in self.sites)
 
 
-def prepare(system: CompiledSystem) -> Prepared:
+def prepare(system: CompiledSystem, sites: tuple[SiteJacobians, ...] | None = None) -> Prepared:
     """Do what analyses with different numbers can share.
 
     Parameters
     ----------
     system
         The compiled scene.
+    sites
+        The Jacobians of each kind; those of the nominal network if they are left out.
+
+    Raises
+    ------
+    ApcError
+        E811 as `ages.nominal`, without sites.
     """
     timings = {timing.name: timing.value for timing in system.timings}
-    return _scheduled(system, linear_sites(system, timings, ORDER), timings, ORDER)
+    sites = linear_sites(system, timings, ORDER) if sites is None else sites
+    return _scheduled(system, sites, timings, ORDER)
 
 
 def instance(system: CompiledSystem, prepared: Prepared | None = None) -> Instance:

@@ -12,7 +12,7 @@ import numpy as np
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
-from apc.frame.ages import linear_sites
+from apc.frame.ages import linear_sites, of_one_delay
 from apc.frame.discretize import TOO_LARGE, refuse_many
 from apc.frame.finite_equations import finite_equations
 from apc.frame.lift import lift
@@ -30,6 +30,8 @@ def check_values(system: CompiledSystem) -> None:
     """Linearize and lift the first few sites of each kind; refuse the scene if a number is not finite.
 
     A kind whose slopes depend on what is heard is left to the analysis, which knows where the scene starts.
+    Ages are those of each link's own delay: where delays differ from pair to pair, only an analysis refuses
+    that, and a simulation needs no single age.
 
     Raises
     ------
@@ -41,7 +43,7 @@ def check_values(system: CompiledSystem) -> None:
     for kind in system.kinds:
         refuse_many(len(kind.states), place)
     numbers = resolve(system)
-    sites = linear_sites(system, numbers.timings)
+    sites = linear_sites(of_one_delay(system), numbers.timings)
     schedules = build_schedules(system, numbers.timings, [site.pattern for site in sites])
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         for group, schedule, rows in zip(system.groups, schedules, numbers.parameters, strict=True):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import apc
+from apc.__main__ import run
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from tests.schemes import ByHand, everybody, magnitudes, mean, played
@@ -198,6 +199,17 @@ def test_a_constant_velocity_is_predicted_whatever_the_network_does(
         assert one.tolist() == pytest.approx([(own - others) * tick * 1e-3 for tick in range(300)], abs=1e-9)
 
 
+UNLIKE_AGES = """\
+topology: t
+clocks: {haptic: 1 ms, network: 8 ms}
+peers: {a: {count: 1}, b: {count: 1}, c: {count: 1, set: {cube.x: 10 mm}}}
+masses: {cube: {mass: 0.6 kg, damping: 5 N*s/m, shared: true}}
+couplers: {coordination: {type: PredictedAverage, object: cube, stiffness: 100 N/m, clock: haptic, link: lan}}
+links: {lan: {clock: network, delay: 8 ms, delays: {a: {b: 12 ms}}}}
+experiment: {duration: 50 ms}
+"""
+
+
 def test_ages_that_differ_from_sender_to_sender_are_played_and_not_analysed(tmp_path: Path) -> None:
     text = SCENE.replace("delay: DELAY", "delay: 3 ms, delays: {left: {right: 7 ms}}")
     system = scene("k*(y - mean(others.x + age(others.x)*others.v))", "", tmp_path, text)
@@ -209,6 +221,20 @@ def test_ages_that_differ_from_sender_to_sender_are_played_and_not_analysed(tmp_
         "Write: apc simulate"
     )
     assert np.isfinite(positions(system)).all()
+
+
+def test_a_file_whose_ages_differ_compiles_and_is_simulated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At first a copy at 10 mm pulls the two others by 100 N/m times half of that."""
+    monkeypatch.chdir(tmp_path)
+    Path("t.yaml").write_text(UNLIKE_AGES, encoding="utf-8")
+    for command in ("check", "compile", "simulate"):
+        assert run([command, "t.yaml"]) == 0, capsys.readouterr().err
+    played = apc.simulate("t.yaml", duration="2 ms", jit=False)
+    assert float(played["a[1].coordination.f"][-1]) == pytest.approx(-0.5, rel=2e-3)
+    assert run(["analyze", "t.yaml"]) == 1
+    assert "E811" in capsys.readouterr().err
 
 
 def test_another_order_of_events_has_its_own_ages(tmp_path: Path) -> None:
