@@ -27,7 +27,9 @@ NONE = "^("  # a unit that Modelica has no words for
 # Letters of an expression that is written again wherever it is used.
 LONGEST = 120
 
-_KEYWORDS = frozenset(
+# Of Modelica 3.6: the keywords (section 2.3.3), the predefined types (4.9), and the names of operators and
+# functions that need no import (3.7, 10.3, 16, 17). A name of a scene that is one of them is quoted.
+RESERVED = frozenset(
     re.findall(
         r"\w+",
         """
@@ -35,8 +37,20 @@ _KEYWORDS = frozenset(
         each else elseif elsewhen encapsulated end enumeration equation expandable extends external
         false final flow for function if import impure in initial inner input loop model not operator or
         outer output package parameter partial protected public pure record redeclare replaceable return
-        stream then true type when while within time Real Integer Boolean String Clock sample hold
-        previous
+        stream then true type when while within
+
+        Real Integer Boolean String Clock StateSelect ExternalObject AssertionLevel Connections Complex
+        Modelica time
+
+        abs sign sqrt div mod rem ceil floor integer sin cos tan asin acos atan atan2 sinh cosh tanh exp
+        log log10 delay cardinality homotopy semiLinear inStream actualStream spatialDistribution
+        getInstanceName terminal noEvent smooth sample pre edge change reinit assert terminate
+
+        promote ndims size scalar vector matrix transpose outerProduct symmetric cross skew identity
+        diagonal zeros ones fill linspace min max sum product array cat
+
+        previous hold subSample superSample shiftSample backSample noClock interval firstTick
+        rooted transition initialState activeState ticksInState timeInState
         """,
     )
 )
@@ -63,8 +77,8 @@ class Text:
 
 
 def identifier(name: str) -> str:
-    """Return a name as Modelica writes it, in quotes where it is no word."""
-    if _PLAIN.match(name) and name not in _KEYWORDS:
+    """Return a name as Modelica writes it, in quotes where it is no word or one of the language."""
+    if _PLAIN.match(name) and name not in RESERVED:
         return name
     return "'" + name.replace("\\", "\\\\").replace("'", "\\'") + "'"
 

@@ -121,7 +121,7 @@ class _Writer:
 
     def model(self) -> ModelicaModel:
         """Return the model."""
-        system, name = self.system, word(self.system.name)
+        system, name = self.system, identifier(word(self.system.name))
         groups = [g for g, group in enumerate(system.groups) for _ in range(group.count)]
         peers = [_Peer(self, number, group) for number, group in enumerate(groups)]
         for peer in peers:

@@ -215,3 +215,43 @@ def test_a_refused_scene_leaves_no_file(
     assert (tmp_path / "scene.mo").read_text(encoding="utf-8").startswith("model three_users_average")
     assert run(["export", "--out", "scene.mo", "--cut", "lan"]) == 1
     assert "E953 --cut means nothing to the format modelica" in capsys.readouterr().err
+
+
+# Keywords, predefined types, operators and functions of the Modelica Language Specification 3.6.
+NAMES = re.findall(r"\w+", """
+algorithm and annotation block break class connect connector constant constrainedby der discrete each else
+elseif elsewhen encapsulated end enumeration equation expandable extends external false final flow for
+function if import impure in initial inner input loop model not operator or outer output package parameter
+partial protected public pure record redeclare replaceable return stream then true type when while within
+Real Integer Boolean String Clock StateSelect ExternalObject AssertionLevel Connections time abs sign sqrt
+div mod rem ceil floor integer sin cos tan asin acos atan atan2 sinh cosh tanh exp log log10 delay
+cardinality homotopy semiLinear inStream actualStream spatialDistribution getInstanceName initial terminal
+noEvent smooth sample pre edge change reinit assert terminate ndims size scalar vector matrix transpose
+outerProduct symmetric cross skew identity diagonal zeros ones fill linspace min max sum product array cat
+previous hold subSample superSample shiftSample backSample noClock interval firstTick transition
+initialState activeState ticksInState timeInState
+""")  # fmt: skip
+
+
+def test_no_name_of_the_language_is_declared() -> None:
+    assert [name for name in NAMES if identifier(name) != f"'{name}'"] == []
+    assert identifier("haptic") == "haptic"
+
+
+@pytest.mark.parametrize(
+    ("model", "fast", "slow"),
+    [
+        ("subSample", "subSample", "superSample"),
+        ("when", "shiftSample", "backSample"),
+        ("Clock", "Real", "firstTick"),
+    ],
+)
+def test_a_scene_of_such_names_is_a_model(model: str, fast: str, slow: str) -> None:
+    """No line declares the name without quotes; Rumoca, where it is installed, compiles the model."""
+    text = replaced(AVERAGE, ("topology: three-users-average", f"topology: {model}"))
+    text = text.replace("haptic", fast).replace("network", slow)
+    made = modelica(compiled(text))
+    declared = re.findall(r"^  Clock (\S+) =", made.text, re.MULTILINE)
+    assert (made.name, declared) == (f"'{model}'" if model in NAMES else model, [f"'{fast}'", f"'{slow}'"])
+    if find_spec("rumoca") is not None:
+        import_module("rumoca").Session().loads(made.text, model=made.name)
