@@ -304,7 +304,8 @@ class Kind:
 
     A float among the values of a parameter is exact, but where `rounded` has it: by the parameter's place in
     `parameters`, the rationals that floats round, each float at most one of them. `hands` are the parts that
-    the scene calls hands, if they answer to how they are moved; `held` the parts that any hand is joined to.
+    the scene calls hands, if they answer to how they are moved; `held` the parts that any hand is joined to,
+    or without hands those with a connector for hands.
     `linear` is the kind that represents it in a linear analysis, of the same states and parameters, None
     where that is the kind itself; `replaced` are the parts in which they differ.
     `symbols` are those of published wall conditions with the numbers that play them, empty unless every part

@@ -285,7 +285,8 @@ def _kind(writer: Writer, heard: Iterable[str], timings: Timings) -> Kind:
         limits=tuple(limit(variable) for variable in flat.variables if variable.limit),
         held=tuple(
             dict.fromkeys(other for part in hands for _, other, _ in part.connections if other != GROUND)
-        ),
+        )
+        or tuple(part.name for part in flat.parts if part.component.grips),
     )
 
 

@@ -50,6 +50,8 @@ FREE, CLAMPED, HELD, PASSIVE = HANDS = ("free", "clamped", "held", "passive")
 
 # Codes of a scene that can't have the hands asked for, where another could.
 UNHELD = ("E931", "E932")
+# A force of 0 N that names the part in a hand, and changes nothing else.
+_HOLDS = "hands: {{grip: {{type: ConstantForce, flange: {part}, force: 0 N{at}}}}}"
 
 # What a peer without a device lacks.
 OWN_MASS = "masses: {device: {mass: 0.1 kg}}, where it moves in a plane with type: PlanarMass, at each peer"
@@ -361,12 +363,28 @@ def devices_of(system: CompiledSystem, *, option: str) -> dict[int, Device]:
         site = jacobians(analyzed(system.kinds[group.kind]))
         device = find_device(site, numbers.parameters[place][0], unit_of, direct=direct)
         if isinstance(device, str):
-            raise ApcError(Mistake("E931", Place(system.origin.topology), f"{option}: {device}"))
+            found = find_devices(site, numbers.parameters[place][0], unit_of, direct=direct)
+            hint = _naming_what_is_held(system, site.kind, found)
+            raise ApcError(Mistake("E931", Place(system.origin.topology), f"{option}: {device}", hint=hint))
         if device is not None:
             result.setdefault(group.kind, device)
     if not result:
         raise no_device(system, option)
     return result
+
+
+def _naming_what_is_held(system: CompiledSystem, kind: Kind, found: Mapping[str, Device | str]) -> str:
+    """Return the entry of a hand at the first of several parts that a hand may hold, or nothing."""
+    part = next((own for own, device in found.items() if isinstance(device, Device)), "")
+    if kind.held or len(found) < 2 or not part or part.endswith("]"):
+        return ""
+    having = [
+        group.name
+        for group in system.groups
+        if any(_part(state.name) == part for state in system.kinds[group.kind].states)
+    ]
+    at = f", at: [{', '.join(having)}]" if len(having) < len(system.groups) else ""
+    return _HOLDS.format(part=part, at=at)
 
 
 def directions_of(system: CompiledSystem) -> dict[str, CompiledSystem]:

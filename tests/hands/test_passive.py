@@ -17,6 +17,7 @@ from apc.__main__ import run
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.eigen.dissipation import least_real, peak_gain
+from apc.frame.devices import with_hands
 from apc.hands.passivity import STABLE, UNSTABLE, PassiveHands, passive_hands
 from tests.topologies import AVERAGE, MESH, ROOT, SCENES, compiled, replaced, wall
 from tests.truths import LIBRARY
@@ -476,3 +477,52 @@ def test_a_wall_of_more_damping_than_its_device_is_never_passive(damping: str) -
 def test_a_wall_that_is_only_touched_has_no_critical_value() -> None:
     found = apc.critical(textbook("0.5 N*s/m", "0 m"), "wall.stiffness", criterion="passive")
     assert found.value is None and "where the scene starts: there nothing depends" in found.verdict
+
+
+TWO_MASSES = """\
+topology: two
+clocks: {haptic: 1 ms}
+peers: {user: {count: 1}}
+masses:
+  device: {mass: 0.1 kg, damping: 5 N*s/m}
+  cube: {mass: 1e6 kg, damping: 1e6 N*s/m}
+couplers:
+  contact: {type: SampledSpringDamper, a: device, b: cube, stiffness: 1000 N/m, clock: haptic}
+"""
+
+
+@pytest.mark.parametrize("hands", ["passive", "clamped", "held"])
+def test_what_a_hand_holds_is_named_by_the_line_of_the_message(hands: str, tmp_path: Path) -> None:
+    """The line, pasted, is understood; a cube that does not move is a wall, which needs K T/2 of damping."""
+    path = tmp_path / "two.yaml"
+    path.write_text(TWO_MASSES, encoding="utf-8")
+    with pytest.raises(ApcError, match=r"E931 .*a hand may hold any of device, cube") as refused:
+        with_hands(apc.compile(path), hands) if hands != "passive" else apc.passive_hands(apc.compile(path))
+    hint = refused.value.mistakes[0].hint
+    assert hint == "hands: {grip: {type: ConstantForce, flange: device, force: 0 N}}"
+    path.write_text(f"{TWO_MASSES}{hint}\n", encoding="utf-8")
+    system = apc.compile(path)
+    assert with_hands(system, hands).kinds
+    (mode,) = apc.passive_hands(system).modes
+    assert mode.needed == pytest.approx(1000 * 1e-3 / 2, rel=1e-4)
+
+
+def test_a_hand_holds_what_has_a_grip() -> None:
+    """A Falcon's mass and damping are those of the device above."""
+    falcon = replaced(TWO_MASSES, ("device: {mass: 0.1 kg, damping: 5 N*s/m}", "device: {type: Falcon}"))
+    (mode,) = apc.passive_hands(compiled(falcon)).modes
+    assert mode.needed == pytest.approx(1000 * 1e-3 / 2, rel=1e-4)
+
+
+def test_the_named_part_is_held_where_it_is(tmp_path: Path) -> None:
+    """A group without the part is left out of the entry."""
+    text = replaced(TWO_MASSES, ("{user: {count: 1}}", "{user: {count: 1}, server: {count: 1}}"))
+    text = text.replace("{mass", "{at: [user], mass").replace("{type: S", "{at: [user], type: S")
+    own = "type: SampledSpringDamper, a: ball, b: ground, stiffness: 1 N/m, clock: haptic"
+    text += f"  spring: {{at: [server], {own}}}\n"
+    text = text.replace("masses:\n", "masses:\n  ball: {at: [server], mass: 1 kg}\n")
+    with pytest.raises(ApcError, match="E931") as refused:
+        apc.passive_hands(compiled(text))
+    hint = refused.value.mistakes[0].hint
+    assert hint == "hands: {grip: {type: ConstantForce, flange: device, force: 0 N, at: [user]}}"
+    assert apc.passive_hands(compiled(f"{text}{hint}\n")).verdict
