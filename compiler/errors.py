@@ -8,7 +8,6 @@ Does not: print, or decide exit codes.
 
 from __future__ import annotations
 
-import operator
 import re
 import unicodedata
 from collections.abc import Iterable
@@ -209,4 +208,5 @@ def nearest(name: str, texts: Iterable[str], *, alike: float = 0.6) -> str:
 
 def _in_place(name: str, text: str) -> int:
     """Return how many characters two names have in common at the same distance from either end."""
-    return sum(map(operator.eq, name, text)) + sum(map(operator.eq, name[::-1], text[::-1]))
+    forwards, backwards = zip(name, text, strict=False), zip(name[::-1], text[::-1], strict=False)
+    return sum(one == other for pairs in (forwards, backwards) for one, other in pairs)

@@ -99,7 +99,7 @@ def read_linearized(root: Body, mistakes: Mistakes) -> Linearized | None:
     node = root.nodes.get("linearized")
     if node is None:
         return None
-    valid, items = "", (node,)
+    valid, items = "", tuple[Node, ...]((node,))
     if isinstance(node, NodeMapping):
         body = Body(node, ("equations", "valid"), "linearized", root.mistakes)
         valid, items = body.text("valid"), body.read("equations", _items, ())

@@ -92,10 +92,10 @@ def build_functions(
                 kind = replace(kind, linear=of_analysis, replaced=replaced, symbols=symbols)
             kinds.append(kind)
     dropped = []
-    for kind, writer in zip(system.kinds, writers, strict=True):
-        unread = (hold.variable for hold in kind.clocked.holds if symbol(hold.symbol) not in writer.known)
+    for ordered, writer in zip(system.kinds, writers, strict=True):
+        unread = (hold.variable for hold in ordered.clocked.holds if symbol(hold.symbol) not in writer.known)
         dropped += [(name, "nobody reads this held value") for name in unread]
-        dropped += [(send.name, "nobody hears it") for send in kind.sends if send.name not in heard]
+        dropped += [(send.name, "nobody hears it") for send in ordered.sends if send.name not in heard]
     numbers = {group: i for i, kind in enumerate(system.kinds) for group in kind.clocked.flat.groups}
     places = [numbers[group.name] for group in scene.groups]
     check_links(scene, kinds, places)
@@ -172,16 +172,20 @@ def _symbols(kind: SortedKind) -> tuple[tuple[str, str], ...]:
 
 
 def _check_states(kind: SortedKind, full: Kind, linear: Kind) -> None:
-    """Refuse equations of a linear analysis that have other states or held values."""
+    """Refuse equations of a linear analysis that have other states, held or sent values."""
     for whole, own in (
         ([state.name for state in full.states], [state.name for state in linear.states]),
         ([hold.name for hold in full.holds], [hold.name for hold in linear.holds]),
+        (
+            [name for send in full.sends for name in send.channels],
+            [name for send in linear.sends for name in send.channels],
+        ),
     ):
         if whole != own:
             part = next(part for part in kind.clocked.flat.parts if part.component.linearized is not None)
             names = ", ".join(sorted(set(whole) ^ set(own)))
             what = f"linearized of {part.component.name}: {names} would be in one set of equations only"
-            hint = "equations that keep the same states and held values"
+            hint = "equations that keep the same states, held and sent values"
             raise ApcError(Mistake("E514", part.component.place, what, hint=hint))
 
 

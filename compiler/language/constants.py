@@ -82,4 +82,4 @@ def check_constants(expression: Expr, text: str, place: Place) -> None:
 
 def _is_tiny(value: Fraction | float) -> bool:
     """Return whether a value is less than the least float, or a product or exponential rounded to zero."""
-    return abs(value) < LEAST and (value != 0 or isinstance(value, float)) and math.isfinite(value)
+    return abs(float(value)) < LEAST and (value != 0 or isinstance(value, float)) and math.isfinite(value)

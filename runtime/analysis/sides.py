@@ -269,7 +269,8 @@ def _names(switched: SwitchedKind, pieces: Sequence[Piece]) -> list[str]:
         ordered = sorted(sizes, key=lambda state: sizes[state])
         words = [f"on piece {number}" for number in range(1, len(ordered) + 1)]
         if len(ordered) == 2:
-            equal = np.isclose(*sizes.values(), rtol=EQUAL)
+            least, most = sorted(sizes.values())
+            equal = math.isclose(least, most, rel_tol=EQUAL)
             words = ["on one side", "on the other side"] if equal else ["off", "on"]
         text = ", ".join(names) or "an equation"
         for parts, state in zip(result, states, strict=True):

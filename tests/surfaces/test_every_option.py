@@ -90,7 +90,7 @@ CASES = [
 ]
 
 
-@pytest.mark.few(30)
+@pytest.mark.few(8)
 @pytest.mark.parametrize(("topology", "call"), CASES)
 def test_no_call_is_a_bug(
     topology: str, call: str, cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
