@@ -134,6 +134,7 @@ def compile_fmu(system: apc.CompiledSystem, folder: Path, peer: str = "") -> Non
     assert done.returncode == 0, done.stderr[:2000]
 
 
+@pytest.mark.whole
 def test_so_does_an_fmu_of_them(tmp_path: Path) -> None:
     compile_fmu(hostile(), tmp_path)
 
@@ -142,6 +143,7 @@ def test_so_does_an_fmu_of_them(tmp_path: Path) -> None:
 GROUPS = ["begin", "next", "a", "A", "a_1_link_b", "link_b_1", "newest_link_b", "class", "M_SQRT1", "site0_a"]
 
 
+@pytest.mark.whole
 def test_peers_of_any_name_are_distinct_in_an_fmu(tmp_path: Path) -> None:
     names = ["b_1", "b_1_newest", "b_1_way", "p", "p_sent"]
     system = compiled(topology(names, GROUPS, ("while", "linux"), ("x", "quanta")))
@@ -166,6 +168,7 @@ def test_identifiers_are_valid_and_of_several_no_two_are_equal(prefix: str) -> N
     assert not RESERVED & set(made)
 
 
+@pytest.mark.whole
 def test_random_names_compile(tmp_path: Path) -> None:
     chosen = random.Random(5)
     names = {

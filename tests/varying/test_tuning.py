@@ -208,6 +208,7 @@ def test_what_the_study_asks_is_written_into_the_topology(cli: Cli) -> None:
     assert 0.99 * limit <= next(one.value for one in model.parameters if one.name == K) <= limit
 
 
+@pytest.mark.whole
 def test_a_range_of_a_delay_is_of_constant_delays_and_changing_ones_are_reported_or_demanded() -> None:
     """A program of its own, packet by packet: 4 at 20 ms and 8 at 60 ms grow by 1.001684 a frame."""
     model = compiled(
