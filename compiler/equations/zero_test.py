@@ -146,12 +146,15 @@ def _float_at(node: Term, point: Mapping[Symbol, float]) -> float:
         return prod(values)
     if node.is_Pow:
         return float(values[0] ** values[1])
-    return ROUNDED[NAMES[node.func]](*values)
+    name = NAMES[node.func]
+    return abs(values[0]) if name == "abs" else ROUNDED[name](*values)
 
 
 def _is_identity(expression: Term) -> bool:
     """Say whether an expression is zero for all values of its symbols, by what functions have in common."""
     expression = expression.replace(Abs, sympy.Abs)
+    if expression == 0:
+        return True
     if expression.is_Mul:
         return any(map(_is_identity, expression.args))
     if expression.is_Pow:

@@ -123,7 +123,7 @@ def test_what_no_estimate_foresaw_ends_in_words(
     assert cli("check scene.yaml") == (
         1,
         "",
-        "apc check: E820 takes more memory than there is, 1 GB when all was given back. "
+        "apc check: E820 ran out of memory. "
         "Write: fewer peers that differ, fewer states, or a shorter time\n",
     )
 
