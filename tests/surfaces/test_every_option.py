@@ -85,8 +85,13 @@ def words_for(call: str, model: apc.CompiledSystem) -> list[str] | None:
     return [word.replace("_", " ") for word in call.split()]
 
 
+# All cases take an hour; each call is tried on every eighth topology, another one for each call.
+EVERY = 8
 CASES = [
-    (topology, call) for topology in TOPOLOGIES for call in CALLS if (topology, call.split()[0]) not in SLOW
+    (topology, call)
+    for row, topology in enumerate(TOPOLOGIES)
+    for column, call in enumerate(CALLS)
+    if (row + column) % EVERY == 0 and (topology, call.split()[0]) not in SLOW
 ]
 
 
