@@ -119,8 +119,8 @@ WAYS: dict[str, Callable[[str], Said]] = {
 REFUSED = {
     "dense": ("the matrix of one may have 1,000",),
     "determinant": ("hides the peers' own eigenvalues",),
-    "paper": ("E861", "E862", "the matrix of one may have 1,000"),
-    "export": ("E951",),
+    "paper": ("E861", "E862", "E808 watch of user has a kink", "the matrix of one may have 1,000"),
+    "export": ("E951", "E808 watch of user has a kink"),
     "box": ("E832", "the matrix of one may have 1,000"),
 }
 
