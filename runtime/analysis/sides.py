@@ -1,7 +1,7 @@
 """The one-sided linear models of a topology whose peers start at a kink.
 
 Takes: a `CompiledSystem`.
-Gives: `Side`, `SideVerdict`, `sides`, `worst_side`.
+Gives: `Side`, `SideVerdict`, `sides`, `worst_side`, `severity`.
 Guarantees: every combination of the pieces that meet at the start values, up to MOST_SIDES; where nothing has
 a kink there, the topology itself and nothing is computed twice.
 Does not: try peers of one group on different sides.
@@ -22,7 +22,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.peers import start_classes
 from apc.frame.decisions import SwitchedKind, find_switches
-from apc.frame.finite_equations import finite_equations
+from apc.frame.finite_equations import at_its_part, finite_equations
 from apc.frame.instance import Instance, Prepared, instance
 from apc.frame.jacobians import DECIDING, SiteJacobians, with_equations
 from apc.frame.kinks import EQUAL, Piece, Point, at_a_kink, names_of, one_sided, pieces_at, tie_indicators
@@ -62,13 +62,21 @@ class SideVerdict:
 
 
 def worst_side(verdicts: Sequence[SideVerdict]) -> int:
-    """Return the index of the worst verdict: not stable before undecided before stable, then the radius."""
+    """Return the index of the worst verdict."""
+    return max(range(len(verdicts)), key=lambda n: severity(verdicts[n].stable, verdicts[n].spectral_radius))
 
-    def badness(index: int) -> tuple[int, float]:
-        stable, radius = verdicts[index].stable, verdicts[index].spectral_radius
-        return {False: 2, None: 1, True: 0}[stable], radius if math.isfinite(radius) else math.inf
 
-    return max(range(len(verdicts)), key=badness)
+def severity(stable: bool | None, measure: float) -> tuple[int, float]:
+    """Return the rank of a verdict among those of several sides: the largest is the worst.
+
+    Parameters
+    ----------
+    stable
+        The verdict; None is undecided, which is worse than stable and better than unstable.
+    measure
+        What orders equal verdicts, larger if worse: a spectral radius, or a missing damping. NaN is worst.
+    """
+    return {False: 2, None: 1, True: 0}[stable], math.inf if math.isnan(measure) else measure
 
 
 def sides(system: CompiledSystem, prepared: Prepared) -> tuple[Side, ...]:
@@ -90,7 +98,13 @@ def sides(system: CompiledSystem, prepared: Prepared) -> tuple[Side, ...]:
         return (Side("", system, prepared),)
     with finite_equations(system.origin.topology), np.errstate(all="ignore"):
         scene = instance(system, prepared)
-        pieces = _pieces_of_groups(scene)
+        try:
+            pieces = _pieces_of_groups(scene)
+        except ApcError as error:
+            origin = system.origin
+            raise ApcError(
+                at_its_part(mistake, origin.topology, origin.texts) for mistake in error.mistakes
+            ) from None
     if not any(piece.taken for listed in pieces for piece in listed):
         return (Side("", system, prepared),)
     count = math.prod(map(len, pieces))
@@ -129,14 +143,19 @@ def _pieces_of_groups(scene: Instance) -> list[tuple[Piece, ...]]:
     classes = start_classes(scene)
     starting = StartClasses(scene, classes)
     found: list[list[tuple[Piece, ...]]] = [[] for _ in near]
-    for g, group in enumerate(starting.groups):
-        if near[group]:
-            site = starting.sites[g]
-            if not site.walkable:
-                _refuse_hidden_kink(site, starting, g)
-                continue
-            for point in _points(starting, g):
-                found[group].append(pieces_at(find_switches(site.equations), point))
+    for g, peers in enumerate(classes):
+        # Peers of several groups may start alike.
+        groups = {scene.exchange.group_of(run.start) for run in peers.runs}
+        site = starting.sites[g]
+        if not any(near[group] for group in groups):
+            continue
+        if not site.walkable:
+            _refuse_hidden_kink(site, starting, g)
+            continue
+        for point in _points(starting, g):
+            pieces = pieces_at(find_switches(site.equations), point)
+            for group in groups:
+                found[group].append(pieces)
     return [_joined(listed) if listed else smooth for listed in found]
 
 
@@ -317,5 +336,4 @@ def _too_many(scene: Instance, pieces: Sequence[Sequence[Piece]], count: int) ->
         f"{kinks}: {count} combinations of sides meet at the start values, and at most {MOST_SIDES} are "
         "analyzed"
     )
-    hint = "start values on one side of some of these kinks"
-    return ApcError(Mistake("E808", Place(scene.system.origin.topology), what, hint=hint))
+    return ApcError(Mistake("E808", Place(scene.system.origin.topology), what))

@@ -20,7 +20,7 @@ from apc.compiler.source.source import parse_source
 
 SOMEWHERE = Place("the scene")  # of a mistake in numbers by themselves
 
-_PART = re.compile(r"(?:^|\bder\(|\bslope of )(\w+)[.\[]")  # of what is not finite
+_PART = re.compile(r"(?:^|\bder\(|\bslope of )(\w+)(?:[.\[]| of )")  # of what is not finite, or has a kink
 
 # What Python's math module and CasADi's Newton solver say of a point where a function has no value.
 _NO_VALUE = ("math domain error", "rootfinder", "Evaluation failed", "Newton", "cannot convert NaN")

@@ -211,9 +211,8 @@ def _refused(switched: SwitchedKind, places: Sequence[int], why: str) -> ApcErro
 
 def at_a_kink(where: str, what: str) -> ApcError:
     """Return the refusal of a point without a linearization."""
-    text = f"{what}: there is no linearization at the start values"
-    hint = "start values on one side of the kink"
-    return ApcError(Mistake("E808", Place(where), text, hint=hint))
+    text = f"{what}: there is no linearization at the start values, only on one side of it"
+    return ApcError(Mistake("E808", Place(where), text))
 
 
 def one_sided(switched: SwitchedKind, taken: Mapping[int, bool], ties: Mapping[int, float]) -> Kind:

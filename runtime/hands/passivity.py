@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Analysis, analyze, lifted_groups, near_start
 from apc.analysis.contact_modes import contact_modes
 from apc.analysis.elements import is_linear
-from apc.analysis.sides import Side, sides
+from apc.analysis.sides import Side, severity, sides
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
@@ -168,8 +168,7 @@ def passive_hands(
         _one_sided_hands(side.system, side.prepared, fixed, certify=certify)
         for side in sides(system, prepared)
     ]
-    badness = {False: 2, None: 1, True: 0}
-    worst = max(each, key=lambda hands: (badness[hands.stable], _missing(hands)))
+    worst = max(each, key=lambda hands: severity(hands.stable, _missing(hands)))
     return replace(worst, left_out=(*replaced_hands(of_scene), *_limitations(system, prepared)))
 
 

@@ -16,7 +16,7 @@ from fractions import Fraction
 import numpy as np
 
 from apc.analysis.elements import is_linear
-from apc.analysis.sides import sides
+from apc.analysis.sides import severity, sides
 from apc.compiler.compiled import CompiledSystem, Link
 from apc.compiler.multiples import common_multiple
 from apc.frame.finite_equations import finite_equations
@@ -360,8 +360,12 @@ def judge_network(
         return None
     listed = sides(system, prepared or prepare(system))
     each = [_judge_network(side.system, side.prepared, certify=certify) for side in listed]
-    badness = {False: 2, None: 1, True: 0}
-    return max(each, key=lambda verdict: (badness[verdict.stable], verdict.mean_square_radius or math.inf))
+    return max(
+        each,
+        key=lambda verdict: severity(
+            verdict.stable, math.nan if verdict.mean_square_radius is None else verdict.mean_square_radius
+        ),
+    )
 
 
 def _judge_network(system: CompiledSystem, prepared: Prepared, *, certify: bool) -> NetworkVerdict:

@@ -89,7 +89,7 @@ def critical_text(critical: Critical) -> Lines:
         yield f"    {_sides(crossing)}{turns}, {crossing.proof}"
         if crossing.kind == PERIOD:
             yield from sentences(
-                "every period between makes a frame of too many ticks with the other clocks to be analysed"
+                "periods in the middle of this range make frames of too many ticks with the other clocks"
             )
         elif crossing.error > ROUGH * abs(crossing.value):
             yield "    no narrower: within its error the bounds on growth leave the verdict open"

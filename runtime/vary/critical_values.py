@@ -18,6 +18,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from apc.analysis.analysis import analyze, near_start, prepare_at_start
+from apc.analysis.sides import sides
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
@@ -32,7 +33,7 @@ from apc.option_value import option_value
 from apc.result import Look, Result
 from apc.threads import single_threaded
 from apc.vary.counts import count_range
-from apc.vary.crossing import CELL, Crossing, Line, Progress, Search, Verdict, search
+from apc.vary.crossing import CELL, Crossing, Line, Progress, Search, Verdict, search, stable_in_all
 from apc.vary.delays import pace
 from apc.vary.evaluator import (
     evaluator_of_many,
@@ -45,6 +46,7 @@ from apc.vary.growth import (
     BY_GROWTH,
     MEAN_SQUARE,
     NOMINAL,
+    NOWHERE,
     PASSIVE,
     PointLine,
     RadiusEvaluator,
@@ -53,11 +55,14 @@ from apc.vary.growth import (
     line_points,
     refuse_time,
 )
-from apc.vary.line import SPAN, CountLine, DelayLine, MatrixLine, delay_reach, judged
+from apc.vary.line import OPEN, SPAN, CountLine, DelayLine, MatrixLine, delay_reach, judged
 from apc.vary.periods import PeriodLine
-from apc.vary.timing_values import delay_now, reaches_period, refuse_phase
+from apc.vary.timing_values import delay_now, is_scaled, reaches_period, refuse_phase
 
 _PLACE = Place("critical value")
+
+# Refusals of a frame of too many ticks, states or intervals.
+TOO_LONG = ("E804", "E805", "E933")
 
 # The limits of a search in SI, None where not given.
 Ends = tuple[float | None, float | None]
@@ -186,12 +191,21 @@ def critical(
                 progress=progress,
             )
         elif timed and reaches_period(system, free):
+            if chosen_criterion == MEAN_SQUARE and not is_scaled(system, free):
+                refuse_time(system, free, _PLACE, chosen_criterion)
 
             def decide(changed: CompiledSystem) -> Verdict:
-                if by_growth:
+                if not by_growth:
+                    return judged(changed, prepared)
+                try:
                     return judge_at(changed, prepared, [], _PLACE, criterion=chosen_criterion)
-                return judged(changed, prepared)
+                except ApcError as error:
+                    # A frame may be too long, or grow beyond floats; a fault at every value is raised.
+                    if changed is system or error.mistakes[0].code not in (*NOWHERE, *TOO_LONG):
+                        raise
+                    return OPEN
 
+            decide(system)
             result = search(PeriodLine(system, free, decide, limits[0], limits[1], _PLACE), progress=progress)
         elif by_growth:
             refuse_time(system, free, _PLACE, chosen_criterion)
@@ -204,16 +218,29 @@ def critical(
                 result = replace(result, enters=True)  # where clamped devices shake all values are one
         elif timed:
             refuse_phase(system, free, _PLACE)
-            start = prepare_at_start(system, prepared, [free])
-            if start is None:
+            starts = [
+                prepare_at_start(side.system, side.prepared, [free]) for side in sides(system, prepared)
+            ]
+            if None in starts:
                 raise hangs_on_heard(system)
             begin = limits[0] or Fraction(0)
             end = limits[1] or delay_reach(system, free, begin, pieces=PIECES, further=FURTHER)[0]
             tell = pace(system, free, begin, end, place=_PLACE, progress=progress)
-            result = search(DelayLine(system, free, start, begin, end, tell))
+            result = stable_in_all(
+                [
+                    search(DelayLine(side.system, free, start, begin, end, tell))
+                    for side, start in zip(sides(system, prepared), starts, strict=True)
+                    if start is not None
+                ]
+            )
         else:
-            at_start = prepare_at_start(system, prepared, [free])
-            result = search(_line(system, free, ends, at_start or prepared), progress=progress)
+            each = []
+            at_start = None
+            for side in sides(system, prepared):
+                at_start = prepare_at_start(side.system, side.prepared, [free])
+                line = _line(side.system, free, ends, at_start or side.prepared)
+                each.append(search(line, progress=progress))
+            result = stable_in_all(each)
             if at_start and not (result.sided or parameters_suffice(system, prepared)):
                 # Contacts close or open along the way, and other motions are left out of the verdict.
                 result = search(_singly(system, free, ends, prepared, NOMINAL), progress=progress)

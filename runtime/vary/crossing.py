@@ -21,6 +21,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from operator import itemgetter
 from typing import Protocol
 
 import numpy as np
@@ -102,11 +103,11 @@ class Crossing:
     """A value at which the spectral radius crosses 1, right to `error`, both in SI.
 
     `stable_side` is "below" or "above"; `frequency_hz` is that of the motion that grows beside it; `kind` is
-    "crossing", or "jump" where the radius is discontinuous: a packet comes a tick later, events change places
-    or a contact closes; or "count" where it is the number of peers on the stable side of a change from one
-    number to the next, or "period" between two periods of a clock, with no other between that makes a short
-    enough frame; `proof` says how the value is known. `stable_at` is the verdict at a jump's own value, None
-    of any other crossing, or if undecided.
+    "crossing", or "jump" where the radius is discontinuous: a packet comes a tick later, events change
+    places or a contact closes; or "count" where it is the number of peers on the stable side of a change from
+    one number to the next; or "period" between two periods of a clock, where no period in the middle makes a
+    short enough frame. `proof` says how the value is known. `stable_at` is the verdict at a jump's own value,
+    None of any other crossing, or if undecided.
     """
 
     value: float
@@ -218,6 +219,43 @@ class _Samples:
         order = np.argsort(points, kind="stable")
         values, slopes = both(self.values, other.values), both(self.slopes, other.slopes)
         return _Samples(points[order], values[order], slopes[order])
+
+
+def stable_in_all(searches: Sequence[Search]) -> Search:
+    """Return the search for the values at which all of several models are stable.
+
+    Parameters
+    ----------
+    searches
+        One for each model, along the same parameter; those with no verdict at any value restrict nothing.
+    """
+    if len(searches) == 1:
+        return searches[0]
+    decided = [one for one in searches if one.stable]
+    listed = sorted(
+        ((edge.value, n, edge) for n, one in enumerate(decided) for edge in one.edges), key=itemgetter(0, 1)
+    )
+    now = [0] * len(decided)
+    edges: list[Crossing] = []
+    stable = [all(one.stable[0] for one in decided)] if decided else []
+    for _, n, edge in listed:
+        now[n] += 1
+        together = all(one.stable[place] for one, place in zip(decided, now, strict=True))
+        if together is not stable[-1]:
+            edges.append(edge)
+            stable.append(together)
+    return Search(
+        edges=tuple(edges),
+        stable=tuple(stable),
+        scanned=(max(one.scanned[0] for one in searches), min(one.scanned[1] for one in searches)),
+        whole=all(one.whole for one in searches),
+        looked=sum(one.looked for one in searches),
+        enters=any(one.enters for one in searches),
+        sided=all(one.sided for one in searches),
+        left_open=tuple(dict.fromkeys(gap for one in searches for gap in one.left_open)),
+        why=next((one.why for one in searches if one.why), ""),
+        alone=tuple(dict.fromkeys(value for one in searches for value in one.alone)),
+    )
 
 
 def search(line: Line, *, first: bool = False, progress: Progress | None = None) -> Search:

@@ -10,7 +10,8 @@ A period changes the frame, the least common multiple of all periods. Where all 
 as where there is one, every value has as many ticks in a frame: the axis is continuous. Beside a clock of
 another period only commensurate values are analysed: of p/q times the common divisor of the other periods, a
 frame has about as many ticks as p and q together. Between two of these of different verdicts the simplest
-fraction comes next, as long as there is one. What is left is the resolution, and the error of the answer.
+fraction of the middle third comes next, as long as its frame is short. The remaining gap is the error of the
+answer.
 """
 
 from __future__ import annotations
@@ -104,7 +105,6 @@ class PeriodLine(JudgedLine):
         while True:
             third = (high - low) / 3
             value = period_between(self.system, self.free, unit, low + third, high - third)
-            value = value or period_between(self.system, self.free, unit, low, high)
             at = None if value is None else self.judge(value)
             if value is None or at is None or at.stable is None:
                 break

@@ -174,3 +174,90 @@ def test_where_a_path_crosses_the_kink_no_mean_slope_is_used(tmp_path: Path) -> 
 def test_what_has_no_side_is_refused_elsewhere(tmp_path: Path) -> None:
     with pytest.raises(ApcError, match="E808"):
         apc.feel(model(tmp_path, f"max(0, K*{X})", ", K: 100 N/m"), [5.0])
+
+
+def test_a_kink_inside_a_nonlinear_loop_is_refused_and_beside_it_is_not(tmp_path: Path) -> None:
+    """z + z³/L² = max(0, x): behind the kink dz/dx = 1/(1 + 3 z²/L²)."""
+    loop = component("z + z^3/L^2 = max(0, flange.x)", "flange.f = K*z", variables="z:")
+    shelf = library(tmp_path, loop)
+    text = topology(", K: 100 N/m").replace(", clock: tick", "")
+    (line,) = told(apc.analyze, compiled(text, shelf))
+    assert "E808" in line
+    assert "nonlinear loop" in line
+    behind = compiled(text.replace("x: 0 m", "x: 1 mm"), shelf)
+    # s² + 20/s s + k = 0 with k = 100/s²/(1 + 3 z²), z + z³ = 1e-3: nearly critically damped.
+    z = 1e-3 - 1e-9
+    slowest = -10 + math.sqrt(100 - 100 / (1 + 3 * z * z))
+    found = apc.analyze(behind)
+    assert math.log(found.spectral_radius) / found.frame_s == pytest.approx(slowest, abs=1e-7)
+
+
+EDGES = """\
+component: Pushes
+connectors: {object: Flange}
+sends: {x: sample(object.x)}
+parameters: {K: {unit: N/m, default: 100}, clock: clock, link: link}
+variables: {f: {unit: N}}
+equations:
+  - f = sum(max(0, K*(sample(object.x) - others.x)))
+  - object.f = hold(f)
+"""
+
+
+def test_a_kink_between_two_peers_is_one_of_each(tmp_path: Path) -> None:
+    """Two masses at one place, each pushed back by what it is beyond the other: both, one or none acts."""
+    text = (
+        "topology: pair\nclocks: {tick: 1 ms}\npeers: {a: {count: 1}, b: {count: 1}}\n"
+        f"masses: {{cube: {{mass: {MASS} kg, damping: {DAMPING} N*s/m}}}}\n"
+        "couplers: {own: {type: Pushes, object: cube, K: 60000 N/m, clock: tick, link: lan}}\n"
+        "links: {lan: {clock: tick, delay: 0 ms}}\n"
+    )
+    found = apc.analyze(compiled(text, library(tmp_path, EDGES)))
+    rate = DAMPING / MASS
+    decay = math.exp(-rate * PERIOD)
+    reach = (1 - decay) / rate
+    push = np.array([(PERIOD - reach) / DAMPING, (1 - decay) / DAMPING])
+    truths = []
+    for on_a, on_b in itertools.product((0, 1), repeat=2):
+        step = np.zeros((4, 4))
+        step[:2, :2] = step[2:, 2:] = [[1.0, reach], [0.0, decay]]
+        step[:2, [0, 2]] -= on_a * 60e3 * np.outer(push, [1, -1])
+        step[2:, [0, 2]] -= on_b * 60e3 * np.outer(push, [-1, 1])
+        values = np.linalg.eigvals(step)
+        truths.append(float(abs(values[abs(values - 1) > 1e-9]).max()))
+    assert sorted(side.spectral_radius for side in found.sides) == pytest.approx(sorted(truths), abs=1e-9)
+    assert found.spectral_radius == pytest.approx(max(truths), abs=1e-9)
+
+
+def test_a_critical_delay_is_that_of_the_worse_side() -> None:
+    """A wall of 1000 N/m and 0.5 N·s/m that is just touched, stepped exactly with a force that acts late."""
+    mass, damping, stiffness, virtual = 0.5, 2.0, 1000.0, 0.5
+    text = (
+        "topology: wall\nclocks: {tick: 1 ms}\npeers: {user: {count: 1}}\n"
+        f"masses: {{device: {{mass: {mass} kg, damping: {damping} N*s/m}}}}\n"
+        f"couplers: {{it: {{type: VirtualWall, flange: device, stiffness: {stiffness} N/m,"
+        f" damping: {virtual} N*s/m, clock: tick}}}}\n"
+    )
+
+    def radius_at(delay: float) -> float:
+        """Return the radius over (x, v, x before, forces of the three ticks before), 2 ms ≤ delay < 3 ms."""
+        whole = int(delay / PERIOD)
+        assert whole == 2
+        step = np.zeros((6, 6))
+        step[2, 0] = step[4, 3] = step[5, 4] = 1.0  # one tick older
+        step[3, [0, 2]] = stiffness + virtual / PERIOD, -virtual / PERIOD
+        late = delay - whole * PERIOD
+        motion = np.eye(2)
+        for length, force in ((late, 5), (PERIOD - late, 4)):  # of tick k − 3, then of tick k − 2
+            e = math.exp(-damping / mass * length)
+            way = (1 - e) * mass / damping
+            part = np.array([[1.0, way], [0.0, e]])
+            step[:2] = part @ step[:2]
+            step[:2, force] -= np.array([(length - way) / damping, (1 - e) / damping])
+            motion = part @ motion
+        step[:2, :2] = motion
+        return float(abs(np.linalg.eigvals(step)).max())
+
+    found = apc.critical(compiled(text), "it.delay")
+    assert found.value is not None
+    assert radius_at(found.value - 1e-9) < 1 < radius_at(found.value + 1e-9)
