@@ -41,7 +41,7 @@ LinearForm: TypeAlias = tuple[
 
 ZERO, ONE, HALF = sympy.S.Zero, sympy.S.One, sympy.S.Half
 LARGEST = int(sys.float_info.max)
-FLOAT_DIGITS = 17  # decimal digits that tell a float from all others
+FLOAT_DIGITS = 17  # decimal digits that identify a float
 
 
 class NoDerivativeError(Exception):

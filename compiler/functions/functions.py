@@ -73,20 +73,20 @@ def build_functions(
     """
     scene = system.scene
     timings = Timings(scene)
-    writers, heard = _followed(system)
+    writers, received = _followed(system)
     kinds = []
     if linear is None:
-        kinds = [_kind(writer, heard, timings) for writer in writers]
+        kinds = [_kind(writer, received, timings) for writer in writers]
     else:
-        linear_writers, linear_heard = _followed(linear)
+        linear_writers, linear_received = _followed(linear)
         for writer, other in zip(writers, linear_writers, strict=True):
             for name in {**writer.parameters, **other.parameters}:  # one vector serves both
                 writer.parameter(name)
                 other.parameter(name)
             replaced = tuple(_replaced(writer.kind))
-            kind = _kind(writer, heard, timings)
+            kind = _kind(writer, received, timings)
             if replaced:
-                of_analysis = _kind(other, linear_heard, timings)
+                of_analysis = _kind(other, linear_received, timings)
                 _check_states(writer.kind, kind, of_analysis)
                 symbols = _symbols(writer.kind)
                 kind = replace(kind, linear=of_analysis, replaced=replaced, symbols=symbols)
@@ -95,7 +95,7 @@ def build_functions(
     for ordered, writer in zip(system.kinds, writers, strict=True):
         unread = (hold.variable for hold in ordered.clocked.holds if symbol(hold.symbol) not in writer.known)
         dropped += [(name, "nobody reads this held value") for name in unread]
-        dropped += [(send.name, "nobody hears it") for send in ordered.sends if send.name not in heard]
+        dropped += [(send.name, "nobody hears it") for send in ordered.sends if send.name not in received]
     numbers = {group: i for i, kind in enumerate(system.kinds) for group in kind.clocked.flat.groups}
     places = [numbers[group.name] for group in scene.groups]
     check_links(scene, kinds, places)
@@ -135,13 +135,13 @@ def build_functions(
 def _followed(system: SortedSystem) -> tuple[list[Writer], list[str]]:
     """Return a writer of each kind, with all that is needed written, and the names that are received."""
     writers = [Writer(kind) for kind in system.kinds]
-    before, heard = -1, list[str]()
+    before, received = -1, list[str]()
     while before < (before := sum(len(writer.known) for writer in writers)):  # until nothing new is read
         for writer in writers:
-            writer.follow(heard)
+            writer.follow(received)
         receives = (number for writer in writers for number in writer.read(writer.kind.receives))
-        heard = list(dict.fromkeys(name for receive in receives for name in receive.sends))
-    return writers, heard
+        received = list(dict.fromkeys(name for receive in receives for name in receive.sends))
+    return writers, received
 
 
 def _replaced(kind: SortedKind) -> Iterable[Replaced]:
@@ -156,7 +156,7 @@ def _replaced(kind: SortedKind) -> Iterable[Replaced]:
 
 
 def _symbols(kind: SortedKind) -> tuple[tuple[str, str], ...]:
-    """Return the symbols of published conditions with whole names, none unless every part has some."""
+    """Return the symbols of published conditions by full parameter name, none unless every part has some."""
     result = []
     for part in kind.clocked.flat.parts:
         if part.section == "hands":
@@ -173,7 +173,7 @@ def _symbols(kind: SortedKind) -> tuple[tuple[str, str], ...]:
 
 def _check_states(kind: SortedKind, full: Kind, linear: Kind) -> None:
     """Refuse equations of a linear analysis that have other states, held or sent values."""
-    for whole, own in (
+    for nonlinear, own in (
         ([state.name for state in full.states], [state.name for state in linear.states]),
         ([hold.name for hold in full.holds], [hold.name for hold in linear.holds]),
         (
@@ -181,9 +181,9 @@ def _check_states(kind: SortedKind, full: Kind, linear: Kind) -> None:
             [name for send in linear.sends for name in send.channels],
         ),
     ):
-        if whole != own:
+        if nonlinear != own:
             part = next(part for part in kind.clocked.flat.parts if part.component.linearized is not None)
-            names = ", ".join(sorted(set(whole) ^ set(own)))
+            names = ", ".join(sorted(set(nonlinear) ^ set(own)))
             what = f"linearized of {part.component.name}: {names} would be in one set of equations only"
             hint = "equations that keep the same states, held and sent values"
             raise ApcError(Mistake("E514", part.component.place, what, hint=hint))

@@ -154,7 +154,7 @@ def make_plan(instance: Instance, method: str = "auto") -> Plan:
 
 
 def _long_lines(schedule: Schedule) -> bool:
-    """Say whether many packets are on their way at a time, each for many frames."""
+    """Return whether many packets are in transit at a time, each for many frames."""
     packets = sum(schedule.depths)
     return packets > max(LONG_LINES, MANY_FRAMES * len(schedule.sent))
 

@@ -31,8 +31,8 @@ from apc.frame.start_classes import StartClasses
 
 # Combinations of pieces that are analyzed one by one.
 MOST_SIDES = 16
-# Inside a nonlinear loop: random directions, steps from the start (SI), and how the relative gap of slopes
-# between both ends of a step tells a kink, which keeps it, from a curve, where it shrinks as the step.
+# Inside a nonlinear loop: random directions, steps from the start (SI), and the relative gap of slopes
+# between both ends of a step: at a kink it stays, on a curve it shrinks with the step.
 DIRECTIONS, STEPS, HALF_STEEP, LEAST_GAP = 8, (1e-7, 1e-8, 1e-9), 0.5, 1e-6
 
 _Taken = tuple[tuple[int, bool], ...]  # for each tied decision of a kind, whether it is taken
@@ -144,7 +144,7 @@ def _pieces_of_groups(scene: Instance) -> list[tuple[Piece, ...]]:
     starting = StartClasses(scene, classes)
     found: list[list[tuple[Piece, ...]]] = [[] for _ in near]
     for g, peers in enumerate(classes):
-        # Peers of several groups may start alike.
+        # A class of equal start values may contain peers of several groups.
         groups = {scene.exchange.group_of(run.start) for run in peers.runs}
         site = starting.sites[g]
         if not any(near[group] for group in groups):

@@ -46,7 +46,7 @@ def write_topology(path: Path, text: str, system: CompiledSystem, values: Mappin
     Parameters
     ----------
     path
-        The file to write; what the topology names is looked for beside it.
+        The file to write; files that the topology names are searched for in its folder.
     text, system, values
         As for `with_values`.
 
@@ -191,7 +191,7 @@ def _paths(root: _Node, system: CompiledSystem, free: Free) -> list[Sequence[str
 
 
 def _in_set(root: _Node, group: str, name: str) -> Sequence[str]:
-    """Return where a group sets a number: by itself, or as an entry of a vector."""
+    """Return the path at which a group sets a number: its own key, or an entry of a vector."""
     whole, index = whole_and_index(name)
     if index and isinstance(_at(root, ("peers", group, "set", whole)), _List):
         return ("peers", group, "set", whole, str(index))
@@ -203,7 +203,7 @@ def _in_set(root: _Node, group: str, name: str) -> Sequence[str]:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Node:
-    """From `start` to `end` in the text; `alias` is where only the name of a node stands, which is `node`."""
+    """From `start` to `end` in the text; `alias` marks an alias, of which `node` is the value."""
 
     start: int
     end: int

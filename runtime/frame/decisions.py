@@ -56,7 +56,7 @@ class Decision:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Opened:
-    """A function with its decisions as symbols: `where` it stands, its inputs, its output column.
+    """A function with its decisions as symbols: its location `where`, its inputs, its output column.
 
     `rows` name what its rows compute; a function of many variants computes them again and again.
     """
@@ -97,7 +97,7 @@ class _Step:
 
 
 class _Walk:
-    """Opens the functions of one kind; equal decisions, wherever they stand, are one."""
+    """Replaces decisions in the functions of one kind by symbols; equal decisions share a symbol."""
 
     def __init__(self) -> None:
         self.numbers: dict[Any, int] = {}
@@ -147,7 +147,7 @@ class _Walk:
         return inputs, casadi.densify(column)
 
     def look(self, table: Interpolation, at: _Step) -> _Step:
-        """Return what a table says: a value like another, that of no decision."""
+        """Return the value of a table, which is no decision."""
         number = self.number((LOOK, table, at.number))
         return _Step(symbolic(LOOK)(table, at.expression), number, at.moves, at.decided)
 
@@ -205,7 +205,7 @@ def find_switches(kind: Kind) -> SwitchedKind:
 
 
 def functions_of(kind: Kind) -> list[tuple[tuple[str, int, int], Any, tuple[str, ...], tuple[str, ...]]]:
-    """Return a kind's functions: where each stands, itself, its arguments' names, and those of its rows."""
+    """Return a kind's functions: the location of each, itself, and the names of its arguments and rows."""
     states = tuple(state.name for state in kind.states)
     listed: list[tuple[tuple[str, int, int], Any, tuple[str, ...], tuple[str, ...]]] = [
         (("derivative", 0, 0), kind.derivative, ("x", "u", "p", "t"), states)
@@ -228,7 +228,7 @@ def _changed(kind: Kind, opened: _Opened, symbol: Any, operands: Sequence[Any]) 
     """Return the names of what a decision changes in a function."""
     what, p, place = opened.where
     changed = opened.names(opened.output, symbol)
-    if what == "edge":  # what is computed of what is heard
+    if what == "edge":  # outputs that depend on the received value
         partition = kind.clocks[p]
         inputs = partition.tick.sx_in()
         computed = partition.tick(*inputs)

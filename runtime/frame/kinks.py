@@ -29,7 +29,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.interpolation import jacobian
 from apc.frame.decisions import SwitchedKind, decided_kind, find_switches
 
-# A guard of this size relative to its terms is zero: they are rounded some ten times on the way to it.
+# A guard of this size relative to its terms is zero: its evaluation rounds some ten times.
 TIE = 2.0**-46
 # What a guard of zeros alone is shifted by: any number that changes no other sum.
 SMALLEST = 1e-300

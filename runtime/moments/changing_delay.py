@@ -41,8 +41,8 @@ from apc.unserved import UnservedError
 # What a link whose packets come late is like: the newest that has arrived is heard, until there is another.
 HOLDING = Channel(None, None, "uniform", "newest", "hold", None)
 
-# Packets in a row that are tried, of the least delay and then of the largest: all up to so many, and of more
-# a third, a half and two thirds of the least delay.
+# Packets in a row that are tried, of the least delay and then of the largest: all up to the first number, and
+# up to the second those with a third, a half and two thirds of the least delay.
 LONGEST, LONGER = 8, 12
 
 # A gain is proved to be below so much more than it is: rounding takes a part of what lies between.

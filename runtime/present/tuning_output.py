@@ -164,11 +164,11 @@ def _changing_lines(tuning: Tuning) -> Lines:
     """Yield what is proved of the gains where the delay changes from packet to packet."""
     if tuning.delay is None:
         return
-    told: dict[str, list[str]] = {}
+    gains_of: dict[str, list[str]] = {}
     for counts, found in tuning.changing:
         numbers = ", ".join(f"{label} {number}" for label, number in counts)
-        told.setdefault(changing_text(found, tuning.delay), []).append(numbers)
-    for text, where in told.items():
+        gains_of.setdefault(changing_text(found, tuning.delay), []).append(numbers)
+    for text, where in gains_of.items():
         yield from wrapped(text, "  ", "    ")
         if any(where):
             yield from wrapped(f"with {'; '.join(where)}", "    ", "    ")

@@ -99,7 +99,7 @@ def critical_text(critical: Critical) -> Lines:
     yield f"  {counted(critical.looked, 'value')} looked at: two crossings near to each other could hide"
     if critical.alone:
         ends = " and ".join(quantity(value, unit) for value in critical.alone)
-        yield from sentences(f"at {ends} itself the verdict is another than beside it")
+        yield from sentences(f"at {ends} the verdict differs from that at all neighbouring values")
     if critical.left_open:
         parts = ", ".join(_span(pair, unit) for pair in critical.left_open[:SHOWN])
         rest = f" and {len(critical.left_open) - SHOWN} more" if len(critical.left_open) > SHOWN else ""

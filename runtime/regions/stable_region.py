@@ -354,7 +354,7 @@ def _scales(system: CompiledSystem, free: Free) -> bool:
 
 
 def _refuse_two_times(system: CompiledSystem, times: Sequence[Free]) -> None:
-    """Refuse a period beside another time, unless all clocks scale with it: ApcError E903."""
+    """Refuse a period together with another time, unless all clocks scale with it: ApcError E903."""
     if len(times) < 2:
         return
     for free in times:

@@ -87,7 +87,7 @@ def _lines(page: str, exact: bool) -> list[_Line]:
 
 
 def _decoded(figures: list[str], found: re.Match[str]) -> str:
-    """Append the text of a figure to `figures`; return what stands for it in its line."""
+    """Append the text of a figure to `figures`; return its replacement in the line."""
     try:
         figures.append(base64.b64decode(found[1], validate=True).decode("utf-8"))
     except (binascii.Error, ValueError):

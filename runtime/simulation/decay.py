@@ -42,8 +42,8 @@ RAMP = 0.05  # share of the range of the window from which a ramp counts
 OPEN = 0.5
 LARGE = 0.1  # share of the largest amplitude from which a pole that is not known leaves the rate open
 FADED = 1e-10  # share of the largest second difference from which a sample counts
-STEADY = 0.5  # share of the range of the last quarter that the step to it must be, for a motion that goes on
-KEPT = 0.8  # share of a step that the next but one must keep, for a motion that goes on
+STEADY = 0.5  # share of the range of the last quarter that the step to it must be, for a drift
+KEPT = 0.8  # share of a step that the next but one must keep, for a drift
 LATE = 0.9  # share of the samples: a motion that ends before has ended
 UNIT = float(np.finfo(np.float64).eps)
 PARTS = ((0.0, 0.7), (0.3, 1.0))  # of the window, which are fitted again
@@ -65,7 +65,7 @@ class Fit:
 
     `rate` in 1/s is that of the slowest exponential, positive if it grows, right to `error`; 0 ± inf where
     nothing is known. `span` is the length of the window in seconds, and `ended` whether nothing moves after
-    it. `oscillation` is the largest one at the end, None if nothing oscillates. `ramp` says that some
+    it. `oscillation` is the largest one at the end, None if nothing oscillates. `ramp`: some
     position moves on at a constant velocity, or at a constant acceleration.
     """
 
@@ -101,7 +101,7 @@ _Line = tuple[int, float, float]
 
 @dataclass(frozen=True, slots=True)
 class _Rate:
-    """A rate in 1/s and its error, the line of the largest oscillation, and whether something moves on."""
+    """A rate in 1/s and its error, the line of the largest oscillation, and whether something drifts."""
 
     rate: float
     error: float
@@ -147,7 +147,7 @@ def fit_motion(step: float, values: Floats, scale: Floats) -> Fit | None:
         return None
     last = min(int(moving[-1]) + 1, len(scaled) - 1)
     ended = last < LATE * len(scaled)
-    # What grows fast is rounding beside its end until a short time before.
+    # What grows fast is rounding compared with its end until a short time before.
     curve = np.abs(np.diff(scaled[: last + 1], 2, axis=0)).max(axis=1, initial=0.0)
     begun = int(np.argmax(curve > FADED * curve.max(initial=0.0)))
     first = max(min(max(last // 2, begun), last + 1 - FEWEST), 0)
@@ -165,7 +165,7 @@ def fit_motion(step: float, values: Floats, scale: Floats) -> Fit | None:
         if found is None or (other is not None and other.error < found.error):
             found = other
     if found is None:
-        found = _Rate(0.0, math.inf, None, _goes_on(window))
+        found = _Rate(0.0, math.inf, None, _drifts(window))
     crests = None
     if found.line is not None:
         place, frequency, off = found.line
@@ -213,7 +213,7 @@ def _by_poles(step: float, window: Floats) -> _Rate | None:
         largest = max(turning, key=lambda i: float(size[i]))
         frequency, error = (float(v / (2 * np.pi)) for v in (abs(every.s[largest].imag), off[largest]))
         line = int(np.argmax(every.amplitudes[largest])), frequency, error
-    ramp = bool((every.ramps > RAMP * np.ptp(window, axis=0)).any()) and _goes_on(window)
+    ramp = bool((every.ramps > RAMP * np.ptp(window, axis=0)).any()) and _drifts(window)
     return _Rate(float(every.s.real[slowest]), float(off[slowest]) + doubt, line, ramp)
 
 
@@ -263,7 +263,7 @@ def _by_ranges(step: float, window: Floats) -> _Rate | None:
     halves = np.diff(step * (cross + motion[cross] / (motion[cross] - motion[cross + 1])))
     frequency = float(1 / (2 * halves.mean()))
     off = SAFETY * frequency * float(halves.std() / halves.mean()) / math.sqrt(len(halves))
-    return _Rate(rate, error, (channel, frequency, off), _goes_on(window))
+    return _Rate(rate, error, (channel, frequency, off), _drifts(window))
 
 
 def _straightened(window: Floats) -> Floats:
@@ -275,8 +275,8 @@ def _straightened(window: Floats) -> Floats:
     return np.asarray(rows.reshape(window.shape))
 
 
-def _goes_on(window: Floats) -> bool:
-    """Return whether the mean of some channel moves on from quarter to quarter, by no less each time.
+def _drifts(window: Floats) -> bool:
+    """Return whether the mean of some channel drifts from quarter to quarter, by no less each time.
 
     The step to the last quarter must be a large share of its range: what oscillates more does not drift.
     """

@@ -17,8 +17,8 @@ visible.
 
 The settling time of a position is the time of its last sample outside `BAND` of its range (highest less
 lowest value) around its last value; that of a motion is the largest of its positions. It is None if it is in
-the last tenth of the duration. A position whose range is rounding beside those of its unit has none. An angle
-is a position, too.
+the last tenth of the duration. A position whose range is rounding compared with those of its unit has none. An
+angle is a position, too.
 
 Without forces that change with time the verdict of a linear topology is consistent with that of `analyze`:
 where the two contradict each other (a mode that the motion does not excite, a duration too short) it is "not
@@ -74,7 +74,7 @@ FEWEST_GROUPS = 16  # of rows whose extremes are kept together, whatever their n
 MOST_FITTED = 1024  # positions whose last rows are kept for a fit
 SHORT = "the duration is too short, or the motion too irregular, for a decay rate"
 CONTRADICTION = "the motion within this duration does not show the verdict of the linear topology"
-MOST_LINEAR = 60  # peers of a linear topology that is analysed beside a motion
+MOST_LINEAR = 60  # peers of a linear topology that is analyzed together with a motion
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +110,7 @@ class Extent:
 class Summary:
     """A simulation in numbers, SI.
 
-    `verdict` is one of those above; `reason` says why it is not determined. `settled` is the settling time in
+    `verdict` is one of those above; `reason` is why it is not determined. `settled` is the settling time in
     s, at most `settled_error` too large. `fit` is that of the last part of the motion, `oscillating` the name
     of the position of its oscillation. `driven_until` is the last time in s at which an equation changed with
     time alone. `overshoot` is a part of the step from first to last. `copies` are (name, distance at the end)

@@ -43,7 +43,7 @@ HINF = "error_hinf"
 
 # What hands feel, by its name in a demand: its unit, and whether it is at a frequency. `error_h2` is the rms
 # at the ticks of a copy's error for white forces of 1 N rms at all hands, `error_hinf` the largest gain from
-# any forces, which add up to 0 over peers that are alike, to how far a copy is from the mean of all.
+# any forces, which add up to 0 over equal peers, to how far a copy is from the mean of all.
 FELT = {
     "impedance": ("N*s/m", True),
     "transmitted": ("m/s/N", True),
@@ -166,7 +166,7 @@ def read_demands(
         One of them: what is to be best, a gain, `spectral_radius`, `settling_time`, what is felt such as
         `feel.error at 1 Hz`, or a weighted sum of these in SI, `feel.damping - 0.01*coordination.stiffness`.
     subject
-        Demands beside stability: `decay=60 dB in 2 s`, `feel.impedance at 5 Hz < 20 N*s/m`,
+        Demands in addition to stability: `decay=60 dB in 2 s`, `feel.impedance at 5 Hz < 20 N*s/m`,
         `delay=changing`.
     over
         What has to be borne: `user.count=2:10`, `device.mass=±20%`, `lan.delay=8 ms:20 ms`.

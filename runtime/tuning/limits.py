@@ -242,7 +242,7 @@ class Limits:
     def asked(
         self, setting: int, points: Floats, *, bounded: bool = False, view: Demands | None = None
     ) -> Floats:
-        """Return how far points (k, m + b) are from the demands beside stability, and the level (k, q).
+        """Return how far points (k, m + b) are from the demands other than stability, and the level (k, q).
 
         Parameters
         ----------

@@ -61,9 +61,9 @@ FIRST_HALF = 1e-10
 # Steps of Newton's method, of Brent's, and of a bisection by verdicts.
 NEWTON, BRENT, HALVINGS = 12, 200, 60
 
-# How far inside a stretch its ends are sampled where the verdict changes in the cell beside, relative to the
-# value or the least size.
-BESIDE = 1e-9
+# How far inside a stretch its ends are sampled where the verdict changes in the neighbouring cell, relative to
+# the value or the least size.
+INWARDS = 1e-9
 
 # The radius is discontinuous in a bracket narrower than this, relative to the value, in which it changes by
 # more.
@@ -175,8 +175,8 @@ class Search:
     at; `whole` is False where an eigenvalue kept so near to the circle that not every cell could be cleared;
     `enters` says whether any eigenvalue changed; `sided` whether each value to begin with, but those next to
     0, lies on a side; `left_open` are the stretches that no analysis decides; `why` says why the search
-    ended before its end. `alone` are ends of a stretch at which the verdict is another than on all values
-    beside them: as where a stiffness of 0 takes a force away that every other value leaves.
+    ended before its end. `alone` are ends of a stretch at which the verdict differs from that at all
+    neighbouring values: as where a stiffness of 0 takes a force away that every other value leaves.
     """
 
     edges: tuple[Crossing, ...]
@@ -447,9 +447,9 @@ def _cubic(t: Floats, start: Complexes, end: Complexes, slope: Complexes, end_sl
 
 
 def _with_ends_beside(stretch: Stretch, samples: _Samples) -> tuple[_Samples, list[float]]:
-    """Return the samples with an end as it is just inside, where the verdict changes in the cell beside it.
+    """Return the samples with an end replaced by a point just inside, where the verdict changes next to it.
 
-    Also, the ends at which the verdict is another than just inside.
+    Also, the ends at which the verdict differs from that just inside.
     """
     alone = []
     for place, next_place, way in ((0, 1, 1), (-1, -2, -1)):
@@ -457,8 +457,8 @@ def _with_ends_beside(stretch: Stretch, samples: _Samples) -> tuple[_Samples, li
         if len(stable) < 2 or stable[place] == stable[next_place]:
             continue
         end = float(samples.points[place])
-        beside = end + way * BESIDE * max(abs(end), stretch.least)
-        inside = _sided(_sampled(stretch, np.array([beside])), ends=False)
+        near_end = end + way * INWARDS * max(abs(end), stretch.least)
+        inside = _sided(_sampled(stretch, np.array([near_end])), ends=False)
         if len(inside.points) and (inside.growth[0] < 0) == stable[next_place]:
             at_end = replace(inside, points=np.array([end]))
             others = samples.points != end
@@ -511,7 +511,7 @@ def _crossing(
 
 
 def _bisected(stretch: Stretch, ends: Sequence[float], *, rising: bool, half: float) -> Crossing | None:
-    """Hold a crossing by bisection with verdicts, None where both ends are judged alike or are left open."""
+    """Hold a crossing by bisection with verdicts, None where both ends have one verdict or are undecided."""
     left, right = ends
     below, above = (stretch.judge(Fraction(end)) for end in ends)
     if not (below.stable is rising and above.stable is (not rising)):

@@ -7,7 +7,7 @@ Does not: give a verdict for periods whose frame with the other clocks is longer
 `timing_values.MOST_FRAME_TICKS`.
 
 A period changes the frame, the least common multiple of all periods. Where all clocks scale with the number,
-as where there is one, every value has as many ticks in a frame: the axis is continuous. Beside a clock of
+as where there is one, every value has as many ticks in a frame: the axis is continuous. With a clock of
 another period only commensurate values are analysed: of p/q times the common divisor of the other periods, a
 frame has about as many ticks as p and q together. Between two of these of different verdicts the simplest
 fraction of the middle third comes next, as long as its frame is short. The remaining gap is the error of the
@@ -43,7 +43,7 @@ from apc.vary.timing_values import (
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
-# Without limits given, periods from so many times shorter to so many times longer than the present one.
+# Without limits given, periods from the present one divided by this factor to that multiplied by it.
 PERIOD_SPAN = 32
 
 # Periods along an axis of a region, of those that are analysed.
@@ -51,7 +51,7 @@ STRIPS = 32
 
 
 def period_pieces(system: CompiledSystem, axis: Range, place: Place) -> Iterator[Piece]:
-    """Yield a piece for each of some periods of a range, with ends halfway to those beside it.
+    """Yield a piece for each of some periods of a range, with ends halfway to its neighbours.
 
     Raises
     ------

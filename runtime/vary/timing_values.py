@@ -24,7 +24,7 @@ from apc.frame.parameters import resolve, scope_of
 
 # Ticks of all clocks in the longest frame that is analyzed: some tenths of a second each.
 MOST_FRAME_TICKS = 400
-# How far apart two values of a parameter are at which timings tell how fast they follow it.
+# How far apart two values of a parameter are from which the slope of each timing is computed.
 STEP = Fraction(1, 1009)
 # Digits to which a period is met, the most that serve; periods that are kept for the next question.
 DIGITS, KEPT = 9, 256
@@ -56,7 +56,7 @@ def _clock_times(system: CompiledSystem, *, phases: bool) -> set[str]:
 
 
 def reaches_period(system: CompiledSystem, free: Free) -> bool:
-    """Say whether the period of some clock is, or depends on, this parameter."""
+    """Return whether the period of some clock is, or depends on, this parameter."""
     return _reaches(system, free, _clock_times(system, phases=False))
 
 
@@ -72,7 +72,7 @@ def refuse_phase(system: CompiledSystem, free: Free, place: Place, *, code: str 
 
 
 def is_scaled(system: CompiledSystem, free: Free, *, delays: bool = False) -> bool:
-    """Say whether all periods and phases are proportional to a number, with `delays` all other times, too."""
+    """Return whether all periods and phases are proportional to a number; `delays`: all times are."""
     now, timings = delay_now(system, free), resolve(system).timings
     names = _clock_times(system, phases=False) | _clock_times(system, phases=True)
     doubled = resolve(system_with_delay(system, free, 2 * now)).timings
