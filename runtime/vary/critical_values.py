@@ -182,68 +182,7 @@ def critical(
                 return judge_at(changed, prepared, [], _PLACE, criterion=chosen_criterion).stable
             return analyze(changed, prepared=prepared).stable
 
-        low, high = (None if limit is None else float(limit) for limit in limits)
-        ends = low, high
-
-        if counted:
-            result = search(
-                CountLine(system, free, stable_of, *count_range(system, free, limits, present, _PLACE)),
-                progress=progress,
-            )
-        elif timed and reaches_period(system, free):
-            if chosen_criterion == MEAN_SQUARE and not is_scaled(system, free):
-                refuse_time(system, free, _PLACE, chosen_criterion)
-
-            def decide(changed: CompiledSystem) -> Verdict:
-                if not by_growth:
-                    return judged(changed, prepared)
-                try:
-                    return judge_at(changed, prepared, [], _PLACE, criterion=chosen_criterion)
-                except ApcError as error:
-                    # A frame may be too long, or grow beyond floats; a fault at every value is raised.
-                    if changed is system or error.mistakes[0].code not in (*NOWHERE, *TOO_LONG):
-                        raise
-                    return OPEN
-
-            decide(system)
-            result = search(PeriodLine(system, free, decide, limits[0], limits[1], _PLACE), progress=progress)
-        elif by_growth:
-            refuse_time(system, free, _PLACE, chosen_criterion)
-            result = search(_singly(system, free, ends, prepared, chosen_criterion), progress=progress)
-            if (
-                chosen_criterion == PASSIVE
-                and result.stable == (False,)
-                and not passive_hands(system, prepared).why
-            ):
-                result = replace(result, enters=True)  # where clamped devices shake all values are one
-        elif timed:
-            refuse_phase(system, free, _PLACE)
-            starts = [
-                prepare_at_start(side.system, side.prepared, [free]) for side in sides(system, prepared)
-            ]
-            if None in starts:
-                raise hangs_on_heard(system)
-            begin = limits[0] or Fraction(0)
-            end = limits[1] or delay_reach(system, free, begin, pieces=PIECES, further=FURTHER)[0]
-            tell = pace(system, free, begin, end, place=_PLACE, progress=progress)
-            result = stable_in_all(
-                [
-                    search(DelayLine(side.system, free, start, begin, end, tell))
-                    for side, start in zip(sides(system, prepared), starts, strict=True)
-                    if start is not None
-                ]
-            )
-        else:
-            each = []
-            at_start = None
-            for side in sides(system, prepared):
-                at_start = prepare_at_start(side.system, side.prepared, [free])
-                line = _line(side.system, free, ends, at_start or side.prepared)
-                each.append(search(line, progress=progress))
-            result = stable_in_all(each)
-            if at_start and not (result.sided or parameters_suffice(system, prepared)):
-                # Contacts close or open along the way, and other motions are left out of the verdict.
-                result = search(_singly(system, free, ends, prepared, NOMINAL), progress=progress)
+        result = _searched(system, free, prepared, chosen_criterion, limits, stable_of, progress)
 
         def stable_now() -> bool | None:
             return stable_of(system)
@@ -278,6 +217,93 @@ def critical(
         left_open=result.left_open,
         alone=result.alone,
     )
+
+
+def _searched(
+    system: CompiledSystem,
+    free: Free,
+    prepared: Prepared,
+    criterion: str,
+    limits: Sequence[Fraction | None],
+    stable_of: Callable[[CompiledSystem], bool | None],
+    progress: Progress | None,
+) -> Search:
+    """Return the search along a number, by the evaluator that covers it.
+
+    Parameters
+    ----------
+    system, free, prepared
+        The compiled topology, what varies, and the result of `instance.prepare`.
+    criterion
+        One of `NOMINAL`, `MEAN_SQUARE` and `PASSIVE`.
+    limits
+        The ends in SI, None where not given.
+    stable_of
+        Returns the verdict of a topology.
+    progress
+        Receives reports.
+    """
+    present = (
+        float(delay_now(system, free)) if reaches_time(system, free) else parameter_of(system, free).value
+    )
+    timed, counted = reaches_time(system, free), reaches_count(system, free)
+    low, high = (None if limit is None else float(limit) for limit in limits)
+    ends = low, high
+
+    if counted:
+        result = search(
+            CountLine(system, free, stable_of, *count_range(system, free, limits, present, _PLACE)),
+            progress=progress,
+        )
+    elif timed and reaches_period(system, free):
+        if criterion == MEAN_SQUARE and not is_scaled(system, free):
+            refuse_time(system, free, _PLACE, criterion)
+
+        def decide(changed: CompiledSystem) -> Verdict:
+            if criterion not in BY_GROWTH:
+                return judged(changed, prepared)
+            try:
+                return judge_at(changed, prepared, [], _PLACE, criterion=criterion)
+            except ApcError as error:
+                # A frame may be too long, or grow beyond floats; a fault at every value is raised.
+                if changed is system or error.mistakes[0].code not in (*NOWHERE, *TOO_LONG):
+                    raise
+                return OPEN
+
+        decide(system)
+        result = search(PeriodLine(system, free, decide, limits[0], limits[1], _PLACE), progress=progress)
+    elif criterion in BY_GROWTH:
+        refuse_time(system, free, _PLACE, criterion)
+        result = search(_singly(system, free, ends, prepared, criterion), progress=progress)
+        if criterion == PASSIVE and result.stable == (False,) and not passive_hands(system, prepared).why:
+            result = replace(result, enters=True)  # where clamped devices shake all values are one
+    elif timed:
+        refuse_phase(system, free, _PLACE)
+        starts = [prepare_at_start(side.system, side.prepared, [free]) for side in sides(system, prepared)]
+        if None in starts:
+            raise hangs_on_heard(system)
+        begin = limits[0] or Fraction(0)
+        end = limits[1] or delay_reach(system, free, begin, pieces=PIECES, further=FURTHER)[0]
+        tell = pace(system, free, begin, end, place=_PLACE, progress=progress)
+        result = stable_in_all(
+            [
+                search(DelayLine(side.system, free, start, begin, end, tell))
+                for side, start in zip(sides(system, prepared), starts, strict=True)
+                if start is not None
+            ]
+        )
+    else:
+        each = []
+        at_start = None
+        for side in sides(system, prepared):
+            at_start = prepare_at_start(side.system, side.prepared, [free])
+            line = _line(side.system, free, ends, at_start or side.prepared)
+            each.append(search(line, progress=progress))
+        result = stable_in_all(each)
+        if at_start and not (result.sided or parameters_suffice(system, prepared)):
+            # Contacts close or open along the way, and other motions are left out of the verdict.
+            result = search(_singly(system, free, ends, prepared, NOMINAL), progress=progress)
+    return result
 
 
 def _everywhere(

@@ -61,7 +61,7 @@ FIRST_HALF = 1e-10
 # Steps of Newton's method, of Brent's, and of a bisection by verdicts.
 NEWTON, BRENT, HALVINGS = 12, 200, 60
 
-# How far inside a stretch its ends are sampled where the verdict changes in the neighbouring cell, relative to
+# How far inside a stretch its ends are sampled where the verdict changes in the next cell, relative to
 # the value or the least size.
 INWARDS = 1e-9
 
