@@ -17,8 +17,8 @@ visible.
 
 The settling time of a position is the time of its last sample outside `BAND` of its range (highest less
 lowest value) around its last value; that of a motion is the largest of its positions. It is None if it is in
-the last tenth of the duration. A position has none if its range is rounding compared with those of its unit. An
-angle is a position, too.
+the last tenth of the duration. A position has none if its range is rounding compared with those of its unit.
+An angle is a position, too.
 
 Without forces that change with time the verdict of a linear topology is consistent with that of `analyze`:
 where the two contradict each other (a mode that the motion does not excite, a duration too short) it is "not
