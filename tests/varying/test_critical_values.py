@@ -518,3 +518,30 @@ def test_an_end_that_stands_alone_is_no_crossing() -> None:
 def test_a_jump_between_values_is_held_by_bisection() -> None:
     (one,) = search(Known(lambda at: 0.5 if at < 33.3 else 2.0)).edges
     assert abs(one.value - 33.3) <= one.error < 1e-9
+
+
+TELEOPERATION = """\
+topology: teleoperation
+clocks: {fast: 2 kHz, slow: 1 kHz, network: 1 kHz}
+peers:
+  leader: {count: 1}
+  follower: {count: 1, set: {device.mass: 1.5 kg, device.damping: 8 N*s/m, pd.clock: slow}}
+masses:
+  device: {mass: 0.2 kg, damping: 4 N*s/m, shared: false}
+couplers:
+  pd: {type: AveragePosition, object: device, stiffness: 100 N/m, damping: 2 N*s/m, clock: fast, link: wan}
+links:
+  wan: {clock: network, delay: 20 ms, delays: {follower: {leader: 60 ms}}}
+"""
+
+
+@pytest.mark.whole
+def test_a_critical_value_over_long_delays_is_as_close_as_its_analyses() -> None:
+    """A lifting by another program gives 1032.600987 N/m; dense matrices alone leave every value open."""
+    model = compiled(TELEOPERATION)
+    found = apc.critical(model, "pd.stiffness")
+    assert found.value is not None and found.error is not None
+    assert found.value == pytest.approx(1032.600987, abs=1e-5)
+    assert found.error < 1e-6 * found.value
+    for factor, stable in ((1 - 1e-6, True), (1 + 1e-6, False)):
+        assert apc.analyze(model, set={"pd.stiffness": factor * found.value}).stable is stable
