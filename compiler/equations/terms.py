@@ -22,6 +22,7 @@ from typing import Any, TypeAlias
 
 import sympy
 
+from apc.compiler.language.evaluation import FaultError, constant_value
 from apc.compiler.language.expression import (
     CONDITIONS,
     SMOOTH,
@@ -31,7 +32,9 @@ from apc.compiler.language.expression import (
     Number,
     fold,
     format_expression,
+    transform,
 )
+from apc.compiler.language.expression import walk as expressions
 
 Term: TypeAlias = Any  # sympy.Expr, which has no complete types
 Symbol: TypeAlias = Any  # sympy.Symbol
@@ -41,6 +44,7 @@ LinearForm: TypeAlias = tuple[
 
 ZERO, ONE, HALF = sympy.S.Zero, sympy.S.One, sympy.S.Half
 LARGEST = int(sys.float_info.max)
+LONG = 12  # nodes beyond which a constant is rounded: SymPy's assumptions on it take their time
 FLOAT_DIGITS = 17  # decimal digits that identify a float
 
 
@@ -195,7 +199,18 @@ def to_term(expression: Expr, differentiate: Callable[[Term], Term] | None = Non
             operands = tuple(map(rounded, operands))  # of constants inside one another
         return FUNCTIONS[name](*operands)
 
-    return fold(expression, leaf, term)
+    return fold(transform(expression, _short_constant), leaf, term)
+
+
+def _short_constant(node: Expr) -> Expr | None:
+    """Return a long constant that is not rational as the nearest float; None leaves a node as it is."""
+    if not isinstance(node, Call) or sum(1 for _ in expressions(node)) <= LONG:
+        return None
+    try:
+        value = constant_value(node)
+    except FaultError:  # no real value, which SymPy finds
+        return None
+    return Number(Fraction(value)) if isinstance(value, float) else None
 
 
 # ---- what is asked of terms ----
