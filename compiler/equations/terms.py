@@ -203,13 +203,16 @@ def to_term(expression: Expr, differentiate: Callable[[Term], Term] | None = Non
 
 
 def _short_constant(node: Expr) -> Expr | None:
-    """Return a long constant that is not rational as the nearest float; None leaves a node as it is."""
+    """Return a long constant that is not rational as the nearest float, or as 1/0 if it has no real value.
+
+    None leaves a node as it is.
+    """
     if not isinstance(node, Call) or sum(1 for _ in expressions(node)) <= LONG:
         return None
     try:
         value = constant_value(node)
-    except FaultError:  # no real value, which SymPy finds
-        return None
+    except FaultError:
+        return Call("/", (Number(Fraction(1)), Number(Fraction(0))))
     return Number(Fraction(value)) if isinstance(value, float) else None
 
 
