@@ -26,6 +26,9 @@ Floats = NDArray[np.float64]
 # Bounds on the errors of each system's matrices (k, n, n) at values (k, 2).
 Errors = Callable[[Floats], tuple[Floats, ...]]
 
+# Points of the unit square at which properties of the whole rectangle are determined.
+INSIDE = np.array([[0.1, 0.1], [0.1, 0.9], [0.9, 0.1], [0.9, 0.9]])
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rectangle:
@@ -106,7 +109,7 @@ def family_over(source: MatrixSource, rectangle: Rectangle, errors: Errors) -> D
     errors
         Bounds (k, n, n) on the errors of each system's matrices at values (k, 2), entry by entry.
     """
-    corners = rectangle.values(np.array([[0.1, 0.1], [0.1, 0.9], [0.9, 0.1], [0.9, 0.9]]))
+    corners = rectangle.values(INSIDE)
     wrong = tuple(values.max(axis=0) for values in errors(corners))
     parts: list[Part] = []
     for system, (error, matrix) in enumerate(zip(wrong, source.matrices(corners), strict=True)):

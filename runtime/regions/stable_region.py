@@ -11,7 +11,7 @@ Does not: draw, or write files (see `present`).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Unpack
 
@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import near_start, prepare_at_start
+from apc.analysis.sides import Side, sides
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake
 from apc.compiler.timings import part
@@ -35,7 +36,7 @@ from apc.regions.axes import PLACE
 from apc.regions.boundary import Arc, relative_to, stable_area, trace_steps, traced
 from apc.regions.curves import between
 from apc.regions.deciding import Eigenvalues, log_magnitudes
-from apc.regions.rectangle import DirectFamily, Rectangle, family_over, rectangle_of
+from apc.regions.rectangle import INSIDE, DirectFamily, Rectangle, family_over, rectangle_of
 from apc.regions.strips import BRANCHES, Striped, trace_strips
 from apc.regions.survey import blurred, just_inside, survey
 from apc.result import Look, Result
@@ -43,6 +44,7 @@ from apc.threads import single_threaded
 from apc.vary.batch import BatchEvaluator
 from apc.vary.crossing import Progress
 from apc.vary.evaluator import (
+    JoinedEvaluator,
     PiecewiseEvaluator,
     closed_at,
     evaluator_of_many,
@@ -301,9 +303,10 @@ def region(
         scales = len(times) == 1 and not counts and _scales(system, free[times[0]])
         times = [] if scales else times
         _refuse_two_times(system, [free[place] for place in times])
-        start = None if meant in BY_GROWTH else prepare_at_start(system, prepared, free)
+        starts = () if meant in BY_GROWTH else _starts(system, prepared, free, rectangle)
+        start = starts[0].prepared if len(starts) == 1 else None
         striped: Striped | None = None
-        if start is None or times or scales:
+        if not starts or times or scales:
             plane = _points_plane(system, free, rectangle, prepared, meant, stepped=bool(times))
             if meant == NOMINAL and not times:
                 tolerance = max(tolerance, TOLERANCE_OF_DIFFERENCES)
@@ -312,15 +315,22 @@ def region(
                     system, axes, times[0], start, cells=cells, tolerance=tolerance, progress=progress
                 )
         else:
-            source = evaluator_of_many(system, free, PLACE, prepared=start)
+            source = JoinedEvaluator(
+                system,
+                free,
+                tuple(evaluator_of_many(side.system, free, PLACE, prepared=side.prepared) for side in starts),
+            )
             plane = _Plane(family_over(source, rectangle, source.errors), source.closed_at, stepped=False)
             try:
                 striped = _surveyed(plane, cells, tolerance, progress)
             except ApcError as error:
-                if error.mistakes[0].code != "E905" or parameters_suffice(system, prepared):
+                # Other motions are free, or there is a kink, where it starts elsewhere.
+                if error.mistakes[0].code not in ("E808", "E905") or parameters_suffice(system, prepared):
                     raise
-                # Other motions are free where it starts elsewhere.
-                plane = _pieces_plane(system, source, rectangle, prepared, start)
+                if start is None:
+                    plane = _points_plane(system, free, rectangle, prepared, meant, stepped=False)
+                else:
+                    plane = _pieces_plane(system, source.sources[0], rectangle, prepared, start)
         stepped = plane.stepped and striped is None
         striped = striped or _surveyed(plane, cells, tolerance, progress)
         curves = tuple(_curve(plane, arc, meant) for arc in striped.arcs)
@@ -346,6 +356,27 @@ def region(
             *notes_for_all_groups(system, free),
         ),
         system=system,
+    )
+
+
+def _starts(
+    system: CompiledSystem, prepared: Prepared, free: tuple[Free, ...], rectangle: Rectangle
+) -> tuple[Side, ...]:
+    """Return the models at the start, one for each side of a kink, with their Jacobians linearized there.
+
+    None where the start does not decide, or where the number of sides changes over the rectangle.
+    """
+    listed = sides(system, prepared)
+    if len(listed) > 1:
+        for value in rectangle.values(INSIDE).tolist():
+            elsewhere = apply(system, overrides_at(system, free, value))
+            if len(sides(elsewhere, prepared)) != len(listed):
+                return ()
+    starts = [prepare_at_start(side.system, side.prepared, free) for side in listed]
+    return tuple(
+        replace(side, prepared=start)
+        for side, start in zip(listed, starts, strict=True)
+        if start is not None and None not in starts
     )
 
 

@@ -61,6 +61,31 @@ KEPT = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class JoinedEvaluator:
+    """A `MatrixSource` of several models over the same parameters: the matrices of all, one after another."""
+
+    system: CompiledSystem
+    free: tuple[Free, ...]
+    sources: tuple[BatchEvaluator, ...]
+
+    def matrices(self, values: Floats) -> tuple[Floats, ...]:
+        """Return each system's reduced frame matrices (k, n, n) at values (k, m)."""
+        return tuple(matrix for source in self.sources for matrix in source.matrices(values))
+
+    def slopes(self, values: Floats, along: Floats) -> tuple[tuple[Floats, Floats], ...]:
+        """Return each system's matrices (k, n, n) and their derivatives along directions (k, m)."""
+        return tuple(pair for source in self.sources for pair in source.slopes(values, along))
+
+    def errors(self, values: Floats) -> tuple[Floats, ...]:
+        """Return bounds (k, n, n) on the errors of the matrices at values (k, m), entry by entry."""
+        return tuple(error for source in self.sources for error in source.errors(values))
+
+    def closed_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
+        """Return the closed systems at one point (m,), as an analysis has them."""
+        return tuple(closed for source in self.sources for closed in source.closed_at(value))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PiecewiseEvaluator:
     """A `MatrixSource` of a scene in which at some values other motions are free than at others.
 
