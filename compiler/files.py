@@ -370,7 +370,9 @@ def finish_file(temporary: Temporary, path: Path) -> None:
         temporary.name.replace(target)
         return
     os.replace(temporary.name.name, target.name, src_dir_fd=temporary.folder, dst_dir_fd=temporary.folder)
-    if not _is_ours(temporary, target.name):
+    found = os.stat(target.name, dir_fd=temporary.folder, follow_symlinks=False)
+    # Another run of the same user may have written the same file since.
+    if found.st_uid != os.fstat(temporary.descriptor).st_uid or not stat.S_ISREG(found.st_mode):
         with suppress(OSError):  # what came in its place leads elsewhere
             os.unlink(target.name, dir_fd=temporary.folder)
         raise OSError(None, "another program has replaced its temporary file")
