@@ -66,11 +66,14 @@ NEWTON, BRENT, HALVINGS = 12, 200, 60
 INWARDS = 1e-9
 
 # The radius is discontinuous in a bracket narrower than this, relative to the value, in which it changes by
-# more.
+# more, whatever its errors.
 JUMP = 1e-6
 
 # A bracket this wide, relative to the value, with one verdict on both sides has no crossing.
 NOWHERE = 1e-6
+
+# A bracket wider than this on each side of the value, relative to it, is narrowed by so many verdicts.
+WIDE, NARROWINGS = 1e-7, 24
 
 # After so many values at which nothing changes, nothing depends on a number whose every value takes long.
 STILL = 4
@@ -493,7 +496,7 @@ def _crossing(
         dies = grows if grows.stable is None else stretch.judge(Fraction(left if rising else right))
         below, above = (dies, grows) if rising else (grows, dies)
         if below.stable is rising and above.stable is (not rising):
-            return _held(stretch, left, right, side, (below, above))
+            return _held(stretch, *_narrowed(stretch, left, right, (below, above), rising=rising), side)
         if None not in (below.stable, above.stable) and width > NOWHERE * abs(value):
             return _bisected(stretch, ends, rising=rising, half=half)
         if (left, right) == (low, high):
@@ -527,18 +530,55 @@ def _bisected(stretch: Stretch, ends: Sequence[float], *, rising: bool, half: fl
             left, below = middle, at
         else:
             right, above = middle, at
-    return _held(stretch, left, right, "below" if rising else "above", (below, above))
+    narrowed = _narrowed(stretch, left, right, (below, above), rising=rising)
+    return _held(stretch, *narrowed, "below" if rising else "above")
+
+
+def _narrowed(
+    stretch: Stretch, left: float, right: float, verdicts: tuple[Verdict, Verdict], *, rising: bool
+) -> tuple[float, float, tuple[Verdict, Verdict]]:
+    """Return a bracket narrowed from both ends to what verdicts decide, with the verdicts at its ends.
+
+    Parameters
+    ----------
+    stretch
+        The interval that contains the bracket.
+    left, right, verdicts
+        The bracket, and the verdicts at its ends.
+    rising
+        Whether the left end is the stable one.
+    """
+    below, above = verdicts
+    undecided: tuple[float, float] | None = None
+    for _ in range(NARROWINGS):
+        first, last = undecided or (right, left)
+        if right - left <= WIDE * abs(left + right) or max(first - left, right - last) <= (last - first) / 4:
+            break
+        from_left = undecided is None or first - left >= right - last
+        at_left = from_left and undecided is not None
+        middle = (left + first) / 2 if from_left else (last + right) / 2
+        verdict = stretch.judge(Fraction(middle))
+        if verdict.stable is None:
+            undecided = (min(middle, first), max(middle, last)) if undecided else (middle, middle)
+        elif verdict.stable is rising and (at_left or undecided is None):
+            left, below = middle, verdict
+        elif verdict.stable is not rising and not at_left:
+            right, above = middle, verdict
+        else:  # another crossing
+            break
+    return left, right, (below, above)
 
 
 def _held(
-    stretch: Stretch, left: float, right: float, side: str, verdicts: tuple[Verdict, Verdict]
+    stretch: Stretch, left: float, right: float, verdicts: tuple[Verdict, Verdict], side: str
 ) -> Crossing:
     """Return the crossing between two values of these verdicts, the stable one on a side."""
     dies, grows = verdicts if side == "below" else verdicts[::-1]
     bits = re.search(r"\d+ bits", " ".join(verdict.proof for verdict in verdicts))
     proof = f"proved with {bits[0]}" if bits else grows.proof or "bounded in floats"
     middle, kind, at = (left + right) / 2, "crossing", None
-    if right - left < JUMP * abs(middle) and grows.radius - dies.radius > JUMP:
+    change = grows.radius - dies.radius - grows.error - dies.error
+    if right - left < JUMP * abs(middle) and change > JUMP:
         # A discontinuity of the radius, as where a contact closes: at a value that somebody wrote.
         exact = shortest_decimal(left, right)
         middle, kind, at = float(exact), "jump", stretch.judge(exact).stable

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from fractions import Fraction
@@ -513,6 +514,14 @@ def test_an_end_that_stands_alone_is_no_crossing() -> None:
     assert (found.edges, found.stable, found.alone) == ((), (True,), (100.0,))
     (one,) = search(Known(lambda at: 0.9 + at)).edges
     assert one.value == pytest.approx(0.1, rel=1e-10)
+
+
+@pytest.mark.parametrize(("slope", "band"), [(1e-3, 1e-7), (14 / 33.3, 1e-5), (-14 / 33.3, 1e-5)])
+def test_a_bracket_is_narrowed_to_the_values_that_no_analysis_decides(slope: float, band: float) -> None:
+    """The radius is undecided within `band` of 1, so that no bracket is narrower than 2 `band` / `slope`."""
+    (one,) = search(Known(lambda at: math.exp(slope * (at - 33.3)), band=band)).edges
+    assert one.kind == "crossing"
+    assert abs(one.value - 33.3) <= one.error <= 1.6 * band / abs(slope)
 
 
 def test_a_jump_between_values_is_held_by_bisection() -> None:
