@@ -4,7 +4,7 @@ Takes: a `CompiledSystem`.
 Gives: `Side`, `SideVerdict`, `sides`, `worst_side`, `severity`.
 Guarantees: every combination of the pieces that meet at the start values, up to MOST_SIDES; where nothing has
 a kink there, the topology itself and nothing is computed twice.
-Does not: try peers of one group on different sides.
+Does not: know which combinations a motion of several peers reaches: all are analyzed.
 """
 
 from __future__ import annotations
@@ -12,25 +12,37 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import casadi
 import numpy as np
 
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Column, CompiledSystem, Group
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.peers import start_classes
 from apc.frame.decisions import SwitchedKind, find_switches
 from apc.frame.finite_equations import at_its_part, finite_equations
 from apc.frame.instance import Instance, Prepared, instance
 from apc.frame.jacobians import DECIDING, SiteJacobians, with_equations
-from apc.frame.kinks import EQUAL, Piece, Point, at_a_kink, names_of, one_sided, pieces_at, tie_indicators
+from apc.frame.kinks import (
+    EQUAL,
+    Moving,
+    Piece,
+    Point,
+    at_a_kink,
+    names_of,
+    one_sided,
+    pieces_at,
+    tie_indicators,
+)
 from apc.frame.linearize import at_start, of_rows, start_values
 from apc.frame.start_classes import StartClasses
 
-# Combinations of pieces that are analyzed one by one.
-MOST_SIDES = 16
+# Combinations of pieces that are analyzed one by one; peers of a group that are divided to find them.
+MOST_SIDES, MOST_PEERS = 16, 64
 # Inside a nonlinear loop: random directions, steps from the start (SI), and the relative gap of slopes
 # between both ends of a step: at a kink it stays, on a curve it shrinks with the step.
 DIRECTIONS, STEPS, HALF_STEEP, LEAST_GAP = 8, (1e-7, 1e-8, 1e-9), 0.5, 1e-6
@@ -97,34 +109,96 @@ def sides(system: CompiledSystem, prepared: Prepared) -> tuple[Side, ...]:
     if prepared.starting or all(_smooth(prepared.jacobians[group.kind]) for group in system.groups):
         return (Side("", system, prepared),)
     with finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        scene = instance(system, prepared)
+        whole = instance(system, prepared)
+        near = [_near_a_kink(whole, place) for place in range(len(system.groups))]
+        if not any(near):
+            return (Side("", system, prepared),)
+        # Peers of one group may be on different sides.
+        origins = [
+            place
+            for place, group in enumerate(system.groups)
+            for _ in range(group.count if near[place] and group.count <= MOST_PEERS else 1)
+        ]
+        parts = _parts(system.groups, origins)
+        schedules = tuple(prepared.schedules[place] for place in origins)
+        prepared = replace(prepared, schedules=schedules)
+        scene = instance(replace(system, groups=parts), prepared)
         try:
-            pieces = _pieces_of_groups(scene)
+            pieces = _pieces_of_groups(scene, [near[place] for place in origins])
         except ApcError as error:
             origin = system.origin
             raise ApcError(
                 at_its_part(mistake, origin.topology, origin.texts) for mistake in error.mistakes
             ) from None
     if not any(piece.taken for listed in pieces for piece in listed):
-        return (Side("", system, prepared),)
-    count = math.prod(map(len, pieces))
-    if count > MOST_SIDES:
+        return (Side("", system, replace(prepared, schedules=whole.schedules)),)
+    alike = _interchangeable(scene, origins, pieces)
+    count = math.prod(math.comb(len(peers) + len(pieces[peers[0]]) - 1, len(peers)) for peers in alike)
+    large = any(
+        len(listed) > 1 and group.count > 1 for group, listed in zip(parts, pieces, strict=True)
+    )  # not divided
+    if count > MOST_SIDES or large:
         raise _too_many(scene, pieces, count)
     names = [
         _names(find_switches(site.equations), listed)
         for site, listed in zip(scene.sites, pieces, strict=True)
     ]
-    several = sum(len(listed) > 1 for listed in pieces) > 1
     result = []
-    for chosen in itertools.product(*(range(len(listed)) for listed in pieces)):
-        texts = [
-            f"{of_group[k]} at {group.name}" if several else of_group[k]
-            for group, of_group, k in zip(system.groups, names, chosen, strict=True)
-            if of_group[k]
-        ]
-        taken = [listed[k] for listed, k in zip(pieces, chosen, strict=True)]
-        result.append(_side(scene, prepared, taken, "; ".join(texts)))
+    choices = (
+        itertools.combinations_with_replacement(range(len(pieces[peers[0]])), len(peers)) for peers in alike
+    )
+    for chosen in itertools.product(*choices):
+        side_of = dict(zip(itertools.chain(*alike), itertools.chain(*chosen), strict=True))
+        texts = [names[n][side_of[n]] for n in range(len(parts))]
+        taken = [pieces[n][side_of[n]] for n in range(len(parts))]
+        result.append(_side(scene, prepared, origins, taken, _named(scene, pieces, texts)))
     return tuple(result)
+
+
+def _parts(groups: Sequence[Group], origins: Sequence[int]) -> tuple[Group, ...]:
+    """Return the groups, those that `origins` lists several times divided into single peers."""
+    counts, result, before = Counter(origins), [], Counter[int]()
+    for place in origins:
+        group = groups[place]
+        if counts[place] == 1:
+            result.append(group)
+            continue
+        row = slice(before[place], before[place] + 1)
+        columns = tuple(Column(column.name, column.values[row]) for column in group.columns)
+        result.append(replace(group, count=1, columns=columns))
+        before[place] += 1
+    return tuple(result)
+
+
+def _interchangeable(
+    scene: Instance, origins: Sequence[int], pieces: Sequence[tuple[Piece, ...]]
+) -> list[list[int]]:
+    """Return the groups, by index, in classes whose members may exchange their sides."""
+    complete = all(map(scene.exchange.is_complete, scene.exchange.links))
+    classes: dict[object, list[int]] = {}
+    for n, origin in enumerate(origins):
+        vector = scene.numbers.parameters[n].tobytes()
+        taken = tuple(piece.taken for piece in pieces[n])
+        classes.setdefault((origin, vector, taken) if complete else n, []).append(n)
+    return list(classes.values())
+
+
+def _named(scene: Instance, pieces: Sequence[tuple[Piece, ...]], texts: Sequence[str]) -> str:
+    """Return the name of a combination: its sides, and whose they are where several peers have some."""
+    groups, starts = scene.system.groups, scene.exchange.starts
+    totals: Counter[str] = Counter()
+    peers: dict[tuple[str, str], list[str]] = {}
+    for group, text, first in zip(groups, texts, starts[:-1].tolist(), strict=True):
+        totals[group.name] += group.count
+        if text:
+            peers.setdefault((group.name, text), []).append(scene.exchange.peer_name(first))
+    kinked = {group.name for group, listed in zip(groups, pieces, strict=True) if len(listed) > 1}
+    result = []
+    for (name, text), listed in peers.items():
+        everyone = len(listed) == totals[name]
+        where = name if everyone else ", ".join(listed)
+        result.append(text if everyone and len(kinked) == 1 else f"{text} at {where}")
+    return "; ".join(result)
 
 
 def _smooth(site: SiteJacobians) -> bool:
@@ -134,12 +208,9 @@ def _smooth(site: SiteJacobians) -> bool:
     return not site.edges and site.walkable and tie_indicators(site.equations) is None
 
 
-def _pieces_of_groups(scene: Instance) -> list[tuple[Piece, ...]]:
-    """Return the pieces that meet at the start of each group's peers."""
-    near = [_near_a_kink(scene, place) for place in range(len(scene.system.groups))]
+def _pieces_of_groups(scene: Instance, near: Sequence[bool]) -> list[tuple[Piece, ...]]:
+    """Return the pieces that meet at the start of each group's peers; `near`: whether a group may be at one."""
     smooth = (Piece((), (), np.zeros(0), np.zeros((0, 0))),)
-    if not any(near):
-        return [smooth] * len(near)
     classes = start_classes(scene)
     starting = StartClasses(scene, classes)
     found: list[list[tuple[Piece, ...]]] = [[] for _ in near]
@@ -152,8 +223,10 @@ def _pieces_of_groups(scene: Instance) -> list[tuple[Piece, ...]]:
         if not site.walkable:
             _refuse_hidden_kink(site, starting, g)
             continue
+        switched = find_switches(site.equations)
         for point in _points(starting, g):
-            pieces = pieces_at(find_switches(site.equations), point)
+            pieces = pieces_at(switched, point)
+            _refuse_several_senders(switched, starting, g, pieces)
             for group in groups:
                 found[group].append(pieces)
     return [_joined(listed) if listed else smooth for listed in found]
@@ -195,6 +268,30 @@ def _points(starting: StartClasses, g: int) -> Iterable[Point]:
                 senders[f"s{size} {receive.link}"] = listed or [[0.0] * size]
     for chosen in itertools.product(*senders.values()):
         yield {**point, **dict(zip(senders, chosen, strict=True))}
+
+
+def _refuse_several_senders(
+    switched: SwitchedKind, starting: StartClasses, g: int, pieces: Sequence[Piece]
+) -> None:
+    """Refuse a kink in what a peer makes of each sender where it receives from several: one may be on each
+    side.
+    """
+    if len(pieces) < 2:
+        return
+    for name, column in switched.columns.items():
+        link = name.partition(" ")[2]
+        if not link or starting.senders(link, g) < 2:
+            continue
+        places = [
+            place
+            for place, _ in pieces[0].taken
+            if casadi.depends_on(switched.decisions[place].guard, column)
+            and len({dict(piece.taken).get(place) for piece in pieces}) > 1
+        ]
+        if places:
+            names = ", ".join(names_of(switched, places)) or "an equation"
+            what = f"{names} has a kink for each of the peers that it receives from over {link}"
+            raise at_a_kink(switched.kind.name, what)
 
 
 def _refuse_hidden_kink(site: SiteJacobians, starting: StartClasses, g: int) -> None:
@@ -251,12 +348,8 @@ def _floats(values: Iterable[object]) -> list[float]:
 def _joined(listed: Sequence[tuple[Piece, ...]]) -> tuple[Piece, ...]:
     """Return the pieces of one kind that hold at several points: those that agree on common decisions."""
     different: dict[tuple[_Taken, ...], tuple[Piece, ...]] = {}
-    sizes: dict[int, float] = {}
     for pieces in listed:
         different.setdefault(tuple(piece.taken for piece in pieces), pieces)
-        for piece in pieces:
-            for (place, _), tie in zip(piece.taken, piece.ties, strict=True):
-                sizes[place] = max(tie, sizes.get(place, 0.0))
     result: dict[_Taken, Piece] = {}
     for chosen in itertools.product(*different.values()):
         taken: dict[int, bool] = {}
@@ -266,7 +359,7 @@ def _joined(listed: Sequence[tuple[Piece, ...]]) -> tuple[Piece, ...]:
             taken |= dict(piece.taken)
         else:
             key = tuple(sorted(taken.items()))
-            result[key] = replace(chosen[0], taken=key, ties=tuple(sizes[place] for place, _ in key))
+            result[key] = replace(chosen[0], taken=key)
         if len(result) > MOST_SIDES:
             break
     return tuple(result.values())
@@ -297,29 +390,45 @@ def _names(switched: SwitchedKind, pieces: Sequence[Piece]) -> list[str]:
     return ["; ".join(parts) for parts in result]
 
 
-def _side(scene: Instance, prepared: Prepared, chosen: Sequence[Piece], name: str) -> Side:
-    """Return the model with a piece for each group."""
+def _side(
+    scene: Instance, prepared: Prepared, origins: Sequence[int], chosen: Sequence[Piece], name: str
+) -> Side:
+    """Return the model with a piece for each peer or group; neighbours of a group on one side are one again."""
     system = scene.system
-    numbers: dict[tuple[int, _Taken], int] = {}
+    numbers: dict[tuple[int, _Taken, Moving], int] = {}
     built: list[SiteJacobians] = []
-    groups = []
-    for group, piece in zip(system.groups, chosen, strict=True):
-        key = (group.kind, piece.taken)
+    groups: list[Group] = []
+    schedules = []
+    before: tuple[int, int] | None = None
+    for group, schedule, origin, piece in zip(
+        system.groups, prepared.schedules, origins, chosen, strict=True
+    ):
+        key = group.kind, piece.taken, piece.moving
         if key not in numbers:
             numbers[key] = len(built)
-            built.append(_one_sided(scene.jacobians[group.kind], piece.taken, piece.ties))
-        groups.append(replace(group, kind=numbers[key]))
-    changed = replace(system, kinds=tuple(system.kinds[kind] for kind, _ in numbers), groups=tuple(groups))
-    return Side(name, changed, replace(prepared, jacobians=tuple(built)))
+            built.append(_one_sided(scene.jacobians[group.kind], piece.taken, piece.moving))
+        kind = numbers[key]
+        if before == (origin, kind):
+            last = groups[-1]
+            columns = tuple(
+                Column(first.name, np.concatenate([first.values, second.values]))
+                for first, second in zip(last.columns, group.columns, strict=True)
+            )
+            groups[-1] = replace(last, count=last.count + group.count, columns=columns)
+            continue
+        groups.append(replace(group, kind=kind))
+        schedules.append(schedule)
+        before = origin, kind
+    kinds = tuple(system.kinds[kind] for kind, *_ in numbers)
+    changed = replace(system, kinds=kinds, groups=tuple(groups))
+    return Side(name, changed, replace(prepared, jacobians=tuple(built), schedules=tuple(schedules)))
 
 
 @functools.lru_cache(maxsize=MOST_SIDES * 4)
-def _one_sided(site: SiteJacobians, taken: _Taken, ties: tuple[float, ...]) -> SiteJacobians:
+def _one_sided(site: SiteJacobians, taken: _Taken, moving: Moving) -> SiteJacobians:
     if not taken:
         return site
-    switched = find_switches(site.equations)
-    places = [place for place, _ in taken]
-    return with_equations(site, one_sided(switched, dict(taken), dict(zip(places, ties, strict=True))))
+    return with_equations(site, one_sided(find_switches(site.equations), dict(taken), moving))
 
 
 def _too_many(scene: Instance, pieces: Sequence[Sequence[Piece]], count: int) -> ApcError:

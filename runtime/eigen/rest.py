@@ -35,9 +35,10 @@ def unrest(groups: Sequence[PeerGroup]) -> str:
     Parameters
     ----------
     groups
-        All peers of the scene, each group linearized where it starts.
+        All peers of the topology; a group that is linear on its side of a kink is left out.
     """
-    result = [value for group in groups for value in _moved(group, named=len(groups) > 1)]
+    started = [group for group in groups if group.listening is not None]
+    result = [value for group in started for value in _moved(group, named=len(groups) > 1)]
     for unit in FORCES:
         pushed = [(size, what) for size, of, what in result if of == unit]
         if pushed:

@@ -2,8 +2,8 @@
 
 Takes: a kind of a `CompiledSystem`.
 Gives: `Decision`, `SwitchedKind`, `functions_of`, `find_switches`, `bound_kind`, `decided_kind`.
-Guarantees: found in the equations themselves: a comparison, an `if`, a `max`, `min`, `abs` or `sign` of
-something that moves is a decision, whatever the part is called.
+Guarantees: found in the equations themselves: a comparison, an `if`, a `max`, `min`, `abs`, `sign` or `floor`
+of something that moves is a decision, whatever the part is called.
 Does not: know which pieces a motion can reach, or switch what depends on time and parameters alone.
 
 Each decision becomes a number d, 0 or 1 (c a condition):
@@ -165,6 +165,13 @@ class _Walk:
         if moves and word in ("fmin", "fmax"):
             d = self.decide(word, operands).expression
             return _Step(_branch(d, *values), number, True, True)
+        if moves and word in ("floor", "ceil"):
+            # Next to a whole number n, floor(z) is n − (z < n) and ceil(z) is n + (n < z).
+            nearest = casadi.floor(values[0] + 0.5)
+            whole = _Step(nearest, self.number(("nearest", operands[0].number)), False, decided)
+            pair = (operands[0], whole) if word == "floor" else (whole, operands[0])
+            d = self.decide("lt", pair).expression
+            return _Step(nearest - d if word == "floor" else nearest + d, number, False, True)
         if moves and word in ("fabs", "sign"):
             d = self.decide("sign", operands).expression
             value = _branch(d, values[0], -values[0]) if word == "fabs" else 2 * d - 1

@@ -9,6 +9,7 @@ Does not: know what is sent, or when (see `scheduling`), or a graph's eigenvalue
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -30,7 +31,8 @@ KEPT = 16
 class Exchange:
     """The links between the groups of a scene.
 
-    `scene` is the file it stands in; `groups` are the groups' names, `starts` (K + 1,) the number of each
+    `scene` is the file it stands in; `groups` are the groups' names (parts of one group have one name and
+    follow each other), `starts` (K + 1,) the number of each
     group's first peer and the number of all; `usual` is the timing of a link's delay, `late` that between two
     groups (link, sender, receiver) where it is another: of timings of equal value, always the same one.
     """
@@ -80,8 +82,8 @@ class Exchange:
 
     def peer_name(self, peer: int) -> str:
         """Return `left[2]`, for a peer's number."""
-        group = self.group_of(peer)
-        return f"{self.groups[group]}[{peer - int(self.starts[group]) + 1}]"
+        name = self.groups[self.group_of(peer)]
+        return f"{name}[{peer - int(self.starts[self.groups.index(name)]) + 1}]"
 
 
 def build_exchange(system: CompiledSystem, timings: Mapping[str, Fraction]) -> Exchange:
@@ -107,14 +109,17 @@ def _exchange(
 ) -> Exchange:
     """Return what `build_exchange` does: of scenes that differ in other numbers only, the same object."""
     names, timings = tuple(name for name, _ in groups), dict(times)
-    place = {name: index for index, name in enumerate(names)}
+    indices: dict[str, list[int]] = {}
+    for index, name in enumerate(names):
+        indices.setdefault(name, []).append(index)
     late = {}
     for link in links:
         of_value = {timings[link.delay]: link.delay}
         for pair in link.delays:
             timing = of_value.setdefault(timings[pair.delay], pair.delay)
             if timing != link.delay:
-                late[link.name, place[pair.sender], place[pair.receiver]] = timing
+                pairs = itertools.product(indices[pair.sender], indices[pair.receiver])
+                late |= {(link.name, sender, receiver): timing for sender, receiver in pairs}
     return Exchange(
         scene=scene,
         groups=names,

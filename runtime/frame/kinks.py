@@ -43,19 +43,22 @@ KEPT = 64
 
 _GENERATED = re.compile(r"\.held\d+$")  # names of expressions that are held
 
+_STILL = ("p", "t")  # columns that no motion changes
+
 Floats = NDArray[np.float64]
+Moving = tuple[tuple[str, tuple[float, ...]], ...]  # the columns that a motion changes, by name
 Point = Mapping[str, Sequence[float]]  # the columns of `SwitchedKind.columns` by name
 
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """A piece that meets a point: for each tied decision whether it is taken, and the size of its tie.
+    """A piece that meets a point: for each tied decision whether it is taken; `moving` is the point.
 
     `values` are those of all functions at the point, `slopes` over everything that moves.
     """
 
     taken: tuple[tuple[int, bool], ...]
-    ties: tuple[float, ...]
+    moving: Moving
     values: Floats
     slopes: Floats
 
@@ -74,7 +77,7 @@ def _guards(switched: SwitchedKind) -> _Guards:
     columns = list(switched.columns.values())
     symbols = [decision.symbol for decision in switched.decisions]
     everything = casadi.vertcat(*columns)
-    moving = casadi.vertcat(*(c for name, c in switched.columns.items() if name not in ("p", "t")))
+    moving = casadi.vertcat(*(c for name, c in switched.columns.items() if name not in _STILL))
     guards = casadi.vertcat(*(decision.guard for decision in switched.decisions))
     terms = casadi.fabs(jacobian(guards, everything)) @ casadi.fabs(everything)
     outputs = casadi.vertcat(*(function.output for function in switched.functions))
@@ -106,38 +109,49 @@ def pieces_at(switched: SwitchedKind, point: Point) -> tuple[Piece, ...]:
         return (Piece((), (), np.zeros(0), np.zeros((0, 0))),)
     functions, count = _guards(switched), len(switched.decisions)
     columns = [list(point.get(name, [0.0] * c.numel())) for name, c in switched.columns.items()]
-    leaves: list[tuple[dict[int, bool], dict[int, float]]] = []
+    moving = tuple(
+        (name, tuple(map(float, column)))
+        for name, column in zip(switched.columns, columns, strict=True)
+        if name not in _STILL
+    )
+    leaves: list[dict[int, bool]] = []
 
-    def follow(symbols: list[float], tied: dict[int, bool], ties: dict[int, float]) -> None:
+    def follow(symbols: list[float], tied: dict[int, bool]) -> None:
         """Try both sides of each tie, in the order in which guards depend on earlier decisions."""
         place = len(symbols)
         if place == count:
-            leaves.append((tied, ties))
+            leaves.append(tied)
             return
         guards, _, terms = functions.guards(*columns, [*symbols, *[0.0] * (count - place)])
         guard, tie = float(guards[place]), max(TIE * float(terms[place]), SMALLEST)
         if not abs(guard) <= tie or not np.isfinite(tie):
-            follow([*symbols, float(bool(switched.decisions[place].holds(guard)))], tied, ties)
+            follow([*symbols, float(bool(switched.decisions[place].holds(guard)))], tied)
             return
         if switched.decisions[place].point:
-            follow([*symbols, 0.0], {**tied, place: False}, {**ties, place: tie})
+            follow([*symbols, 0.0], {**tied, place: False})
             return
         if len(tied) == MOST_TIES:
             raise _refused(switched, [*tied, place], f"takes more than {MOST_TIES} decisions there")
         for side in (True, False):
-            follow([*symbols, float(side)], {**tied, place: side}, {**ties, place: tie})
+            follow([*symbols, float(side)], {**tied, place: side})
 
-    follow([], {}, {})
+    follow([], {})
+    # The value at the point itself, where it is compared with "==": elsewhere one of the sides has it.
+    points = {place for place, decision in enumerate(switched.decisions) if decision.point}
     result: list[Piece] = []
-    for tied, ties in leaves:
+    for tied in leaves:
         symbols = _symbols(switched, functions, columns, tied)
         _, rows, _ = functions.guards(*columns, symbols)
         if not _reachable(switched, np.asarray(rows, dtype=np.float64), tied):
             continue
         values, slopes, sizes = map(np.asarray, functions.slopes(*columns, symbols))
-        piece = Piece(tuple(tied.items()), tuple(ties.values()), values.ravel(), slopes)
+        piece = Piece(tuple(tied.items()), moving, values.ravel(), slopes)
         # No number on one side alone, as of a root or logarithm there, is a jump too.
-        if result and not (np.abs(piece.values - result[0].values) <= TIE * sizes.ravel()).all():
+        beside = [result[0].values] if result else []
+        if points & tied.keys():
+            at = _symbols(switched, functions, columns, {**tied, **dict.fromkeys(points & tied.keys(), True)})
+            beside.append(np.asarray(functions.slopes(*columns, at)[0]).ravel())
+        if any(not (np.abs(piece.values - other) <= TIE * sizes.ravel()).all() for other in beside):
             raise _refused(switched, list(tied), "jumps there")
         if not any(_equal(piece.slopes, other.slopes) for other in result):
             result.append(piece)
@@ -205,8 +219,12 @@ def names_of(switched: SwitchedKind, places: Sequence[int]) -> tuple[str, ...]:
 
 
 def _refused(switched: SwitchedKind, places: Sequence[int], why: str) -> ApcError:
-    names = ", ".join(names_of(switched, places)) or "an equation"
-    return at_a_kink(switched.kind.name, f"{names} {why}")
+    names = names_of(switched, places)
+    if not names:  # a comparison with "==" has no sides to name
+        symbols = [switched.decisions[place].symbol for place in places]
+        listed = (name for f in switched.functions for s in symbols for name in f.names(f.output, s))
+        names = tuple(dict.fromkeys(_GENERATED.sub("", name) for name in listed))
+    return at_a_kink(switched.kind.name, f"{', '.join(names) or 'an equation'} {why}")
 
 
 def at_a_kink(where: str, what: str) -> ApcError:
@@ -215,8 +233,10 @@ def at_a_kink(where: str, what: str) -> ApcError:
     return ApcError(Mistake("E808", Place(where), text))
 
 
-def one_sided(switched: SwitchedKind, taken: Mapping[int, bool], ties: Mapping[int, float]) -> Kind:
+def one_sided(switched: SwitchedKind, taken: Mapping[int, bool], moving: Moving) -> Kind:
     """Return a kind whose slopes at a point are those of one piece.
+
+    The switching point of each tied decision is shifted by twice its tolerance, whatever the parameters are.
 
     Parameters
     ----------
@@ -224,23 +244,36 @@ def one_sided(switched: SwitchedKind, taken: Mapping[int, bool], ties: Mapping[i
         The kind with its decisions laid open.
     taken
         For each tied decision whether it is taken at the point.
-    ties
-        The size of each tie, by which the switching point is shifted away.
+    moving
+        The point.
     """
     expressions: list[Any] = []
+    symbols = casadi.vertcat(*(switched.columns[name] for name, _ in moving))
+    point = casadi.DM([value for _, column in moving for value in column])
     for place, decision in enumerate(switched.decisions):
-        earlier = [item.symbol for item in switched.decisions[:place]]
-        guard = decision.guard
-        if earlier:
-            guard = casadi.substitute(guard, casadi.vertcat(*earlier), casadi.vertcat(*expressions))
+        guard = _guard(switched, expressions)
         if decision.point:
             expressions.append(casadi.SX(0) if place in taken else decision.holds(guard))
             continue
         if place in taken:
-            shift = 2 * ties[place] if taken[place] is decision.above else -2 * ties[place]
-            guard = guard + shift
+            terms = casadi.substitute(_terms(switched, guard), symbols, point)
+            shift = 2 * casadi.fmax(TIE * terms, SMALLEST)
+            guard += shift if taken[place] is decision.above else -shift
         expressions.append(decision.holds(guard))
     return decided_kind(switched, expressions)
+
+
+def _guard(switched: SwitchedKind, earlier: Sequence[Any]) -> Any:
+    """Return the guard of a decision with the expressions of all earlier ones."""
+    symbols = [decision.symbol for decision in switched.decisions[: len(earlier)]]
+    guard = switched.decisions[len(earlier)].guard
+    return casadi.substitute(guard, casadi.vertcat(*symbols), casadi.vertcat(*earlier)) if earlier else guard
+
+
+def _terms(switched: SwitchedKind, guard: Any) -> Any:
+    """Return the sum of the magnitudes of the terms of a guard, which bounds its rounding."""
+    everything = casadi.vertcat(*switched.columns.values())
+    return casadi.fabs(jacobian(guard, everything)) @ casadi.fabs(everything)
 
 
 @functools.lru_cache(maxsize=KEPT)
@@ -255,20 +288,15 @@ def tie_indicators(kind: Kind) -> Any | None:
     if not switched.decisions:
         return None
     columns = switched.columns
-    everything = casadi.vertcat(*columns.values())
-    symbols = [decision.symbol for decision in switched.decisions]
     outputs = casadi.vertcat(*(item.output for item in switched.functions if item.where[0] != "edge"))
     guards = casadi.vertcat(*(decision.guard for decision in switched.decisions))
     expressions: list[Any] = []
     ties: list[Any] = []
-    for place, decision in enumerate(switched.decisions):
-        guard = decision.guard
-        if place:
-            guard = casadi.substitute(guard, casadi.vertcat(*symbols[:place]), casadi.vertcat(*expressions))
+    for decision in switched.decisions:
+        guard = _guard(switched, expressions)
         expressions.append(decision.holds(guard))
-        if casadi.depends_on(casadi.vertcat(outputs, guards), symbols[place]):
-            terms = casadi.fabs(jacobian(guard, everything)) @ casadi.fabs(everything)
-            ties.append(casadi.fabs(guard) <= TIE * terms)
+        if casadi.depends_on(casadi.vertcat(outputs, guards), decision.symbol):
+            ties.append(casadi.fabs(guard) <= TIE * _terms(switched, guard))
     if not ties:
         return None
     column = casadi.vertcat(*ties)

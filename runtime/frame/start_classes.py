@@ -64,6 +64,10 @@ class StartClasses:
         counts = [count - (1 if g == h else 0) for h, count in enumerate(self.counts)]
         return [(h, Fraction(n), n) for h, n in enumerate(counts) if n and link in self.sent[h]]
 
+    def senders(self, link: str, g: int) -> int:
+        """Return how many peers a peer of class g receives from over a link."""
+        return sum(number for _, _, number in self._senders(link, g))
+
     def sent_to(self, link: str, g: int) -> list[list[Fraction]]:
         """Return what each different sender that class g receives from sends over a link at the start."""
         return [self.sent[h][link] for h, _, _ in self._senders(link, g)]

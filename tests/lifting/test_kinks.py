@@ -150,6 +150,92 @@ def test_many_kinks_are_combined_or_refused_by_name(tmp_path: Path) -> None:
         assert found.spectral_radius == pytest.approx(max(truths), abs=1e-12)
 
 
+def test_peers_of_one_group_take_different_sides(tmp_path: Path) -> None:
+    """Of two peers that are coupled none, one or both are on: as two groups of one peer each have it."""
+    shelf = library(
+        tmp_path,
+        component(f"f = max(0, K*{X})", "flange.f = hold(f)", variables="f=N"),
+    )
+    mean = "tie: {type: AveragePosition, object: device, stiffness: 3000 N/m, clock: tick, link: lan}"
+    coupled = topology("}, " + mean[:-1], count=2).replace("own: {type: Own", "own: {type: Own, K: 20000 N/m")
+    coupled += "links: {lan: {clock: tick, delay: 1 ms}}\n"
+    apart = coupled.replace("user: {count: 2}", "a: {count: 1}, b: {count: 1}")
+    found, other = (apc.analyze(compiled(text, shelf)) for text in (coupled, apart))
+    assert (len(found.sides), len(other.sides)) == (3, 4)
+    assert found.spectral_radius == pytest.approx(other.spectral_radius, abs=1e-12)
+    radii = [{round(side.spectral_radius, 9) for side in one.sides} for one in (found, other)]
+    assert radii[0] == radii[1]
+    assert len(radii[0]) == 3
+    assert any("user[1]" in side.name and "user[2]" in side.name for side in found.sides)
+
+
+def test_peers_of_one_group_with_numbers_of_their_own_have_kinks_of_their_own(tmp_path: Path) -> None:
+    """The first peer of the group has no kink, as its stiffness is 0; the second is unstable on one side."""
+    shelf = library(tmp_path, component(f"f = max(0, K*{X})", "flange.f = hold(f)", variables="f=N"))
+    text = topology(count=2).replace("{count: 2}", "{count: 2, set: {own.K: [0 N/m, 60000 N/m]}}")
+    found = apc.analyze(compiled(text, shelf))
+    assert found.stable is False
+    assert found.spectral_radius == pytest.approx(radius(60e3), abs=1e-12)
+    assert [side.spectral_radius for side in found.sides] == pytest.approx(
+        [radius(0), radius(60e3)], abs=1e-12
+    )
+
+
+def test_a_kink_for_each_of_several_senders_is_refused(tmp_path: Path) -> None:
+    text = (
+        "topology: three\nclocks: {tick: 1 ms}\npeers: {a: {count: 1}, b: {count: 2}}\n"
+        f"masses: {{cube: {{mass: {MASS} kg, damping: {DAMPING} N*s/m}}}}\n"
+        "couplers: {own: {type: Pushes, object: cube, K: 1000 N/m, clock: tick, link: lan}}\n"
+        "links: {lan: {clock: tick, delay: 0 ms}}\n"
+    )
+    (line,) = told(apc.analyze, compiled(text, library(tmp_path, EDGES)))
+    assert "E808 own.f has a kink for each of the peers that it receives from over lan" in line
+
+
+def test_a_value_at_one_point_alone_is_a_jump(tmp_path: Path) -> None:
+    """At rest the force is 0, and 60 kN wherever the device moves to."""
+    (line,) = told(apc.analyze, model(tmp_path, f"if {X} == 0 then 0 else K*L", ", K: 60000 N/m, L: 1 m"))
+    assert "E808 own.f jumps there" in line
+
+
+def test_a_floor_has_a_side_before_and_behind_each_whole_number(tmp_path: Path) -> None:
+    force = f"0.5*K*{X} + K*T*sample(der(flange.x))*floor({X}/L)"
+    found = apc.analyze(model(tmp_path, force, ", K: 60000 N/m, T: 2 ms"))
+    assert sorted(side.spectral_radius for side in found.sides) == pytest.approx(
+        sorted([radius(30e3), radius(30e3, -120.0)]), abs=1e-12
+    )
+    (line,) = told(apc.analyze, model(tmp_path, f"F*floor({X}/L)"))
+    assert "jumps" in line
+
+
+def radius_at_wall(stiffness: float, damping: float) -> float:
+    """Return the radius in contact with a wall that damps the backward difference of the position."""
+    decay = math.exp(-DAMPING / MASS * PERIOD)
+    reach = (1 - decay) * MASS / DAMPING
+    push = np.array([(PERIOD - reach) / DAMPING, (1 - decay) / DAMPING, 0.0])
+    step = np.array([[1.0, reach, 0.0], [0.0, decay, 0.0], [1.0, 0.0, 0.0]])
+    difference = damping / PERIOD
+    step -= np.outer(push, [stiffness + difference, 0.0, -difference])
+    return float(abs(np.linalg.eigvals(step)).max())
+
+
+@pytest.mark.parametrize("stiffness", ["1000 N/m", "100 N/m", "500 kN/m"])
+def test_a_critical_value_at_zero_depth_is_that_of_the_contact(stiffness: str) -> None:
+    """Whatever the present stiffness: the position of the device and the wall is 7 mm, not 0."""
+    damping = 0.4
+    text = (
+        "topology: wall\nclocks: {tick: 1 ms}\npeers: {user: {count: 1}}\n"
+        f"masses: {{device: {{mass: {MASS} kg, damping: {DAMPING} N*s/m, x: 7 mm}}}}\n"
+        f"couplers: {{it: {{type: VirtualWall, flange: device, stiffness: {stiffness},"
+        f" damping: {damping} N*s/m, clock: tick, position: 7 mm, x: 7 mm}}}}\n"
+    )
+    found = apc.critical(compiled(text), "it.stiffness")
+    assert found.value is not None and found.error is not None
+    assert found.error < 1e-6 * found.value
+    below, above = (radius_at_wall(found.value * factor, damping) for factor in (1 - 1e-8, 1 + 1e-8))
+    assert below < 1 < above
+
+
 def test_sides_that_no_motion_reaches_are_left_out(tmp_path: Path) -> None:
     """Of max(0, x) and max(0, 2 x) both act or neither; with max(0, −x) one of two does."""
     for force, count in (
