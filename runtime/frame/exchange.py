@@ -112,7 +112,7 @@ def _exchange(
     indices: dict[str, list[int]] = {}
     for index, name in enumerate(names):
         indices.setdefault(name, []).append(index)
-    late = {}
+    late: dict[tuple[str, int, int], str] = {}
     for link in links:
         of_value = {timings[link.delay]: link.delay}
         for pair in link.delays:

@@ -110,7 +110,7 @@ def critical_text(critical: Critical) -> Lines:
 
 def _stable_ranges(critical: Critical) -> str:
     """Return where a scene is stable in a sentence; nothing where no crossing was found."""
-    ranges, begin, included = [], "", None
+    ranges, begin, included, least = [], "", None, -math.inf
     for crossing in critical.crossings:
         if critical.counted:
             value = f"{math.floor(crossing.boundary) + (crossing.stable_side == 'above'):,d}"
@@ -120,6 +120,10 @@ def _stable_ranges(critical: Critical) -> str:
             value = with_unit(f"{_on_stable_side(crossing.value * by, error, crossing.stable_side):g}", shown)
         if crossing.stable_side == "above":
             begin, included = value, critical.counted or crossing.stable_at
+            least = crossing.value + crossing.error
+            continue
+        if begin and not critical.counted and crossing.value - crossing.error <= least + 1e-9 * abs(least):
+            begin = ""  # stable at a single value
             continue
         most = f"up to {value}" if critical.counted or crossing.stable_at else f"below {value}"
         ranges.append(f"from {begin} {most}" if begin else most)

@@ -122,12 +122,18 @@ def trace_strips(
         if strip is None:
             return None
         strips.append(strip)
+    if reaches_period(system, delay.free):
+        strips = _between_periods(strips)
     whole = RadiusEvaluator(system, (delay.free, other.free), prepared, PLACE, NOMINAL)
     arcs = [list(strip.arcs) for strip in strips]
     rectangle = rectangle_of(delay, other)
     edges = []
     for place in range(1, len(strips)):
-        edges += _join(strips, arcs, place, SAME * tolerance, whole, rectangle)
+        listed_edges = _join(strips, arcs, place, SAME * tolerance, whole, rectangle)
+        if reaches_period(system, delay.free):  # the edge is anywhere between two periods
+            width = max(strips[k].end - strips[k].start for k in (place - 1, place))
+            listed_edges = [replace(edge, errors=edge.errors + width) for edge in listed_edges]
+        edges += listed_edges
 
     def mode_of(arc: Arc) -> str:
         value = rectangle.values(arc.knots)[0].tolist()
@@ -177,6 +183,21 @@ def _strips(
             yield _standing(piece, other, ends, prepared)
         else:
             yield _moving(system, delay, other, piece, ends, prepared, cells, tolerance)
+
+
+def _between_periods(strips: Sequence[_Strip]) -> list[_Strip]:
+    """Return strips of which each holds at one period only, with the errors that follow.
+
+    Lines are uncertain by the width of the strip, areas by half of what they differ from the next ones.
+    """
+    result = []
+    for n, strip in enumerate(strips):
+        width = strip.end - strip.start
+        beside = [strips[k].area for k in (n - 1, n + 1) if 0 <= k < len(strips)]
+        off = strip.off + max((abs(area - strip.area) for area in beside), default=0.0) / 2
+        arcs = tuple(replace(arc, errors=arc.errors + width) for arc in strip.arcs)
+        result.append(replace(strip, arcs=arcs, off=off))
+    return result
 
 
 def _standing(piece: Piece, other: Range, ends: Sequence[float], prepared: Prepared) -> _Strip | None:

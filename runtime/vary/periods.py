@@ -9,9 +9,10 @@ Does not: give a verdict for periods whose frame with the other clocks is longer
 A period changes the frame, the least common multiple of all periods. Where all clocks scale with the number,
 as where there is one, every value has as many ticks in a frame: the axis is continuous. With a clock of
 another period only commensurate values are analysed: of p/q times the common divisor of the other periods, a
-frame has about as many ticks as p and q together. Between two of these of different verdicts the simplest
-fraction of the middle third comes next, as long as its frame is short. The remaining gap is the error of the
-answer.
+frame has about as many ticks as p and q together. A period in a simple ratio to the others may have another
+verdict than all periods near it: near each value the simplest ratio and one of a long frame are analyzed.
+Between two of different verdicts one of the middle third comes next, as long as its frame is short. The
+remaining gap is the error of the answer.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from apc.vary.timing_values import (
     common_period,
     delay_now,
     is_scaled,
+    long_period_between,
     period_between,
     periods_near,
     system_with_delay,
@@ -83,7 +85,7 @@ class PeriodLine(JudgedLine):
     def stretches(self) -> Iterator[Stretch]:
         """Yield one stretch where all clocks scale with the number, else one for each period."""
         now = delay_now(self.system, self.free)
-        low = self.low or now / PERIOD_SPAN
+        low = self.low or min(now, self.high or now) / PERIOD_SPAN
         high = self.high or max(now, low) * PERIOD_SPAN
         points = spread(float(low), float(high), float(now))
         look = partial(one_by_one, self.judge)
@@ -104,7 +106,8 @@ class PeriodLine(JudgedLine):
         verdicts = [self.judge(low), self.judge(high)]
         while True:
             third = (high - low) / 3
-            value = period_between(self.system, self.free, unit, low + third, high - third)
+            between = self.system, self.free, unit, low + third, high - third
+            value = long_period_between(*between) or period_between(*between)
             at = None if value is None else self.judge(value)
             if value is None or at is None or at.stable is None:
                 break

@@ -26,6 +26,10 @@ from apc.frame.parameters import resolve, scope_of
 MOST_FRAME_TICKS = 400
 # How far apart two values of a parameter are from which the slope of each timing is computed.
 STEP = Fraction(1, 1009)
+# Denominator of the first ratio that is tried where a long frame is searched for.
+TRIAL = 101
+# Shares of the distance to the next value within which one is searched for.
+SHARES = (Fraction(1, 32), Fraction(1, 4), Fraction(1))
 # Digits to which a period is met, the most that serve; periods that are kept for the next question.
 DIGITS, KEPT = 9, 256
 
@@ -133,6 +137,27 @@ def period_between(
     return value if _ticks(system, free, value) <= MOST_FRAME_TICKS else None
 
 
+def long_period_between(
+    system: CompiledSystem, free: Free, unit: Fraction, low: Fraction, high: Fraction
+) -> Fraction | None:
+    """Return a value strictly between two whose frame is about as long as allowed, None if there is none.
+
+    A period in a simple ratio to the others samples few of the instants at which packets can arrive: its
+    verdict may differ from that of all periods near it. Parameters as for `period_between`.
+    """
+    middle = (low + high) / 2
+    trial = unit * Fraction(round(TRIAL * middle / unit) or 1, TRIAL)
+    most = TRIAL * MOST_FRAME_TICKS / _ticks(system, free, trial)
+    if not math.isfinite(most):
+        return None
+    for denominator in range(int(most), max(int(most / 2), 1), -1):
+        numerator = round(denominator * middle / unit)
+        value = unit * Fraction(numerator, denominator)
+        if math.gcd(numerator, denominator) == 1 and low < value < high:
+            return value if _ticks(system, free, value) <= MOST_FRAME_TICKS else None
+    return None
+
+
 @lru_cache(maxsize=KEPT)
 def nearest_period(system: CompiledSystem, free: Free, value: Fraction) -> Fraction:
     """Return a period near a value, by powers of ten, whose frame is short; any other time as it is."""
@@ -152,7 +177,7 @@ def nearest_period(system: CompiledSystem, free: Free, value: Fraction) -> Fract
 def periods_near(
     system: CompiledSystem, free: Free, targets: Sequence[Fraction], place: Place
 ) -> list[Fraction]:
-    """Return the simplest periods near some values, those of too long a frame left out.
+    """Return the simplest period near each of some values, and one of a long frame on either side of it.
 
     Parameters
     ----------
@@ -173,8 +198,16 @@ def periods_near(
     for before, value, after in zip(targets, targets[1:], targets[2:], strict=False):
         low, high = value - (value - before) / 3, value + (after - value) / 3
         near = period_between(system, free, unit, low, high)
-        if near is not None:
-            found.add(near)
+        if near is None:
+            continue
+        found.add(near)
+        for end in (low, high):  # on both sides of it, as near as there is one
+            for share in SHARES:
+                ends = sorted((near, near + (end - near) * share))
+                beside = long_period_between(system, free, unit, *ends)
+                if beside is not None:
+                    found.add(beside)
+                    break
     if len(found) < 2:
         span = " to ".join(with_unit(f"{float(end):g}", "s") for end in (targets[0], targets[-1]))
         what = (

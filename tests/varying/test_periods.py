@@ -92,3 +92,35 @@ def test_a_limit_of_0_and_a_phase_are_refused() -> None:
         apc.critical(compiled(AVERAGE), "haptic.phase")
     with pytest.raises(apc.ApcError, match=r"E903 haptic\.phase sets the phase"):
         apc.region(compiled(AVERAGE), x="haptic.phase=0 ms:1 ms", y="contact.stiffness=1 N/m:2 N/m")
+
+
+RATIOS = """\
+topology: ratios
+clocks: {haptic: 1 ms, network: 2 ms}
+peers: {user: {count: 2}}
+masses:
+  cube: {mass: 0.6 kg, damping: 4 N*s/m, shared: true}
+couplers:
+  average: {type: AveragePosition, object: cube, stiffness: 250 N/m, clock: haptic, delay: 0 ms, link: lan}
+links: {lan: {clock: network, delay: 2 ms}}
+hands: {arm: {type: SpringDamperArm, flange: cube, stiffness: 60 N/m, damping: 0 N*s/m}}
+"""
+
+
+@pytest.mark.whole
+def test_a_simple_ratio_of_two_clocks_is_not_taken_for_all_periods_near_it() -> None:
+    """By another program, event by event: 1.0281386716 a frame at 13.9 ms, 0.997156 at 14 ms."""
+    model = compiled(RATIOS)
+    first, *others = apc.critical(model, "haptic.period").crossings
+    assert first.stable_side == "below"
+    assert 0.0135 < first.value < 0.0137
+    assert "13.5" in str(apc.critical(model, "haptic.period")).splitlines()[0]
+    assert all(abs(one.value - 0.014) < 1e-4 for one in others)
+    assert apc.analyze(model, set={"haptic.period": "13.9 ms"}).spectral_radius == pytest.approx(
+        1.0281386716, abs=1e-9
+    )
+
+
+def test_an_upper_end_below_the_first_value_of_a_scan_is_kept() -> None:
+    found = apc.critical(pulled(), "tick.period", upper="0.05 ms")
+    assert found.scanned[0] < found.scanned[1] <= 0.05e-3
