@@ -131,6 +131,8 @@ class ComponentNames:
             with mistakes:
                 for written in self._checked(equation, mistakes):
                     left = format_expression(written.left)
+                    if left in [format_expression(other.left) for other in replaced]:
+                        raise fault("E514", equation.place, f"linearized: {left} is replaced twice")
                     if left not in lefts:
                         what = f"linearized: no equation of {self.component.name} has {left} on its left"
                         raise unknown("E514", equation.place, what, left, sorted(lefts))

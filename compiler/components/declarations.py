@@ -106,6 +106,9 @@ def read_linearized(root: Body, mistakes: Mistakes) -> Linearized | None:
     elif isinstance(node, Sequence):
         items = node.items
     equations = []
+    if not items:
+        example = "linearized: a = b"
+        mistakes.take(fault("E203", node.place, "linearized", "at least one equation", "none", example))
     for item in items:
         with mistakes:
             text = text_of(item, "an equation", "linearized: a = b")

@@ -102,9 +102,9 @@ def _symbols(root: Body, component: Component) -> tuple[tuple[str, str], ...]:
     names = {parameter.name: None for parameter in component.parameters}
 
     def read(key: Scalar, value: Node) -> tuple[str, str]:
-        symbol = among(key.text, dict.fromkeys(SYMBOLS), key.place, "symbols names {}, which is no symbol of")
+        symbol = among(key.text, dict.fromkeys(SYMBOLS), key.place, "symbols names {}, which is no symbol")
         name = text_of(value, key.text, "K: stiffness")
-        return symbol, among(name, names, value.place, f"{symbol} names {{}}, which is no parameter of")
+        return symbol, among(name, names, value.place, f"{symbol} names {{}}, which is no parameter")
 
     return tuple(root.each("symbols", "{K: stiffness}", read))
 

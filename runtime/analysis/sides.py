@@ -33,6 +33,7 @@ from apc.frame.kinks import (
     Piece,
     Point,
     at_a_kink,
+    equal,
     names_of,
     one_sided,
     pieces_at,
@@ -138,7 +139,7 @@ def sides(system: CompiledSystem, prepared: Prepared) -> tuple[Side, ...]:
         len(listed) > 1 and group.count > 1 for group, listed in zip(parts, pieces, strict=True)
     )  # not divided
     if count > MOST_SIDES or large:
-        raise _too_many(scene, pieces, count)
+        raise _too_many(scene, pieces)
     names = [
         _names(find_switches(site.equations), listed)
         for site, listed in zip(scene.sites, pieces, strict=True)
@@ -209,7 +210,8 @@ def _smooth(site: SiteJacobians) -> bool:
 
 
 def _pieces_of_groups(scene: Instance, near: Sequence[bool]) -> list[tuple[Piece, ...]]:
-    """Return the pieces that meet at the start of each group's peers; `near`: whether a group may be at one."""
+    """Return the pieces that meet at the start of each group's peers; `near`: whether a group may be at one.
+    """
     smooth = (Piece((), (), np.zeros(0), np.zeros((0, 0))),)
     classes = start_classes(scene)
     starting = StartClasses(scene, classes)
@@ -225,7 +227,7 @@ def _pieces_of_groups(scene: Instance, near: Sequence[bool]) -> list[tuple[Piece
             continue
         switched = find_switches(site.equations)
         for point in _points(starting, g):
-            pieces = pieces_at(switched, point)
+            pieces = pieces_at(switched, point, every=True)
             _refuse_several_senders(switched, starting, g, pieces)
             for group in groups:
                 found[group].append(pieces)
@@ -350,6 +352,7 @@ def _joined(listed: Sequence[tuple[Piece, ...]]) -> tuple[Piece, ...]:
     different: dict[tuple[_Taken, ...], tuple[Piece, ...]] = {}
     for pieces in listed:
         different.setdefault(tuple(piece.taken for piece in pieces), pieces)
+    kept: list[list[Piece]] = []
     result: dict[_Taken, Piece] = {}
     for chosen in itertools.product(*different.values()):
         taken: dict[int, bool] = {}
@@ -358,8 +361,18 @@ def _joined(listed: Sequence[tuple[Piece, ...]]) -> tuple[Piece, ...]:
                 break
             taken |= dict(piece.taken)
         else:
+            # Pieces that have the same slopes at every point are one.
+            agreeing = [
+                piece for pieces in listed for piece in pieces if dict(piece.taken).items() <= taken.items()
+            ]
+            if any(
+                all(equal(a.slopes, b.slopes) for a, b in zip(agreeing, other, strict=True)) for other in kept
+            ):
+                continue
+            kept.append(agreeing)
+            steepest = max(agreeing, key=lambda piece: float(np.linalg.norm(piece.slopes)))
             key = tuple(sorted(taken.items()))
-            result[key] = replace(chosen[0], taken=key)
+            result[key] = replace(steepest, taken=key)
         if len(result) > MOST_SIDES:
             break
     return tuple(result.values())
@@ -393,7 +406,8 @@ def _names(switched: SwitchedKind, pieces: Sequence[Piece]) -> list[str]:
 def _side(
     scene: Instance, prepared: Prepared, origins: Sequence[int], chosen: Sequence[Piece], name: str
 ) -> Side:
-    """Return the model with a piece for each peer or group; neighbours of a group on one side are one again."""
+    """Return the model with a piece for each peer or group; neighbours of a group on one side are one again.
+    """
     system = scene.system
     numbers: dict[tuple[int, _Taken, Moving], int] = {}
     built: list[SiteJacobians] = []
@@ -431,7 +445,7 @@ def _one_sided(site: SiteJacobians, taken: _Taken, moving: Moving) -> SiteJacobi
     return with_equations(site, one_sided(find_switches(site.equations), dict(taken), moving))
 
 
-def _too_many(scene: Instance, pieces: Sequence[Sequence[Piece]], count: int) -> ApcError:
+def _too_many(scene: Instance, pieces: Sequence[Sequence[Piece]]) -> ApcError:
     """Return the refusal of more combinations than are analyzed, with the names of the kinks."""
     names = [
         name
@@ -441,8 +455,5 @@ def _too_many(scene: Instance, pieces: Sequence[Sequence[Piece]], count: int) ->
         )
     ]
     kinks = ", ".join(dict.fromkeys(names))
-    what = (
-        f"{kinks}: {count} combinations of sides meet at the start values, and at most {MOST_SIDES} are "
-        "analyzed"
-    )
+    what = f"{kinks}: more than {MOST_SIDES} combinations of sides meet at the start values"
     return ApcError(Mistake("E808", Place(scene.system.origin.topology), what))

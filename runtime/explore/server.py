@@ -24,6 +24,7 @@ from functools import partial
 from html import escape
 from pathlib import Path
 from tempfile import NamedTemporaryFile
+from types import TracebackType
 from typing import Any
 
 from bokeh.application import Application
@@ -207,12 +208,19 @@ def _opened(loop: IOLoop, link: str) -> Iterator[None]:
         yield
 
 
+def _is_ours(reached: TracebackType | None) -> bool:
+    """Return whether a traceback passes through this package."""
+    return any(frame.f_globals["__name__"].startswith("apc.") for frame, _ in traceback.walk_tb(reached))
+
+
 def _without_token(token: str, record: logging.LogRecord) -> bool:
     """Log a failed request in one line, without the token; a fault of ours keeps its traceback."""
-    text = record.getMessage().partition("\n")[0]
+    try:
+        text = record.getMessage().partition("\n")[0]
+    except (TypeError, ValueError):  # its arguments do not fit its text
+        text = str(record.msg)
     _, error, reached = record.exc_info or (None, None, None)
-    ours = any(frame.f_globals["__name__"].startswith("apc.") for frame, _ in traceback.walk_tb(reached))
-    if error is not None and not ours:
+    if error is not None and not _is_ours(reached):
         text, record.exc_info, record.exc_text = f"a request failed: {error!r:.200}", None, None
     record.msg, record.args = text.replace(token, "…"), ()
     return True
@@ -221,8 +229,7 @@ def _without_token(token: str, record: logging.LogRecord) -> bool:
 def _shortened(record: logging.LogRecord) -> bool:
     """Tell in a line that Bokeh refused a message of the page; a fault of ours keeps its traceback."""
     _, error, reached = record.exc_info or (None, None, None)
-    ours = any(frame.f_globals["__name__"].startswith("apc.") for frame, _ in traceback.walk_tb(reached))
-    if not ours:
+    if not _is_ours(reached):
         record.msg, record.args = f"a message of the page was ignored: {error!r:.200}", ()
         record.exc_info = None
     return True

@@ -90,7 +90,7 @@ def _guards(switched: SwitchedKind) -> _Guards:
     )
 
 
-def pieces_at(switched: SwitchedKind, point: Point) -> tuple[Piece, ...]:
+def pieces_at(switched: SwitchedKind, point: Point, *, every: bool = False) -> tuple[Piece, ...]:
     """Return the pieces that meet a point, those of equal slopes once; one without ties where it is smooth.
 
     Parameters
@@ -99,6 +99,8 @@ def pieces_at(switched: SwitchedKind, point: Point) -> tuple[Piece, ...]:
         The kind with its decisions laid open.
     point
         Where it is linearized; columns that are left out are zero.
+    every
+        Whether pieces of equal slopes are returned, too.
 
     Raises
     ------
@@ -153,7 +155,7 @@ def pieces_at(switched: SwitchedKind, point: Point) -> tuple[Piece, ...]:
             beside.append(np.asarray(functions.slopes(*columns, at)[0]).ravel())
         if any(not (np.abs(piece.values - other) <= TIE * sizes.ravel()).all() for other in beside):
             raise _refused(switched, list(tied), "jumps there")
-        if not any(_equal(piece.slopes, other.slopes) for other in result):
+        if every or not any(equal(piece.slopes, other.slopes) for other in result):
             result.append(piece)
     return tuple(result)
 
@@ -190,6 +192,8 @@ def _reachable(switched: SwitchedKind, rows: Floats, tied: Mapping[int, bool]) -
     if len(wanted) < 2:
         return True
     matrix = np.array(wanted)
+    if np.linalg.matrix_rank(matrix, tol=1e-6) == len(matrix):
+        return True  # every combination of signs
     # A direction d with matrix d ≥ 1 exists, in a box large enough for rows that are nearly opposite.
     found = linprog(
         np.zeros(matrix.shape[1]),
@@ -201,7 +205,8 @@ def _reachable(switched: SwitchedKind, rows: Floats, tied: Mapping[int, bool]) -
     return bool(found.status == 0)
 
 
-def _equal(first: Floats, second: Floats) -> bool:
+def equal(first: Floats, second: Floats) -> bool:
+    """Return whether slopes differ by no more than their rounding."""
     return bool(np.isclose(first, second, rtol=EQUAL, atol=_small(first), equal_nan=True).all())
 
 

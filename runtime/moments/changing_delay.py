@@ -26,9 +26,11 @@ from fractions import Fraction
 
 import numpy as np
 
+from apc.analysis.sides import sides
 from apc.compiler.compiled import Channel, CompiledSystem
 from apc.eigen.modes import loops_at_right_angles
 from apc.frame.instance import prepare
+from apc.frame.jacobians import SiteJacobians
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.frame.radius import UNIT
@@ -52,6 +54,8 @@ ABOVE = 1 + 1e-3
 def loop_gain(system: CompiledSystem, delay: Free, low: Fraction, high: Fraction) -> float:
     """Return the left side of the small gain theorem, proved from above; infinite if the middle is unstable.
 
+    At a kink it is the largest of all sides.
+
     Parameters
     ----------
     system
@@ -66,6 +70,16 @@ def loop_gain(system: CompiledSystem, delay: Free, low: Fraction, high: Fraction
     UnservedError
         What stands in the way of a bound.
     """
+    return max(
+        _loop_gain(side.system, side.prepared.jacobians, delay, low, high)
+        for side in sides(system, prepare(system))
+    )
+
+
+def _loop_gain(
+    system: CompiledSystem, jacobians: tuple[SiteJacobians, ...], delay: Free, low: Fraction, high: Fraction
+) -> float:
+    """Return `loop_gain` of one side of a kink."""
     middle = apply(system, [Override(delay, (low + high) / 2)])
     (link,) = (
         link for link in system.links if delay.name in (link.delay, *(pair.delay for pair in link.delays))
@@ -79,7 +93,7 @@ def loop_gain(system: CompiledSystem, delay: Free, low: Fraction, high: Fraction
         raise UnservedError("receivers ask how old packets are, or for the packet before")
     links = tuple(replace(item, channel=HOLDING) if item is link else item for item in middle.links)
     changing = replace(middle, links=links)
-    hearing = build_hearing(changing, prepare(changing))
+    hearing = build_hearing(changing, prepare(changing, jacobians))
     refuse_unheld(changing, hearing)
     loops = loops_at_right_angles(hearing.groups, hearing.exchange, MOST_STATES)
     packets = Packets(changing, hearing)

@@ -150,7 +150,7 @@ def growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool = True) 
 
 def worst_growth(each: Sequence[Growth]) -> Growth:
     """Return the largest of several numbers, all of which have to be below 1."""
-    largest = max(each, key=lambda growth: growth.radius)
+    largest = max(each, key=lambda growth: math.inf if math.isnan(growth.radius) else growth.radius)
     return replace(
         largest,
         low=max(growth.low for growth in each),

@@ -40,7 +40,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import analyze
+from apc.analysis.analysis import Analysis, analyze
 from apc.compiler.compiled import ANGLES, LENGTH, CompiledSystem, Group
 from apc.compiler.errors import ApcError
 from apc.eigen.spectrum import DRIFTS as RADIUS_DRIFTS
@@ -364,7 +364,8 @@ def agreed(summary: Summary, system: CompiledSystem) -> Summary:
     system
         The topology that was simulated.
     """
-    if summary.verdict in (AT_REST, DRIVEN) or summary.driven_until or system.peers > MOST_LINEAR:
+    driven = summary.verdict == DRIVEN
+    if summary.verdict == AT_REST or (summary.driven_until and not driven) or system.peers > MOST_LINEAR:
         return summary
     if not all(jacobians(kind).affine for kind in system.kinds) or unreliable(system):
         return summary
@@ -372,6 +373,11 @@ def agreed(summary: Summary, system: CompiledSystem) -> Summary:
         analysis = analyze(system)
     except ApcError:  # what can't be analysed can be simulated
         return summary
+    if driven:
+        if analysis.stable is not False or analysis.verdict == RADIUS_DRIFTS:
+            return summary
+        reason = f"driven; apc analyze: {analysis.verdict}{_time_constant(analysis)}"
+        return replace(summary, verdict=DIVERGES, reason=reason)
     decays, lasts = summary.verdict == DECAYS, summary.verdict in (DECAYS, DRIFTS)
     drifts = analysis.verdict == RADIUS_DRIFTS
     contradicted = {
@@ -381,11 +387,16 @@ def agreed(summary: Summary, system: CompiledSystem) -> Summary:
     }[analysis.stable]
     if not contradicted:
         return summary
-    reason = f"{summary.reason or CONTRADICTION}; apc analyze: {analysis.verdict}"
-    if 0 < analysis.spectral_radius != 1:
-        slowest = analysis.frame_s / abs(math.log(analysis.spectral_radius))
-        reason += f", {'decay' if analysis.spectral_radius < 1 else 'growth'} time constant {slowest:.6g} s"
+    reason = f"{summary.reason or CONTRADICTION}; apc analyze: {analysis.verdict}{_time_constant(analysis)}"
     return replace(summary, verdict=NOT_DETERMINED, reason=reason)
+
+
+def _time_constant(analysis: Analysis) -> str:
+    """Return the time constant of the slowest decay or fastest growth in words, "" where there is none."""
+    if not 0 < analysis.spectral_radius != 1:
+        return ""
+    slowest = analysis.frame_s / abs(math.log(analysis.spectral_radius))
+    return f", {'decay' if analysis.spectral_radius < 1 else 'growth'} time constant {slowest:.6g} s"
 
 
 def is_position(signal: Signal) -> bool:

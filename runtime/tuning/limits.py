@@ -36,6 +36,7 @@ from apc.hands.frequency_response import COUPLED, feel
 from apc.moments.changing_delay import loop_gain
 from apc.threads import load_pool
 from apc.tuning.demands import HINF, PLACE, SUBJECT, Aim, Demands, Felt
+from apc.unserved import UnservedError
 from apc.vary.batch import BatchEvaluator, MatrixSource
 from apc.vary.delay_box import standing_delays
 from apc.vary.evaluator import evaluator_of_many
@@ -292,7 +293,10 @@ class Limits:
                     break
                 pairs = zip(free, map(Fraction, point), strict=True)
                 scene = apply(self.system, [*counts, *(Override(*pair) for pair in pairs)])
-                gain = loop_gain(scene, delay.free, delay.low, delay.high)
+                try:
+                    gain = loop_gain(scene, delay.free, delay.low, delay.high)
+                except UnservedError:
+                    gain = math.inf
                 self.loop_gains[counts, point] = math.log(max(gain, TINY))
             values[place] = self.loop_gains[counts, point]
         return values

@@ -471,9 +471,12 @@ class _Work:
     def _stable_if_changing(self, scene: CompiledSystem) -> bool:
         """Return whether a scene is proved stable under a delay that changes, where nothing else varies."""
         delay = self.demands.delay
-        return bool(
-            delay and not self.demands.box and loop_gain(scene, delay.free, delay.low, delay.high) < 1
-        )
+        if delay is None or self.demands.box:
+            return False
+        try:
+            return loop_gain(scene, delay.free, delay.low, delay.high) < 1
+        except UnservedError:
+            return False
 
     def _changing(
         self, gains: Sequence[Fraction], proofs: Sequence[Proved]

@@ -230,10 +230,13 @@ def stable_in_all(searches: Sequence[Search]) -> Search:
     Parameters
     ----------
     searches
-        One for each model, along the same parameter; those with no verdict at any value restrict nothing.
+        One for each model, along the same parameter; those in which nothing moves restrict nothing.
     """
     if len(searches) == 1:
         return searches[0]
+    for one in searches:
+        if not one.stable and (one.left_open or not one.whole):
+            return one  # undecided at every value
     decided = [one for one in searches if one.stable]
     listed = sorted(
         ((edge.value, n, edge) for n, one in enumerate(decided) for edge in one.edges), key=itemgetter(0, 1)

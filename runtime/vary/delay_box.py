@@ -14,6 +14,7 @@ from dataclasses import replace
 from fractions import Fraction
 
 from apc.analysis.box_proof import UNDECIDED, BoxProof, ChangingDelay
+from apc.analysis.sides import sides
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.instance import prepare
@@ -99,7 +100,10 @@ def changing(system: CompiledSystem, delay: Range) -> ChangingDelay:
         proved = next((end for end in ends if loop_gain(system, delay.free, low, end) < 1), None)
     except UnservedError as why:
         return ChangingDelay(None, None, f"left open, as {why}")
-    beyond = None if proved == delay.high else unstable_delays(system, delay.free, low, delay.high)
+    several = len(sides(system, prepare(system))) > 1
+    beyond = None
+    if not several and proved != delay.high:
+        beyond = unstable_delays(system, delay.free, low, delay.high)
     return ChangingDelay(None if proved is None else float(proved), beyond)
 
 
