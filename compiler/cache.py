@@ -33,7 +33,7 @@ from pathlib import Path, PurePath
 
 import msgspec
 
-from apc.compiler.errors import Place
+from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import RefusedError, listing, read_file
 from apc.compiler.seal import is_sealed, seal
 from apc.compiler.source.reading import fault
@@ -85,7 +85,11 @@ class Archive:
 def packed(origin: Origin, model: bytes, *, compiled: bool) -> bytes:
     """Return the content of a model's file, under this user's seal."""
     head = f"apc {FORMAT} {'compiled' if compiled else 'saved'}".encode()
-    body = msgspec.json.encode(origin) + b"\n" + model
+    try:
+        body = msgspec.json.encode(origin) + b"\n" + model
+    except UnicodeEncodeError:
+        what = "the name of a file that it is compiled from is not valid UTF-8"
+        raise ApcError(Mistake("E601", Place(origin.topology), what)) from None
     whole = head + b"\n" + body
     mark = f"{seal(whole)} {hashlib.sha256(whole).hexdigest()}"
     return b"\n".join((head, mark.encode(), body))

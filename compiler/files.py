@@ -326,7 +326,9 @@ def begin_file(path: Path) -> Temporary:
     descriptor, text = tempfile.mkstemp(".unfinished", f".{target.name[:24]}.", folder)
     name, by_descriptor = Path(text), Path(f"/proc/{os.getpid()}/fd/{descriptor}")
     try:
-        directory = os.open(folder, os.O_RDONLY | os.O_DIRECTORY) if os.rename in os.supports_dir_fd else None
+        # A folder need not be readable.
+        only = getattr(os, "O_PATH", os.O_RDONLY) | getattr(os, "O_DIRECTORY", 0)
+        directory = os.open(folder, only) if os.rename in os.supports_dir_fd else None
     except OSError:
         os.close(descriptor)
         name.unlink(missing_ok=True)
@@ -366,15 +368,21 @@ def finish_file(temporary: Temporary, path: Path) -> None:
     if not _is_ours(temporary, temporary.name.name):
         raise OSError(None, "another program has replaced its temporary file")
     if temporary.folder is None:
-        os.close(temporary.descriptor)
-        temporary.name.replace(target)
+        os.close(temporary.descriptor)  # an open file can't be moved there
+        try:
+            temporary.name.replace(target)
+        except OSError:
+            temporary.name.unlink(missing_ok=True)
+            raise
         return
     os.replace(temporary.name.name, target.name, src_dir_fd=temporary.folder, dst_dir_fd=temporary.folder)
     found = os.stat(target.name, dir_fd=temporary.folder, follow_symlinks=False)
     # Another run of the same user may have written the same file since.
-    if found.st_uid != os.fstat(temporary.descriptor).st_uid or not stat.S_ISREG(found.st_mode):
-        with suppress(OSError):  # what came in its place leads elsewhere
-            os.unlink(target.name, dir_fd=temporary.folder)
+    regular = stat.S_ISREG(found.st_mode)
+    if found.st_uid != os.fstat(temporary.descriptor).st_uid or not regular:
+        if not regular:
+            with suppress(OSError):  # what came in its place leads elsewhere
+                os.unlink(target.name, dir_fd=temporary.folder)
         raise OSError(None, "another program has replaced its temporary file")
     _close(temporary)
 
@@ -387,9 +395,9 @@ def _is_ours(temporary: Temporary, name: str) -> bool:
             dir_fd=temporary.folder,
             follow_symlinks=False,
         )
-    except FileNotFoundError:
+        return os.path.samestat(found, os.fstat(temporary.descriptor))
+    except OSError:  # it is gone, or closed
         return False
-    return os.path.samestat(found, os.fstat(temporary.descriptor))
 
 
 def _close(temporary: Temporary) -> None:
@@ -418,9 +426,11 @@ def unlink_link(path: Path) -> None:
 def drop_file(temporary: Temporary) -> None:
     """Remove a temporary file that was not put where it belongs."""
     if _is_ours(temporary, temporary.name.name):
-        os.unlink(
-            temporary.name.name if temporary.folder is not None else temporary.name, dir_fd=temporary.folder
-        )
+        with suppress(OSError):
+            os.unlink(
+                temporary.name.name if temporary.folder is not None else temporary.name,
+                dir_fd=temporary.folder,
+            )
     _close(temporary)
 
 
@@ -429,11 +439,16 @@ def _target(path: Path) -> Path:
     try:
         if not path.is_symlink() or is_special(path):
             return path
-        link, folder = path.lstat(), path.parent.stat()
-        # As Linux's protected_symlinks: nobody else's link in a folder of ours or of a third user.
-        if hasattr(os, "geteuid") and link.st_uid not in (os.geteuid(), folder.st_uid):
-            raise PermissionError(None, "it is a link of another user")
-        return path.resolve()
+        target = path.resolve()  # refuses a loop of links
+        step = path
+        while step.is_symlink():
+            link, folder = step.lstat(), step.parent.stat()
+            # Stricter than Linux's protected_symlinks, which holds in sticky folders alone: nobody else's
+            # link in a folder of ours or of a third user.
+            if hasattr(os, "geteuid") and link.st_uid not in (os.geteuid(), folder.st_uid):
+                raise PermissionError(None, "it is a link of another user")
+            step = step.parent / step.readlink()
+        return target
     except RuntimeError as error:  # a loop of links
         raise OSError(None, "its links lead to one another") from error
 

@@ -313,9 +313,12 @@ def _settle(
     infer: Callable[[Expr, Where], T | None],
     known: dict[Path, T | None],
 ) -> None:
-    """Infer something of each name, which may hang on others: each round settles some, while any can be."""
-    for _ in waiting:
-        known |= {name: infer(*written) for name, written in waiting.items() if known[name] is None}
+    """Infer something of each name, which may depend on others: round by round, while any is settled."""
+    while True:
+        found = {name: infer(*written) for name, written in waiting.items() if known[name] is None}
+        known |= found
+        if all(value is None for value in found.values()):
+            return
 
 
 def _visible_names(component: Component) -> Iterator[tuple[Path, Dimension]]:

@@ -14,9 +14,10 @@ SymPy's `zoo` or `nan`, or has an imaginary part.
 from __future__ import annotations
 
 import functools
+import math
 import operator
 import sys
-from collections.abc import Callable, Iterable, Set
+from collections.abc import Callable, Iterable, Sequence, Set
 from fractions import Fraction
 from typing import Any, TypeAlias
 
@@ -153,7 +154,7 @@ FUNCTIONS: dict[str, Any] = {
     **{name: getattr(sympy, name) for name in ("atan2", *SMOOTH)},
     **{name: type(name, (Condition,), {}) for name in CONDITIONS},
 }
-_IRRATIONAL = {"sqrt", "atan2", *SMOOTH}
+_ROUNDED = {"sqrt", "atan2", "max", "min", "abs", *SMOOTH}
 NAMES = {
     sympy.Abs: "abs",
     sympy.sign: "sign",
@@ -195,8 +196,12 @@ def to_term(expression: Expr, differentiate: Callable[[Term], Term] | None = Non
         if name == "der":
             assert differentiate is not None, operands
             return differentiate(*operands)
-        if name in _IRRATIONAL and not all(operand.is_Rational for operand in operands):
+        if name in _ROUNDED and not all(operand.is_Rational for operand in operands):
             operands = tuple(map(rounded, operands))  # of constants inside one another
+        if name in ("max", "min") and all(operand.is_Rational for operand in operands):
+            return (max if name == "max" else min)(operands)
+        if name == "atan2" and _is_wide(operands):
+            return sympy.Rational(math.atan2(*map(float, operands)))
         return FUNCTIONS[name](*operands)
 
     return fold(transform(expression, _short_constant), leaf, term)
@@ -205,15 +210,26 @@ def to_term(expression: Expr, differentiate: Callable[[Term], Term] | None = Non
 def _short_constant(node: Expr) -> Expr | None:
     """Return a long constant that is not rational as the nearest float, or as 1/0 if it has no real value.
 
-    None leaves a node as it is.
+    Also the value of a constant choice. None leaves a node as it is.
     """
-    if not isinstance(node, Call) or sum(1 for _ in expressions(node)) <= LONG:
+    if not isinstance(node, Call):
+        return None
+    chosen = node.function == "if"
+    if not chosen and sum(1 for _ in expressions(node)) <= LONG:
         return None
     try:
         value = constant_value(node)
     except FaultError:
         return Call("/", (Number(Fraction(1)), Number(Fraction(0))))
-    return Number(Fraction(value)) if isinstance(value, float) else None
+    return Number(Fraction(value)) if isinstance(value, float) or (chosen and value is not None) else None
+
+
+def _is_wide(operands: Sequence[Term]) -> bool:
+    """Return whether the ratio of two rationals leaves the range of floats."""
+    if not all(operand.is_Rational and operand for operand in operands):
+        return False
+    ratio = abs(operands[0] / operands[1])
+    return bool(max(ratio, 1 / ratio) > LARGEST)
 
 
 # ---- what is asked of terms ----

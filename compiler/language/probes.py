@@ -38,9 +38,15 @@ _TIME = rf"[=<][\s\ufffd]?(?P<time>\d{{1,15}}(?:[.,]\d{{1,15}})?)[\s\ufffd]?(?P<
 _TOOK = re.compile(rf"\w\s?{_TIME}")
 _NUMBER = re.compile(r"\b(?:icmp?_s(?:eq|ql)|seq|pořadí)\s?[= ]\s?(?P<number>\d{1,18})(?!\d)")
 _ANSWERED = re.compile(r"\b(?:ttl|hlim)\s?=\s?\d", re.IGNORECASE)
+_DUPLICATE = re.compile(r"\([^()\d]*[!！]\)|DUP")  # the second of two answers
 _STAMP = re.compile(r"\[(?P<stamp>\d{1,15}\.\d{1,15})\] ")
 _HEADING = re.compile(r"(?:PING6?|ПІНГ)[ (]|Ping \S+ \(\S+\):")
-_FROM_ZERO = re.compile(r"PING6?\b.*(?:\): \d+ data bytes| --> )")  # these programs begin to count at 0
+_FROM_ZERO = re.compile(
+    r"PING6?\b.*(?:: (?:\d+|\(.*\)) data bytes| --> )"
+)  # these programs begin to count at 0
+# A run that was stopped within a line, and the heading of the next one behind it.
+_CUT_HEADING = re.compile(r".+?PING6? \S+ \(\S+\).*\d+(?:\(\d+\))? (?:data )?bytes")
+_TCPING = re.compile(r"Probing \S+:\d+/tcp")
 _PARTS = re.compile(r"[,，](?!\d)")
 _TOTAL = re.compile(rf"(?<![\d.,-])(?P<total>\d{{1,15}})\s?(?:{_MS})\W*\Z")
 _WINDOWS = re.compile(rf"\w\s?{_TIME}(?:\s*TTL=\d+)?\s*\Z")
@@ -129,7 +135,11 @@ def _ping(lines: Sequence[str], file: str) -> Probe | None:
     ended = Place(file)
     for at, line in enumerate(lines, start=1):
         counted = _NUMBER.search(line)
+        if counted is not None and at == len(lines) and counted.end() == len(line):
+            break  # the recording ends within a number
         if counted is None:
+            if _CUT_HEADING.match(line):
+                raise _second_run(Place(file, at, 1))
             if _HEADING.match(line):
                 if headed or trips or statistics:
                     raise _second_run(Place(file, at, 1))
@@ -162,10 +172,12 @@ def _ping(lines: Sequence[str], file: str) -> Probe | None:
                     break
                 raise _untimed(Place(file, at, 1))
             trips.setdefault(number, math.inf)  # no answer yet: one may come
-        elif math.isinf(trips.get(number, math.inf)):  # and not the second of two answers
+        elif math.isinf(trips.get(number, math.inf)):
             trips[number] = _seconds(took, file, at)
             if (stamp := _STAMP.match(line)) is not None:
                 stamps.append((number, float(stamp["stamp"]) - trips[number]))
+        elif number < last and not _DUPLICATE.search(line):
+            raise _second_run(Place(file, at, 1))
     first = min(first, *trips) if trips else first
     final = max(trips, default=first - 1)
     total = math.nan
@@ -227,6 +239,10 @@ def _windows_ping(lines: Sequence[str], file: str) -> Probe | None:
     ended, again, replies = Place(file), None, 0
     headed = inside = False
     for at, line in enumerate(lines, start=1):
+        if _TCPING.match(line):
+            return None
+        if inside and line[:1].isspace() and line.strip():
+            continue  # routes and time stamps of the answer above
         if not line.strip() or line[0].isspace():
             if statistics is None and (found := _WINDOWS_STATISTICS.match(line)):
                 statistics, ended = tuple(map(int, found.groups())), Place(file, at, 1)

@@ -210,8 +210,7 @@ def _smooth(site: SiteJacobians) -> bool:
 
 
 def _pieces_of_groups(scene: Instance, near: Sequence[bool]) -> list[tuple[Piece, ...]]:
-    """Return the pieces that meet at the start of each group's peers; `near`: whether a group may be at one.
-    """
+    """Return the pieces that meet at the start of each group's peers; `near` excludes groups without a kink."""
     smooth = (Piece((), (), np.zeros(0), np.zeros((0, 0))),)
     classes = start_classes(scene)
     starting = StartClasses(scene, classes)
@@ -406,8 +405,7 @@ def _names(switched: SwitchedKind, pieces: Sequence[Piece]) -> list[str]:
 def _side(
     scene: Instance, prepared: Prepared, origins: Sequence[int], chosen: Sequence[Piece], name: str
 ) -> Side:
-    """Return the model with a piece for each peer or group; neighbours of a group on one side are one again.
-    """
+    """Return the model with a piece for each peer or group; neighbours on one side are one group again."""
     system = scene.system
     numbers: dict[tuple[int, _Taken, Moving], int] = {}
     built: list[SiteJacobians] = []

@@ -43,6 +43,9 @@ QUARTILES = (0.25, 0.5, 0.75)
 POINTS = 1 << 14
 
 
+NO_END = "no burst of losses ended within the recording: how long they last is not known"
+
+
 @dataclass(frozen=True, slots=True)
 class Share:
     """A share of `of` packets, and the `interval` that its probability lies in."""
@@ -146,7 +149,7 @@ def describe_delays(
     turns_bad = _share(after & ~before, ~before)
     turns_good = _share(~after & before, before)
     lost = _share(gone, np.ones_like(gone))
-    bursty = _follow(turns_bad, turns_good)
+    bursty = _follow(turns_bad, turns_good) and turns_good.count > 0
     correlation = _correlation(delays)
     law = _law(arrived)
     runs = np.diff(np.flatnonzero(np.diff(np.concatenate([[False], gone, [False]]))))[::2]
@@ -155,7 +158,10 @@ def describe_delays(
         program=program,
         packets=len(delays),
         interval=interval,
-        left_out=_left_out(program, len(delays), law, correlation, interval),
+        left_out=(
+            *_left_out(program, len(delays), law, correlation, interval),
+            *([NO_END] if gone.any() and before.any() and not turns_good.count else []),
+        ),
         lost=lost,
         turns_bad=turns_bad,
         turns_good=turns_good,

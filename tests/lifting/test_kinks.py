@@ -98,6 +98,24 @@ def test_a_tie_is_one_whatever_floats_round(tmp_path: Path) -> None:
     ) or [side.spectral_radius for side in found.sides] == pytest.approx([radius(60e3), radius(0)], abs=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("constant", "value"),
+    [
+        ("atan2(1, min(1, 2))", math.pi / 4),
+        ("exp(atan2(3, max(1e-9, 1e9)))", math.exp(math.atan2(3, 1e9))),
+        ("sin(atan2(3, atan2(4, max(2, 1))))", math.sin(math.atan2(3, math.atan2(4, 2)))),
+        ("exp(atan2(pi, sign(atan2(abs(pi), min(1e-9, 1e9)))))", math.exp(math.atan2(math.pi, 1))),
+        ("atan2(exp(700), exp(-700))", math.pi / 2),
+        ("cos(atan2(3, atan2(3, if 1 < 2 then 1 else 2)))", math.cos(math.atan2(3, math.atan2(3, 1)))),
+        ("(if 1 < 2 then sqrt(2) else sqrt(-1))", math.sqrt(2)),
+    ],
+)
+def test_a_choice_of_constants_is_a_number(constant: str, value: float, tmp_path: Path) -> None:
+    found = apc.analyze(model(tmp_path, f"K*{X}*{constant}", ", K: 20000 N/m"))
+    assert found.spectral_radius == pytest.approx(radius(20e3 * value), abs=1e-12)
+    assert not found.sides
+
+
 def test_a_critical_value_is_that_of_the_worse_side(tmp_path: Path) -> None:
     system = model(tmp_path, f"max(0, K*{X})", ", K: 100 N/m")
     found = apc.critical(system, "own.K")

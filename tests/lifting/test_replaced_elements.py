@@ -81,6 +81,9 @@ def test_a_simulation_sees_whole_steps() -> None:
         ("linearized: {equation: f = 0}", "E202"),
         ("linearized: {equations: f = 0}", "E203"),
         ("linearized: F = f", "E514"),
+        ("linearized: []", "E203"),
+        ("linearized: {equations: [], valid: all}", "E203"),
+        ("linearized: [f = F*flange.x/L, f = F*flange.x/L]", "E514"),
     ],
 )
 def test_a_replacement_that_does_not_fit_is_refused_at_its_place(

@@ -58,6 +58,17 @@ def test_a_library_file_whose_name_has_a_line_break_is_one_file(cli: Cli) -> Non
     assert cli("analyze nested.yaml --no-margins").code == 0
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="names are bytes on Linux only")
+def test_a_library_file_whose_name_is_no_text_is_refused_where_it_would_be_stored(cli: Cli) -> None:
+    Path("library").mkdir()
+    write("library/flat.yaml", NESTED.format(stiffness="s").replace("Outer", "Other"))
+    Path("library/flat.yaml").rename(os.fsdecode(b"library/\xff\xfe.yaml"))
+    write("scene.yaml", AVERAGE + "library: ./library\n")
+    assert cli("analyze scene.yaml").code == 0
+    ran = cli("compile scene.yaml")
+    assert (ran.code, "E601" in ran.err) == (1, True), ran.err
+
+
 def test_an_unknown_backend_of_windows_is_none_of_our_business(tmp_path: Path) -> None:
     (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
     words = [sys.executable, "-m", "apc", "analyze", "scene.yaml", "--no-margins", "--plot", "p.svg"]
@@ -76,6 +87,9 @@ def test_a_failed_request_is_logged_without_the_token() -> None:
     record = logging.LogRecord("tornado", logging.ERROR, "", 0, "GET /?token=%s\nmore", ("secret",), told)
     assert server._without_token("secret", record)
     assert (record.getMessage(), record.exc_info) == ("a request failed: OSError('of somebody else')", None)
+    wrong = logging.LogRecord("bokeh", logging.ERROR, "", 0, "token secret of %s", (1, 2), None)
+    assert server._without_token("secret", wrong)
+    assert wrong.getMessage() == "token … of %s"
     plain = logging.LogRecord("bokeh", logging.ERROR, "", 0, "session of /?token=secret", (), None)
     assert server._without_token("secret", plain)
     assert plain.getMessage() == "session of /?token=…"

@@ -124,6 +124,16 @@ def test_a_force_that_changes_until_the_end_drives_the_motion(hand: str, verdict
         assert found.fit is not None and abs(found.fit.rate - truth.real) <= found.fit.error < 1e-3
 
 
+@pytest.mark.parametrize(("damping", "verdict"), [(0.46, "driven"), (0.44, "diverges")])
+def test_a_driven_motion_of_an_unstable_linear_topology_diverges(damping: float, verdict: str) -> None:
+    assert (eigenvalue(damping, 900.0).real < 0) is (verdict == "driven")
+    text = SLOW.replace("DAMPING", repr(damping)).replace("STIFFNESS", "900.0")
+    text += "hands: {hand: {type: SineForce, flange: device, force: 1 N, frequency: 3 Hz}}\n"
+    found = simulate(compiled(text), duration=Fraction(2), jit=False).summary
+    assert found.verdict == verdict
+    assert ("growth time constant" in found.reason) is (verdict == "diverges")
+
+
 @pytest.mark.parametrize("name", ["three-users-predicted", "two-users-dead-reckoning"])
 def test_the_age_of_a_packet_is_no_force_that_changes_with_time(name: str) -> None:
     system, _ = strike(apc.compile(SCENES / f"{name}.yaml"))
