@@ -210,7 +210,7 @@ def _smooth(site: SiteJacobians) -> bool:
 
 
 def _pieces_of_groups(scene: Instance, near: Sequence[bool]) -> list[tuple[Piece, ...]]:
-    """Return the pieces that meet at the start of each group's peers; `near` excludes groups without a kink."""
+    """Return the pieces at the start of each group; `near` is False for groups that have no kink."""
     smooth = (Piece((), (), np.zeros(0), np.zeros((0, 0))),)
     classes = start_classes(scene)
     starting = StartClasses(scene, classes)
