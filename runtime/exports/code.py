@@ -8,6 +8,7 @@ Does not: compile what is written as C.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -83,9 +84,15 @@ def _plan(system: CompiledSystem, method: str) -> tuple[Method, Plan]:
         return how, plan_of(system, how)
 
 
+_INCLUDED = re.compile(r"[^\x00-\x1f\"\\]+")
+
+
 def write_code(path: Path, code: Code) -> None:
     """Write a peer's code, its header beside it, and a driver. Raises ApcError (E601) if it can't be."""
     include = f"{path.stem}.h"
+    if not _INCLUDED.fullmatch(include):
+        what = f"{include} can't be the name of a header in C"
+        raise ApcError(Mistake("E601", Place(str(path)), what, hint="--out peer.c"))
     write_texts(
         {
             path.with_suffix(".h"): header(code.code),

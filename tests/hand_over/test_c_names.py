@@ -20,7 +20,7 @@ from apc.exports.peer_step import Peer, peer_of
 from apc.simulation.settings import DEFAULT
 from apc.simulation.simulation import plan_of
 from tests.hand_over.in_c import compiler
-from tests.topologies import compiled
+from tests.topologies import ROOT, compiled
 
 C_WORDS = """
 auto break case char const continue default do double else enum extern float for goto if inline int
@@ -132,6 +132,16 @@ def compile_fmu(system: apc.CompiledSystem, folder: Path, peer: str = "") -> Non
     command = [compiler(), *options, *STRICT, "-Wno-unused-function", *listed, "-o", "unit.so", "-lm"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[:2000]
+
+
+@pytest.mark.parametrize("name", ['q"x.c', "q\\x.c", "q\nx.c"])
+def test_a_name_that_no_include_can_hold_is_refused(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = ROOT / "models" / "scenes" / "three-users-average.yaml"
+    assert run(["export", str(scene), "--peer", "user[1]", "--out", str(tmp_path / name)]) == 1
+    assert "E601" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.whole
