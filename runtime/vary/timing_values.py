@@ -143,7 +143,12 @@ def long_period_between(
     """Return a value strictly between two whose frame is about as long as allowed, None if there is none.
 
     A period in a simple ratio to the others samples few of the instants at which packets can arrive: its
-    verdict may differ from that of all periods near it. Parameters as for `period_between`.
+    verdict may differ from that of all periods near it.
+
+    Parameters
+    ----------
+    system, free, unit, low, high
+        As for `period_between`.
     """
     middle = (low + high) / 2
     trial = unit * Fraction(round(TRIAL * middle / unit) or 1, TRIAL)
