@@ -11,6 +11,7 @@ Does not: compute.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from importlib.resources import files
@@ -520,11 +521,12 @@ class Page:
         return "".join(f"&{quote(name)}={quote(text, safe='')}" for name, text in pairs)
 
     def _later(self, call: Any, seconds: float) -> None:
-        """Call on the thread of the page; a page that is closed by then is told nothing more."""
-        if seconds:
-            self.document.add_timeout_callback(call, round(1000 * seconds))
-        else:
-            self.document.add_next_tick_callback(call)
+        """Call on the thread of the page, if the page is not closed by then."""
+        with suppress(AttributeError):  # a document that Bokeh has destroyed has no list of callbacks
+            if seconds:
+                self.document.add_timeout_callback(call, round(1000 * seconds))
+            else:
+                self.document.add_next_tick_callback(call)
 
     def _deliver(self, section: str, answer: SectionAnswer) -> None:
         """Show what a section tells."""
