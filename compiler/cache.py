@@ -33,7 +33,7 @@ from pathlib import Path, PurePath
 
 import msgspec
 
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import RefusedError, listing, read_file
 from apc.compiler.seal import is_sealed, seal
 from apc.compiler.source.reading import fault
@@ -89,7 +89,7 @@ def packed(origin: Origin, model: bytes, *, compiled: bool) -> bytes:
         body = msgspec.json.encode(origin) + b"\n" + model
     except UnicodeEncodeError:
         what = "the name of a file that it is compiled from is not valid UTF-8"
-        raise ApcError(Mistake("E601", Place(origin.topology), what)) from None
+        raise ApcError(Diagnostic("E601", SourceLocation(origin.topology), what)) from None
     whole = head + b"\n" + body
     mark = f"{seal(whole)} {hashlib.sha256(whole).hexdigest()}"
     return b"\n".join((head, mark.encode(), body))
@@ -103,7 +103,7 @@ def read_archive(path: Path) -> Archive:
     ApcError
         E602 it can't be read, E603 it is of another format, E604 it is damaged.
     """
-    place = Place(str(path))
+    place = SourceLocation(str(path))
     try:
         data = read_file(path, LARGEST)
     except RefusedError as refused:

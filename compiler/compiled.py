@@ -1,18 +1,18 @@
 """The compiled model: CasADi functions of one site per kind, and the exchange between sites as structure.
 
 Takes: nothing (these are the data types the stage `functions` fills and the runtime reads).
-Gives: `CompiledSystem` and its parts, but `Origin` (see `cache`);
+Gives: `Model` and its parts, but `Origin` (see `cache`);
 `PEERS`, `count_of`, `group_count`, `counts_peers`; `LENGTH`, `ANGLES`.
 Guarantees: plain frozen data; numbers in SI; periods, phases and delays exact rationals of a second.
 Does not: evaluate anything, or read or write files (see `store`).
 
 Every function of a kind takes some of these vectors, in this order:
 
-    x  (n_x,)  continuous states, in the order of `Kind.states`
-    u  (n_u,)  the values the holds put out at this moment, in the order of `Kind.holds`
+    x  (n_x,)  continuous states, in the order of `PeerType.states`
+    u  (n_u,)  the values the holds put out at this moment, in the order of `PeerType.holds`
     m  (n_m,)  for a tick: the partition's remembered outputs from its previous tick
     r  (n_r,)  for a tick: what the site hears from the others, in the order of `ClockPartition.receives`
-    p  (n_p,)  parameters, in the order of `Kind.parameters`
+    p  (n_p,)  parameters, in the order of `PeerType.parameters`
     t  ()      time in seconds
 """
 
@@ -265,7 +265,7 @@ class SendPartition:
 
 
 @dataclass(frozen=True, slots=True)
-class Ports:
+class ForcePorts:
     """Where held values act on what moves: `port(x, u, p, t) -> (potentials, then flows) (2 n,)`.
 
     `parts` (n,) names the part of each; a flow counts into its part and follows from u and p alone. A part
@@ -299,7 +299,7 @@ class Replaced:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Kind:
+class PeerType:
     """All peers of one structure. `derivative(x, u, p, t) -> dx/dt (n_x,)`.
 
     A float among the values of a parameter is exact, but where `rounded` has it: by the parameter's place in
@@ -319,18 +319,18 @@ class Kind:
     derivative: casadi.Function
     clocks: tuple[ClockPartition, ...]
     sends: tuple[SendPartition, ...]
-    ports: Ports | None = None
+    ports: ForcePorts | None = None
     rounded: tuple[tuple[int, tuple[Fraction, ...]], ...] = ()
     hands: tuple[str, ...] = ()
     limits: tuple[Limit, ...] = ()
     held: tuple[str, ...] = ()
-    linear: Kind | None = None
+    linear: PeerType | None = None
     replaced: tuple[Replaced, ...] = ()
     symbols: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Column:
+class PeerColumn:
     """A parameter that differs from peer to peer: `values` (count,) in SI."""
 
     name: str
@@ -349,7 +349,7 @@ class Group:
     count: int
     kind: int
     values: tuple[Parameter, ...] = ()
-    columns: tuple[Column, ...] = ()
+    columns: tuple[PeerColumn, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -370,7 +370,7 @@ class Axis:
 
 
 @dataclass(frozen=True, slots=True)
-class CompiledSystem:
+class Model:
     """A compiled scene. `dropped` lists what the scene named but does not need, with the reason.
 
     `followers` are the names of all parameters and timings with a formula, of any group, in an order in which
@@ -386,7 +386,7 @@ class CompiledSystem:
     links: tuple[Link, ...]
     timings: tuple[Timing, ...]
     parameters: tuple[Parameter, ...]
-    kinds: tuple[Kind, ...]
+    kinds: tuple[PeerType, ...]
     groups: tuple[Group, ...]
     dropped: tuple[tuple[str, str], ...]
     origin: Origin
@@ -399,7 +399,7 @@ class CompiledSystem:
 
     def __repr__(self) -> str:
         """Return what it is in a line."""
-        return f"<CompiledSystem {self.name}: {self.peers} peer{'' if self.peers == 1 else 's'}>"
+        return f"<Model {self.name}: {self.peers} peer{'' if self.peers == 1 else 's'}>"
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows."""

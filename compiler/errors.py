@@ -1,6 +1,7 @@
 """What a user is told when the input is at fault.
 
-Takes: nothing. Gives: `Place` and `place_in`, `Mistake`, `ApcError` and the collector `Mistakes`; `visible`.
+Takes: nothing. Gives: `SourceLocation` and `place_in`, `Diagnostic`, `ApcError` and the collector `Mistakes`;
+`visible`.
 Guarantees: mistakes of one file come out together, in file order, each once; no control character is
 told as it is.
 Does not: print, or decide exit codes.
@@ -20,7 +21,7 @@ LONGEST_HINT = 400
 
 
 @dataclass(frozen=True, slots=True, order=True)
-class Place:
+class SourceLocation:
     """A position in a text file; `line` and `column` count from 1, 0 means the file as a whole."""
 
     file: str
@@ -33,7 +34,7 @@ class Place:
         file = visible(self.file.replace("\n", "\\n"))
         return f"{file}:{self.line}:{self.column}" if self.line else file
 
-    def shifted(self, columns: int) -> Place:
+    def shifted(self, columns: int) -> SourceLocation:
         """Return the place `columns` further right on the same line."""
         return replace(self, column=self.column + columns)
 
@@ -51,7 +52,7 @@ def visible(text: str) -> str:
     )
 
 
-def place_in(place: Place, text: str, offset: int) -> Place:
+def place_in(place: SourceLocation, text: str, offset: int) -> SourceLocation:
     """Return the place of character `offset` of a text that starts at `place`.
 
     A text folded from several lines, or one with escapes, does not stand in the source line as it is: then
@@ -64,7 +65,7 @@ def place_in(place: Place, text: str, offset: int) -> Place:
 
 
 @dataclass(frozen=True, slots=True)
-class Mistake:
+class Diagnostic:
     """One fault in the input: what it is about, what was got, what was expected, the line to write.
 
     It reads `PLACE: CODE WHAT wants EXPECTED, got GOT. Write: HINT`; `expected`, `got` and `hint`
@@ -72,7 +73,7 @@ class Mistake:
     """
 
     code: str
-    place: Place
+    place: SourceLocation
     what: str
     expected: str = ""
     got: str = ""
@@ -115,10 +116,10 @@ def _in_one_line(text: str) -> str:
 
 
 class ApcError(Exception):
-    """The input is at fault. `mistakes` holds at least one `Mistake`, in file order."""
+    """The input is at fault. `mistakes` holds at least one `Diagnostic`, in file order."""
 
-    def __init__(self, mistakes: Iterable[Mistake] | Mistake) -> None:
-        result = (mistakes,) if isinstance(mistakes, Mistake) else tuple(mistakes)
+    def __init__(self, mistakes: Iterable[Diagnostic] | Diagnostic) -> None:
+        result = (mistakes,) if isinstance(mistakes, Diagnostic) else tuple(mistakes)
         assert result, "an ApcError names at least one mistake"
         self.mistakes = result
         super().__init__("\n".join(str(mistake) for mistake in result))
@@ -133,19 +134,26 @@ class Mistakes:
 
     def __init__(self, names: Iterable[str] = ()) -> None:
         self.names = tuple(names)
-        self._found: dict[Mistake, None] = {}
+        self._found: dict[Diagnostic, None] = {}
 
     def add(
-        self, code: str, place: Place, what: str, *, expected: str = "", got: str = "", hint: str = ""
+        self,
+        code: str,
+        place: SourceLocation,
+        what: str,
+        *,
+        expected: str = "",
+        got: str = "",
+        hint: str = "",
     ) -> None:
         """Record one mistake; the same mistake twice counts once.
 
         Parameters
         ----------
         code, place, what, expected, got, hint
-            As `Mistake` has them.
+            As `Diagnostic` has them.
         """
-        self._found[Mistake(code, place, what, expected, got, hint)] = None
+        self._found[Diagnostic(code, place, what, expected, got, hint)] = None
 
     def take(self, error: ApcError) -> None:
         """Record every mistake of an error raised further down."""
@@ -168,7 +176,7 @@ class Mistakes:
         other._found |= self._found
 
     @property
-    def found(self) -> tuple[Mistake, ...]:
+    def found(self) -> tuple[Diagnostic, ...]:
         """All mistakes in file order."""
         any_name = "|".join(map(re.escape, self.names)) or "(?!)"  # without names, nothing
         named = re.compile(rf"(?<!\w)({any_name})(?!\w)")

@@ -27,7 +27,7 @@ from functools import partial
 from pathlib import Path
 from typing import Literal, TypeVar
 
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 
 # Of a folder of a user's components: the largest library we know of has a hundred files, three deep.
 MOST_ENTRIES = 10_000
@@ -286,7 +286,9 @@ def unwritable(path: Path, error: Exception) -> ApcError:
     """Return the message (E601) of a file or folder that can't be written."""
     lacking = isinstance(error, FileNotFoundError) and not path.parent.exists()
     hint = f"mkdir -p {shlex.quote(str(path.parent))}" if lacking else ""
-    return ApcError(Mistake("E601", Place(str(path)), f"can't be written: {_reason(error)}", hint=hint))
+    return ApcError(
+        Diagnostic("E601", SourceLocation(str(path)), f"can't be written: {_reason(error)}", hint=hint)
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,23 +21,25 @@ from apc.compiler.compiled import (
     LARGEST_COUNT,
     MOST_PLACED,
     PEERS,
-    Column,
-    CompiledSystem,
     Group,
-    Kind,
     Link,
+    Model,
     Parameter,
+    PeerColumn,
+    PeerType,
     count_of,
     group_count,
 )
-from apc.compiler.errors import Mistakes, Place
+from apc.compiler.errors import Mistakes, SourceLocation
 from apc.compiler.source.reading import fault
 from apc.compiler.weights import sum_weights
 
 COUNT_ABOUT = "peers heard over the link, counted with their weights"
 
 
-def with_heard(groups: Sequence[Group], kinds: Sequence[Kind], links: Sequence[Link]) -> tuple[Group, ...]:
+def with_heard(
+    groups: Sequence[Group], kinds: Sequence[PeerType], links: Sequence[Link]
+) -> tuple[Group, ...]:
     """Return the groups with how many peers each of them hears over a link, `count(LINK)`.
 
     It is a parameter of the group, or a column where it differs from peer to peer.
@@ -58,7 +60,7 @@ def with_heard(groups: Sequence[Group], kinds: Sequence[Kind], links: Sequence[L
                 if isinstance(number, Fraction):
                     values.append(Parameter(name, "1", float(number), about=COUNT_ABOUT, exact=number))
                 else:
-                    columns.append(Column(name, number))
+                    columns.append(PeerColumn(name, number))
         result.append(replace(group, values=tuple(values), columns=tuple(columns)))
     return tuple(result)
 
@@ -69,7 +71,7 @@ def heard_sums(link: Link, peers: int) -> NDArray[Any]:
 
 
 def _heard(
-    link: Link, groups: Sequence[Group], kinds: Sequence[Kind]
+    link: Link, groups: Sequence[Group], kinds: Sequence[PeerType]
 ) -> list[Fraction | NDArray[np.float64]]:
     """Return, by group, the summed weights of what its peers hear over a link: one number if alike."""
     counts = [group.count for group in groups]
@@ -87,7 +89,7 @@ def _heard(
     return [Fraction(part[0]) if np.all(part == part[0]) else part.astype(np.float64) for part in parts]
 
 
-def recounted(system: CompiledSystem, counts: Mapping[str, Fraction], place: Place) -> CompiledSystem:
+def recounted(system: Model, counts: Mapping[str, Fraction], place: SourceLocation) -> Model:
     """Return a model with other numbers of peers.
 
     Parameters
@@ -142,7 +144,7 @@ def recounted(system: CompiledSystem, counts: Mapping[str, Fraction], place: Pla
     )
 
 
-def least_peers(kinds: Sequence[Kind]) -> int:
+def least_peers(kinds: Sequence[PeerType]) -> int:
     """Return how many peers a scene must have: two where some part follows the others."""
     hears = any(partition.receives for kind in kinds for partition in kind.clocks)
     return 2 if hears else 1

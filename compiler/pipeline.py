@@ -12,31 +12,31 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from apc.compiler.cache import Origin, origin_of, replayable
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.compiler.components.component_library import Library, definition_of
 from apc.compiler.equations.clocks import ClockedSystem, check_alone, partition
 from apc.compiler.equations.flatten import FlatSystem, flatten
 from apc.compiler.equations.structure import SortedSystem, sort
-from apc.compiler.errors import ApcError, Mistakes, Place
+from apc.compiler.errors import ApcError, Mistakes, SourceLocation
 from apc.compiler.files import recorded, replayed
 from apc.compiler.functions.functions import build_functions
-from apc.compiler.scene.scene import Scene, build_scene, library_folders
+from apc.compiler.scene.scene import Topology, build_scene, library_folders
 from apc.compiler.source.source import Source, read_source
 from apc.compiler.timings import part
 
 Stage = Literal["source", "scene", "flat", "clocked", "sorted", "compiled"]
 STAGES: tuple[Stage, ...] = get_args(Stage)
-StageValue = Source | Scene | FlatSystem | ClockedSystem | SortedSystem | CompiledSystem
+StageValue = Source | Topology | FlatSystem | ClockedSystem | SortedSystem | Model
 
 
-def compile_topology(path: Path) -> CompiledSystem:
+def compile_topology(path: Path) -> Model:
     """Compile a topology file. Raises ApcError with its mistakes."""
     value = run_stages(path, until="compiled")
-    assert isinstance(value, CompiledSystem)
+    assert isinstance(value, Model)
     return value
 
 
-def compile_again(origin: Origin, folder: Path) -> CompiledSystem:
+def compile_again(origin: Origin, folder: Path) -> Model:
     """Compile the texts that a model was made from; no file of theirs is read.
 
     Parameters
@@ -78,7 +78,7 @@ def check_definition(path: Path) -> str:
         if kind == "connector":
             library.connector(name)
         elif component := library.component(name):
-            check_alone(component, Place(str(path)), mistakes)
+            check_alone(component, SourceLocation(str(path)), mistakes)
     # Its own mistakes first.
     result = [*mistakes.found, *(mistake for error in beside for mistake in error.mistakes)]
     if result:
@@ -86,7 +86,7 @@ def check_definition(path: Path) -> str:
     return f"{name}, a {kind}"
 
 
-def linear_system(scene: Scene) -> SortedSystem | None:
+def linear_system(scene: Topology) -> SortedSystem | None:
     """Return the equations of linear analyses, None where no component has equations of its own for them."""
     if all(part.component.linearized is None for part in scene.parts):
         return None

@@ -1,8 +1,8 @@
 """CasADi functions as plain data, and back: nothing that a file says is given to CasADi's own reader.
 
 Takes: the functions of a kind, or the JSON of one. Gives: `PlainFunction`, `plain`, `straight`,
-`read_function`; `walk`, `RULES`, `ROUNDED`, `symbolic`: its operations over any kind of number; `Loop`,
-`composed`.
+`read_function`; `walk`, `RULES`, `ROUNDED`, `symbolic`: its operations over any kind of number;
+`AlgebraicLoop`, `composed`.
 Guarantees: a function is arithmetic from a short list of operations on its inputs and constants, and for each
 nonlinear loop Newton's iteration with options of our own; what is read is checked in full before anything is
 built, so that text from anywhere can build no other function, and none larger than the text. What is built
@@ -137,14 +137,14 @@ def symbolic(word: str) -> Callable[..., Any]:
 
 
 @dataclass(frozen=True, slots=True)
-class Loop:
+class AlgebraicLoop:
     """A nonlinear loop: `given(…) -> (begin (n,), q (m,))`, `residual(z (n,), q (m,)) -> (n,)`, zero at z."""
 
     given: Any  # casadi.Function
     residual: Any  # casadi.Function
 
 
-def composed(name: str, loops: Sequence[Loop], result: Any, words: Sequence[str]) -> Any:
+def composed(name: str, loops: Sequence[AlgebraicLoop], result: Any, words: Sequence[str]) -> Any:
     """Return the function that solves loops one after another and then gives a result.
 
     Parameters

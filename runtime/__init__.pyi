@@ -1,10 +1,10 @@
 # The public names, each with its home, once: a type checker reads them here, and `__init__.py` looks them up.
 from .analysis.analysis import Analysis as Analysis
-from .analysis.box_proof import BoxProof as BoxProof
+from .analysis.box_proof import RobustStability as RobustStability
 from .analysis.contact_modes import ContactModes as ContactModes
-from .analysis.conventions import Conventions as Conventions
-from .analysis.paper import PaperRoute as PaperRoute
-from .analysis.switching import Switching as Switching
+from .analysis.conventions import EventOrder as EventOrder
+from .analysis.paper import PaperMethod as PaperMethod
+from .analysis.switching import ArbitrarySwitching as ArbitrarySwitching
 from .api import (
     analyze as analyze,
 )
@@ -102,21 +102,21 @@ from .api import (
     with_hands as with_hands,
 )
 from .benchmark.speed_and_error import Bench as Bench
-from .comparison.comparison import Comparison as Comparison
-from .compiler.compiled import CompiledSystem as CompiledSystem
+from .comparison.comparison import SchemeComparison as SchemeComparison
+from .compiler.compiled import Model as Model
 from .compiler.errors import ApcError as ApcError
 from .frame.settable import Parameters as Parameters
-from .hands.frequency_response import Feel as Feel
-from .hands.passivity import PassiveHands as PassiveHands
-from .moments.network_verdict import NetworkVerdict as NetworkVerdict
-from .network.recorded import NetworkRecording as NetworkRecording
+from .hands.frequency_response import Transparency as Transparency
+from .hands.passivity import AbsoluteStability as AbsoluteStability
+from .moments.network_verdict import MeanSquareStability as MeanSquareStability
+from .network.recorded import LinkFit as LinkFit
 from .regions.stable_region import Region as Region
 from .reports.contents import Report as Report
-from .simulation.buzz import Buzz as Buzz
+from .simulation.buzz import LimitCycle as LimitCycle
 from .simulation.trajectory import Trajectory as Trajectory
 from .sweeps.resumable_sweep import Sweep as Sweep
 from .tuning.front import Design as Design
-from .tuning.front import Front as Front
+from .tuning.front import ParetoFront as ParetoFront
 from .tuning.tuner import Tuning as Tuning
 from .vary.critical_values import Critical as Critical
 from .vary.many import Analyses as Analyses

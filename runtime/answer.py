@@ -1,7 +1,7 @@
 """The whole answer of `apc analyze`: the verdict, and what stands beside it.
 
-Takes: a `CompiledSystem`.
-Gives: `Answer`, `NetworkAnswer`, `answer`, `judge`; `sensitivities_of`, `proved_box`, `proved_at`.
+Takes: a `Model`.
+Gives: `AnalysisReport`, `NetworkAnswer`, `answer`, `judge`; `sensitivities_of`, `proved_box`, `proved_at`.
 Guarantees: what stands beside the verdict never changes it; what could not be had is said in a note.
 Does not: compute any of it itself.
 """
@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING
 
 from apc.analysis.analysis import Analysis, analyze, analyze_sides, near_start
 from apc.analysis.contact_modes import ContactModes, contact_modes
-from apc.analysis.conventions import Conventions, conventions
+from apc.analysis.conventions import EventOrder, conventions
 from apc.analysis.methods import PAPER
 from apc.analysis.sides import Side
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.eigen.spectrum import UNSTABLE
 from apc.frame.instance import Prepared, prepare
 from apc.result import Result
@@ -28,11 +28,11 @@ from apc.vary.margins import margins as margins_of
 from apc.vary.sensitivity import Sensitivities, network_sensitivities, sensitivities, varied
 
 if TYPE_CHECKING:
-    from apc.analysis.box_proof import BoxProof
-    from apc.analysis.switching import Switching
+    from apc.analysis.box_proof import RobustStability
+    from apc.analysis.switching import ArbitrarySwitching
     from apc.frame.names import Range
-    from apc.moments.network_verdict import NetworkVerdict
-    from apc.simulation.buzz import Buzz
+    from apc.moments.network_verdict import MeanSquareStability
+    from apc.simulation.buzz import LimitCycle
 
 # How far the radius that is differentiated may be from that of the analysis, relative to 1: roundings of a
 # well-conditioned frame stay below 1e-12; beyond ten times that, floats have lost what derivatives need.
@@ -52,13 +52,13 @@ class NetworkAnswer(Result):
 
     shown_by = "analysis_output:network_answer"
 
-    verdict: NetworkVerdict
+    verdict: MeanSquareStability
     sensitivities: Sensitivities
     margins: Margins
 
 
 @dataclass(frozen=True, slots=True)
-class Answer(Result):
+class AnalysisReport(Result):
     """An analysis with what moves its spectral radius most, its margins, and its modes of contact.
 
     `conventions` holds the analyses under every order of coincident events, or under those that could be had
@@ -77,18 +77,18 @@ class Answer(Result):
     sensitivities: Sensitivities
     margins: Margins
     contact_modes: ContactModes | None
-    switching: Switching | None
-    buzz: Buzz | None
-    conventions: Conventions
+    switching: ArbitrarySwitching | None
+    buzz: LimitCycle | None
+    conventions: EventOrder
     detailed: bool
-    box: BoxProof | None
+    box: RobustStability | None
     no_buzz: str = ""
     warnings: tuple[str, ...] = ()
     nominal: bool = False
 
 
 def judge(
-    system: CompiledSystem, *, method: str = "auto", certify: bool = False, prepared: Prepared | None = None
+    system: Model, *, method: str = "auto", certify: bool = False, prepared: Prepared | None = None
 ) -> Analysis:
     """Analyse a system by one of the methods of `analysis.analyze`, or "paper" (see `paper`).
 
@@ -106,22 +106,22 @@ def judge(
     return _judged(system, prepared or prepare(system), method=method, certify=certify)[0]
 
 
-def _judged(
-    system: CompiledSystem, prepared: Prepared, *, method: str, certify: bool
-) -> tuple[Analysis, Side]:
+def _judged(system: Model, prepared: Prepared, *, method: str, certify: bool) -> tuple[Analysis, Side]:
     """Return the analysis of the worst side of the kinks at which peers start, and that side."""
     if method != PAPER:
         return analyze_sides(system, method=method, certify=certify, prepared=prepared)
     if certify:
         what = "method paper gives no proof: its matrices hold every sample of a frame, rounded"
-        raise ApcError(Mistake("E850", Place(system.origin.topology), what, hint="--method auto --certify"))
+        raise ApcError(
+            Diagnostic("E850", SourceLocation(system.origin.topology), what, hint="--method auto --certify")
+        )
     from apc.analysis.paper import analyze_paper  # rarely asked for
 
     return analyze_paper(system), Side("", system, prepared)
 
 
 def answer(
-    system: CompiledSystem,
+    system: Model,
     *,
     method: str = "auto",
     certify: bool = False,
@@ -130,7 +130,7 @@ def answer(
     every_convention: bool = False,
     margins: bool | None = None,
     with_buzz: bool = False,
-) -> Answer:
+) -> AnalysisReport:
     """Analyse a system and look at what stands beside the verdict.
 
     Parameters
@@ -167,7 +167,7 @@ def answer(
     moved = sensitivities_of(side.system, side.prepared, analysis)
     nominal = _margins(system, prepared, analysis, wanted=margins)
     buzz, no_buzz = _buzz(system, prepared) if with_buzz else (None, "")
-    return Answer(
+    return AnalysisReport(
         analysis=replace(analysis, notes=(*analysis.notes, *notes, *_published(system))),
         network=_over_network(system, prepared, analysis, nominal, certify=certify, wanted=margins),
         sensitivities=moved,
@@ -183,7 +183,7 @@ def answer(
     )
 
 
-def _published(system: CompiledSystem) -> tuple[str, ...]:
+def _published(system: Model) -> tuple[str, ...]:
     """Return published conditions; imported here, as few topologies have an element they are about."""
     from apc.hands.published_limits import published_limits
 
@@ -191,7 +191,7 @@ def _published(system: CompiledSystem) -> tuple[str, ...]:
 
 
 def _over_network(
-    system: CompiledSystem,
+    system: Model,
     prepared: Prepared,
     analysis: Analysis,
     nominal: Margins,
@@ -215,14 +215,14 @@ def _over_network(
     return NetworkAnswer(verdict, moved, network_margins(system, prepared, nominal, quick=not wanted))
 
 
-def _switching(system: CompiledSystem, prepared: Prepared, modes: ContactModes) -> Switching:
+def _switching(system: Model, prepared: Prepared, modes: ContactModes) -> ArbitrarySwitching:
     """Return whether contacts may switch at will; imported here, as most scenes have none."""
     from apc.analysis.switching import switching
 
     return switching(system, modes, prepared=prepared)
 
 
-def _buzz(system: CompiledSystem, prepared: Prepared) -> tuple[Buzz | None, str]:
+def _buzz(system: Model, prepared: Prepared) -> tuple[LimitCycle | None, str]:
     """Return the buzz of contacts, or why there is none; imported here, as few analyses ask for it."""
     from apc.simulation.buzz import buzz
 
@@ -233,13 +233,13 @@ def _buzz(system: CompiledSystem, prepared: Prepared) -> tuple[Buzz | None, str]
 
 
 def proved_box(
-    system: CompiledSystem,
+    system: Model,
     box: Sequence[Range],
     *,
     passive: bool = False,
     cells: int | None = None,
     inside: float = 1.0,
-) -> BoxProof:
+) -> RobustStability:
     """Return the proof over a box; imported here, as few analyses ask for one.
 
     Parameters
@@ -267,7 +267,7 @@ def proved_box(
     if passive and not (len(box) == 1 and is_delay(system, box[0].free)):
         what = "with every passive hand values are judged one by one, and of ranges that of a link's delay"
         hint = "apc region --hands passive, or apc critical --hands passive"
-        raise ApcError(Mistake("E930", Place("--box"), what, hint=hint))
+        raise ApcError(Diagnostic("E930", SourceLocation("--box"), what, hint=hint))
     if any(is_delay(system, interval.free) for interval in box):
         at_each = partial(proved_at, passive=passive, cells=cells, inside=inside)
         return prove_over_delay(system, box, at_each, nominal=not passive and not unreliable(system))
@@ -282,13 +282,13 @@ def proved_box(
 
 
 def proved_at(
-    system: CompiledSystem,
+    system: Model,
     box: Sequence[Range],
     *,
     passive: bool = False,
     cells: int | None = None,
     inside: float = 1.0,
-) -> BoxProof:
+) -> RobustStability:
     """Return the proof over a box; without any range, the verdict as it is.
 
     Parameters
@@ -298,7 +298,7 @@ def proved_at(
     """
     if box:
         return proved_box(system, box, passive=passive, cells=cells, inside=inside)
-    from apc.analysis.box_proof import BoxProof
+    from apc.analysis.box_proof import RobustStability
     from apc.network.nominal import unreliable
 
     if passive:
@@ -318,10 +318,10 @@ def proved_at(
         verdict, stable, left = analysis.verdict, analysis.stable, analysis.left_out
         if stable and inside != 1 and not analysis.spectral_radius + analysis.spectral_radius_error < inside:
             stable = False if analysis.spectral_radius - analysis.spectral_radius_error >= inside else None
-    return BoxProof(system.name, (), verdict, stable, 1, float(stable is None), (), (), left)
+    return RobustStability(system.name, (), verdict, stable, 1, float(stable is None), (), (), left)
 
 
-def sensitivities_of(system: CompiledSystem, prepared: Prepared, analysis: Analysis) -> Sensitivities:
+def sensitivities_of(system: Model, prepared: Prepared, analysis: Analysis) -> Sensitivities:
     """Return what moves the spectral radius of an analysis most, or only why it couldn't be had.
 
     Parameters
@@ -349,7 +349,7 @@ def _not_told(radius: float, why: str) -> Sensitivities:
     return Sensitivities(radius, (), (), f"what moves it most: {why}")
 
 
-def _too_large(system: CompiledSystem, prepared: Prepared, analysis: Analysis) -> str:
+def _too_large(system: Model, prepared: Prepared, analysis: Analysis) -> str:
     """Return why nothing is varied, "" unless the scene is more than few small matrices and short frames."""
     if why := _too_many_peers(system, analysis):
         return why
@@ -362,14 +362,14 @@ def _too_large(system: CompiledSystem, prepared: Prepared, analysis: Analysis) -
     return ""
 
 
-def _too_many_peers(system: CompiledSystem, analysis: Analysis) -> str:
+def _too_many_peers(system: Model, analysis: Analysis) -> str:
     """Return why nothing is varied, "" unless very many peers differ or stand on a graph."""
     complete = all(link.graph.shape == "complete" for link in system.links)
     apart = analysis.method == "determinant" or not complete
     return "not looked for in so large a population" if apart and system.peers > FEW_PEERS else ""
 
 
-def _too_many_products(system: CompiledSystem) -> str:
+def _too_many_products(system: Model) -> str:
     """Return why nothing is differentiated, "" unless many numbers meet many states."""
     free, states = len(varied(system)), max(len(kind.states) for kind in system.kinds)
     if free * states**3 > MOST_PRODUCTS:
@@ -377,9 +377,7 @@ def _too_many_products(system: CompiledSystem) -> str:
     return ""
 
 
-def _margins(
-    system: CompiledSystem, prepared: Prepared, analysis: Analysis, *, wanted: bool | None
-) -> Margins:
+def _margins(system: Model, prepared: Prepared, analysis: Analysis, *, wanted: bool | None) -> Margins:
     """Return the margins, or only why they couldn't be had."""
     if wanted is False:
         return Margins((), "not looked for: they were not wanted")
@@ -393,7 +391,7 @@ def _margins(
         return Margins((), f"not looked for: {error.mistakes[0].what}")
 
 
-def _contact_modes(system: CompiledSystem, prepared: Prepared) -> tuple[ContactModes | None, tuple[str, ...]]:
+def _contact_modes(system: Model, prepared: Prepared) -> tuple[ContactModes | None, tuple[str, ...]]:
     """Return the modes of contact, None where nothing switches, and what to say where they can't be had."""
     try:
         modes = contact_modes(system, prepared=prepared)

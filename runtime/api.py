@@ -14,46 +14,46 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from apc.arguments import checked
 from apc.compiler import store
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 
 if TYPE_CHECKING:
     from apc.analysis.analysis import Analysis
-    from apc.analysis.box_proof import BoxProof
+    from apc.analysis.box_proof import RobustStability
     from apc.analysis.contact_modes import ContactModes
-    from apc.analysis.conventions import Conventions
+    from apc.analysis.conventions import EventOrder
     from apc.analysis.methods import Method
-    from apc.analysis.paper import PaperRoute
-    from apc.analysis.switching import Switching
+    from apc.analysis.paper import PaperMethod
+    from apc.analysis.switching import ArbitrarySwitching
     from apc.benchmark.speed_and_error import Bench
-    from apc.comparison.comparison import Comparison
+    from apc.comparison.comparison import SchemeComparison
     from apc.frame.settable import Parameters
-    from apc.hands.frequency_response import Feel
-    from apc.hands.passivity import PassiveHands
-    from apc.moments.network_verdict import NetworkVerdict
-    from apc.network.recorded import NetworkRecording
+    from apc.hands.frequency_response import Transparency
+    from apc.hands.passivity import AbsoluteStability
+    from apc.moments.network_verdict import MeanSquareStability
+    from apc.network.recorded import LinkFit
     from apc.regions.stable_region import Region
     from apc.reports.contents import Report
     from apc.result import Result
-    from apc.simulation.buzz import Buzz
+    from apc.simulation.buzz import LimitCycle
     from apc.simulation.trajectory import Trajectory
     from apc.sweeps.resumable_sweep import Sweep
-    from apc.tuning.demands import Demands
-    from apc.tuning.front import Front
+    from apc.tuning.demands import TuningSpec
+    from apc.tuning.front import ParetoFront
     from apc.tuning.tuner import Tuning
     from apc.vary.critical_values import Critical
     from apc.vary.many import Analyses
     from apc.vary.margins import Margins
     from apc.vary.sensitivity import Sensitivities
 
-Scene = CompiledSystem | str | Path
+Scene = Model | str | Path
 Values = Mapping[str, str | float]  # by the name of a parameter, quantities or numbers in SI
 Format = Literal["text", "json", "dot", "mermaid", "svg"]
 Criterion = Literal["mean-square", "nominal", "passive"]
 
 
 @checked
-def compile(path: str | Path) -> CompiledSystem:
+def compile(path: str | Path) -> Model:
     """Compile a topology file.
 
     Parameters
@@ -63,7 +63,7 @@ def compile(path: str | Path) -> CompiledSystem:
 
     Returns
     -------
-    CompiledSystem
+    Model
         The compiled model; nothing is written (see `save`).
 
     Raises
@@ -80,13 +80,13 @@ def compile(path: str | Path) -> CompiledSystem:
 
 
 @checked
-def save(model: CompiledSystem, path: str | Path) -> None:
+def save(model: Model, path: str | Path) -> None:
     """Write a compiled model to a .apc file, whole or not at all. Raises ApcError if it can't be written."""
     store.save(model, Path(path))
 
 
 @checked
-def load(path: str | Path) -> CompiledSystem:
+def load(path: str | Path) -> Model:
     """Read a compiled model from a .apc file. Raises ApcError if it is damaged or older than its topology."""
     from apc.inputs import load_fresh
 
@@ -94,7 +94,7 @@ def load(path: str | Path) -> CompiledSystem:
 
 
 @checked
-def with_hands(model: Scene, hands: str) -> CompiledSystem:
+def with_hands(model: Scene, hands: str) -> Model:
     """Return the model with hands at all devices.
 
     Parameters
@@ -116,12 +116,14 @@ def with_hands(model: Scene, hands: str) -> CompiledSystem:
     changed = devices.with_hands(_model(model, None), hands)
     if hands == devices.PASSIVE:
         what = "passive hands are all that draw no energy, and a model has one hand a device"
-        raise ApcError(Mistake("E930", Place("with_hands"), what, hint="apc.passive_hands(model)"))
+        raise ApcError(
+            Diagnostic("E930", SourceLocation("with_hands"), what, hint="apc.passive_hands(model)")
+        )
     return changed
 
 
 @checked
-def set_parameters(model: CompiledSystem, values: Mapping[str, str | float]) -> CompiledSystem:
+def set_parameters(model: Model, values: Mapping[str, str | float]) -> Model:
     """Return the model with other parameter values, without compiling again.
 
     Parameters
@@ -144,19 +146,21 @@ def set_parameters(model: CompiledSystem, values: Mapping[str, str | float]) -> 
     return apply(model, overrides)
 
 
-def _quantity(system: CompiledSystem, name: str, value: str | float) -> str:
+def _quantity(system: Model, name: str, value: str | float) -> str:
     """Return a value of a parameter as it is written: a number without a unit is in SI."""
     if isinstance(value, str):
         return value
     from apc.frame.names import find, unit_of
 
     if not isinstance(value, Real) or isinstance(value, bool):
-        raise ApcError(Mistake("E204", Place(name), name, "a quantity or a number in SI", repr(value)[:80]))
+        raise ApcError(
+            Diagnostic("E204", SourceLocation(name), name, "a quantity or a number in SI", repr(value)[:80])
+        )
     number = int(value) if isinstance(value, Integral) else float(value)
     return f"{number!r} {unit_of(system, find(system, name, counts=True).name)}".rstrip()
 
 
-def _range(system: CompiledSystem, name: str, value: str | Sequence[str | float]) -> str:
+def _range(system: Model, name: str, value: str | Sequence[str | float]) -> str:
     """Return a range of a parameter as it is written, of a text or of its two ends."""
     return value if isinstance(value, str) else ":".join(_quantity(system, name, end) for end in value)
 
@@ -278,7 +282,7 @@ def compare(
     over: Sequence[str] = (),
     criterion: Criterion | None = None,
     at: str = "",
-) -> Comparison:
+) -> SchemeComparison:
     """Put schemes side by side: verdicts, largest stable stiffness, delay, loss, what is felt, what it costs.
 
     Parameters
@@ -296,7 +300,7 @@ def compare(
 
     Returns
     -------
-    Comparison
+    SchemeComparison
         Its `.schemes`, each with the results of `analyze`, `critical` and `feel` that it is made of;
         `.to_dataframe()`, `.plot()`.
 
@@ -312,7 +316,7 @@ def compare(
 
 
 @checked
-def passive_hands(model: Scene, *, set: Values | None = None) -> PassiveHands:
+def passive_hands(model: Scene, *, set: Values | None = None) -> AbsoluteStability:
     """Say whether a scene is stable with every passive hand at every device, and how much damping that takes.
 
     Parameters
@@ -339,7 +343,7 @@ def feel(
     at: str = "",
     between: str = "",
     unstable: bool = False,
-) -> Feel:
+) -> Transparency:
     """Say what a hand feels at its device, and what of a push arrives at another.
 
     Parameters
@@ -355,7 +359,7 @@ def feel(
 
     Returns
     -------
-    Feel
+    Transparency
         Impedance, transmitted admittance and error between copies, complex (k,), in SI, with a bound; mass,
         damping and stiffness of slow motions; H∞ norms; H2 norms, an rms at the ticks: motion between ticks
         is not included.
@@ -372,7 +376,7 @@ def feel(
 
 
 @checked
-def describe_network(recording: str | Path, *, interval: str | None = None) -> NetworkRecording:
+def describe_network(recording: str | Path, *, interval: str | None = None) -> LinkFit:
     """Say what a recorded network amounts to, as a link's own keys.
 
     Parameters
@@ -384,7 +388,7 @@ def describe_network(recording: str | Path, *, interval: str | None = None) -> N
 
     Returns
     -------
-    NetworkRecording
+    LinkFit
         The share lost with its interval, bursts, delays, the nearest law of a jitter; printed, the link's
         entry.
 
@@ -401,7 +405,9 @@ def describe_network(recording: str | Path, *, interval: str | None = None) -> N
 
 
 @checked
-def judge_network(model: Scene, *, set: Values | None = None, certify: bool = False) -> NetworkVerdict | None:
+def judge_network(
+    model: Scene, *, set: Values | None = None, certify: bool = False
+) -> MeanSquareStability | None:
     """Say what becomes of a scene over the network that it has, lost and late packets included.
 
     Parameters
@@ -411,7 +417,7 @@ def judge_network(model: Scene, *, set: Values | None = None, certify: bool = Fa
 
     Returns
     -------
-    NetworkVerdict or None
+    MeanSquareStability or None
         Verdict in mean square and the growth of second moments a frame with its error; None where every
         packet takes its nominal delay.
 
@@ -454,7 +460,7 @@ def sensitivities(model: Scene, *, set: Values | None = None) -> Sensitivities:
 
 
 @checked
-def conventions(model: Scene, *, set: Values | None = None) -> Conventions:
+def conventions(model: Scene, *, set: Values | None = None) -> EventOrder:
     """Repeat the analysis under every order of coincident events and both readings of the start.
 
     Parameters
@@ -482,7 +488,7 @@ def contact_modes(model: Scene, *, set: Values | None = None) -> ContactModes:
 
 
 @checked
-def switching(model: Scene, *, set: Values | None = None) -> Switching:
+def switching(model: Scene, *, set: Values | None = None) -> ArbitrarySwitching:
     """Say whether a scene is proved stable however its contacts open and close, or as they do by themselves.
 
     Parameters
@@ -498,7 +504,7 @@ def switching(model: Scene, *, set: Values | None = None) -> Switching:
 
 
 @checked
-def buzz(model: Scene, *, set: Values | None = None) -> Buzz:
+def buzz(model: Scene, *, set: Values | None = None) -> LimitCycle:
     """Predict the buzz of a scene's one-sided contacts, and play it beside.
 
     Parameters
@@ -523,7 +529,7 @@ def prove_box(
     *,
     cells: int | None = None,
     set: Values | None = None,
-) -> BoxProof:
+) -> RobustStability:
     """Prove that a scene is stable for every value of some parameters within their ranges.
 
     Parameters
@@ -558,7 +564,7 @@ def parameters(model: Scene) -> Parameters:
 
 
 @checked
-def paper_route(model: Scene, *, set: Values | None = None) -> PaperRoute:
+def paper_route(model: Scene, *, set: Values | None = None) -> PaperMethod:
     """Return the lifted matrices of Rakhsha and Constantinescu, eqs. (18) to (20), rows and columns named.
 
     Parameters
@@ -683,7 +689,7 @@ def front(
     points: int = 20,
     seconds: float | None = None,
     set: Values | None = None,
-) -> Front:
+) -> ParetoFront:
     """Weigh an aim against what a hand feels: the best of the one for each of several bounds on the other.
 
     Parameters
@@ -699,7 +705,7 @@ def front(
 
     Returns
     -------
-    Front
+    ParetoFront
         Its `.designs`; `.plot()` draws it.
 
     Raises
@@ -724,7 +730,7 @@ def _demands(
     maximize: str,
     minimize: str,
     subject: Sequence[str],
-) -> tuple[CompiledSystem, Demands]:
+) -> tuple[Model, TuningSpec]:
     """Return a scene as its study or a criterion has its devices held, and what is asked of gains."""
     from apc.tuning.demands import held_as_studied, read_demands
 
@@ -796,38 +802,35 @@ def sweep(
 
 def _several(scenes: Scene | Iterable[Scene], function: str) -> list[Scene]:
     """Return the scenes that a function is given, of which one needs no list; refuse none."""
-    if isinstance(scenes, CompiledSystem | str | Path):
+    if isinstance(scenes, Model | str | Path):
         return [scenes]
     if listed := list(scenes):
         return listed
     hint = f'apc.{function}(["average.yaml", "mesh.yaml"])'
-    raise ApcError(Mistake("E610", Place(function), "no scene is given", hint=hint))
+    raise ApcError(Diagnostic("E610", SourceLocation(function), "no scene is given", hint=hint))
 
 
 def _path(scene: Scene, function: str) -> Path:
     """Return the path of a topology; refuse a compiled model, beside which it stands."""
     from apc.inputs import refuse_model
 
-    if isinstance(scene, CompiledSystem):
-        path = Path(scene.origin.topology).with_suffix(".apc")
-    else:
-        path = Path(scene)
+    path = Path(scene.origin.topology).with_suffix(".apc") if isinstance(scene, Model) else Path(scene)
     refuse_model(path, function)
     return path
 
 
-def _model(model: Scene, set: Values | None) -> CompiledSystem:
+def _model(model: Scene, set: Values | None) -> Model:
     """Return a compiled model, with the parameters set."""
-    if not isinstance(model, CompiledSystem):
+    if not isinstance(model, Model):
         from apc.inputs import load_or_compile
 
         model = load_or_compile(Path(model))
     return set_parameters(model, set) if set else model
 
 
-def _check_out(model: Scene, system: CompiledSystem, path: Path | None) -> None:
+def _check_out(model: Scene, system: Model, path: Path | None) -> None:
     """Refuse to write over what the model was read from."""
-    if path is not None and not isinstance(model, CompiledSystem):
+    if path is not None and not isinstance(model, Model):
         from apc.inputs import check_outputs
 
         check_outputs(Path(model), (name for name, _ in system.origin.texts), {"out=": path})
@@ -993,7 +996,7 @@ def export(
     chosen = formats.format_of(to, path, option="=")
     system = _model(model, set)
     _check_out(model, system, path)
-    asked = formats.Asked(cut, tuple(free), peer, device, method)
+    asked = formats.ExportRequest(cut, tuple(free), peer, device, method)
     return formats.export(system, chosen, asked, path)
 
 

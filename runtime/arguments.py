@@ -18,7 +18,7 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -28,7 +28,7 @@ T = TypeVar("T")
 WIDER: Mapping[Any, tuple[type, ...]] = {
     int: (Integral,),
     float: (Real,),
-    Path: (os.PathLike, CompiledSystem),
+    Path: (os.PathLike, Model),
 }
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from apc.compiler.cache import LARGEST, SUFFIX, Archive, changed, program_digest, read_archive
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import (
     RefusedError,
     check_file,
@@ -32,7 +32,7 @@ from apc.opening import opened
 from apc.suffixes import written
 
 if TYPE_CHECKING:
-    from apc.compiler.compiled import CompiledSystem
+    from apc.compiler.compiled import Model
 
 YAML_SUFFIXES = (".yaml", ".yml")
 _TOPOLOGY = re.compile(rb"^\xef?\xbb?\xbf?topology\s*:", re.MULTILINE)
@@ -62,15 +62,15 @@ def find_input(file: str | None = None, *, compiled_too: bool) -> Path:
     candidates = [*topologies, *orphans]
     if len(candidates) == 1:
         return candidates[0]
-    place = Place("this folder")
+    place = SourceLocation("this folder")
     if not candidates:
         what = "holds no topology" + (" and no compiled model" if compiled_too else "")
         raise ApcError(
-            Mistake("E610", place, what, hint="apc new  (it writes a topology.yaml to start from)")
+            Diagnostic("E610", place, what, hint="apc new  (it writes a topology.yaml to start from)")
         )
     listed = ", ".join(str(path) for path in candidates[:10]) + (", …" if len(candidates) > 10 else "")
     raise ApcError(
-        Mistake(
+        Diagnostic(
             "E611",
             place,
             f"holds {len(candidates)} scenes: {listed}",
@@ -88,7 +88,7 @@ def _is_topology(path: Path) -> bool:
         return refused.why == "large"  # which is told of when it is read
 
 
-def load_fresh(path: Path) -> CompiledSystem:
+def load_fresh(path: Path) -> Model:
     """Read a compiled model. Raises ApcError if it is damaged, or if what it was made from has changed."""
     archive = read_archive(path)
     topology = path.with_name(archive.origin.topology)
@@ -96,11 +96,11 @@ def load_fresh(path: Path) -> CompiledSystem:
     now = changed(archive, path.parent) if os.path.isfile(topology) else ""  # noqa: PTH113 -- see above
     if now:
         what = f"is stale: {now} has changed since it was compiled"
-        raise ApcError(Mistake("E605", Place(str(path)), what, hint=f"apc compile {topology}"))
+        raise ApcError(Diagnostic("E605", SourceLocation(str(path)), what, hint=f"apc compile {topology}"))
     return opened(archive, path.parent)
 
 
-def load_or_compile(path: Path) -> CompiledSystem:
+def load_or_compile(path: Path) -> Model:
     """Return the compiled model of a file.
 
     A compiled model is read. A topology is compiled in memory and checks itself, unless the model beside it
@@ -132,7 +132,7 @@ def open_scene(
     hands: str = "free",
     varied: Iterable[str] = (),
     notify: Callable[[str], None] | None = None,
-) -> CompiledSystem:
+) -> Model:
     """Return the compiled model that a command means.
 
     Parameters
@@ -173,7 +173,7 @@ def open_scene(
     for place, override in enumerate(overrides):
         if any(override.free == other.free for other in overrides[:place]):
             what, hint = f"{override.free.label} is set twice", f'--set "{settings[place]}"'
-            raise ApcError(Mistake("E621", OVERRIDE, what, hint=hint))
+            raise ApcError(Diagnostic("E621", OVERRIDE, what, hint=hint))
     if notify is not None:
         for note in notes_for_all_groups(system, [override.free for override in overrides]):
             notify(note)
@@ -185,7 +185,7 @@ def refuse_model(path: Path, command: str) -> None:
     if path.suffix == ".apc":
         what = "is a compiled model, and this reads the topology that it was made from"
         hint = f"apc {command} {path.with_suffix('.yaml')}"
-        raise ApcError(Mistake("E615", Place(str(path)), what, hint=hint))
+        raise ApcError(Diagnostic("E615", SourceLocation(str(path)), what, hint=hint))
 
 
 def check_model_name(topology: Path) -> None:
@@ -212,11 +212,13 @@ def check_model_name(topology: Path) -> None:
         other = topology.parent / f"{topology.stem}{suffix}"
         if other.name != topology.name and not same_file(other, topology) and _is_topology(other):
             what = f"and {other.name} would both be compiled to {topology.stem}.apc"
-            raise ApcError(Mistake("E617", Place(str(topology)), what, hint=_renaming(topology)))
+            raise ApcError(Diagnostic("E617", SourceLocation(str(topology)), what, hint=_renaming(topology)))
 
 
 def _not_written(model: Path, why: str) -> ApcError:
-    return ApcError(Mistake("E601", Place(str(model)), f"can't be written: {why}", hint=f"rm {model}"))
+    return ApcError(
+        Diagnostic("E601", SourceLocation(str(model)), f"can't be written: {why}", hint=f"rm {model}")
+    )
 
 
 def _as_word(path: Path) -> str:
@@ -235,11 +237,11 @@ def check_topology_outputs(path: Path, outputs: Mapping[str, Path | None]) -> No
         check_target(output)
     if any(output.exists() for output in given):
         from apc.compiler.pipeline import run_stages
-        from apc.compiler.scene.scene import Scene, library_folders
+        from apc.compiler.scene.scene import Topology, library_folders
         from apc.compiler.source.source import read_source
 
         scene = run_stages(path, until="scene")
-        assert isinstance(scene, Scene)
+        assert isinstance(scene, Topology)
         folders = (str(folder.resolve()) for folder in library_folders(read_source(path)))
         check_outputs(path, (*scene.texts, *folders), outputs)
 
@@ -278,13 +280,13 @@ def check_outputs(path: Path, texts: Iterable[str], outputs: Mapping[str, Path |
                 continue  # a device or pipe takes what both write
             if output.absolute() == before.absolute() or same_file(output, before):
                 what = f"is given to {other} and to {option}: the second would replace the first"
-                raise ApcError(Mistake("E616", Place(str(output)), what, hint=hint))
+                raise ApcError(Diagnostic("E616", SourceLocation(str(output)), what, hint=hint))
         # Beside rows stands what made them, see `present.recording`; beside C its header, see `exports.code`.
         beside = (f"{output.name}.json", f"{output.stem}.h", f"{output.stem}_test.c")
         for file in (output, partial_name(output), *(output.with_name(name) for name in beside)):
             if read(file):
                 what = f"is read by this command: {option.removesuffix('=')} would replace it"
-                raise ApcError(Mistake("E616", Place(str(file)), what, hint=hint))
+                raise ApcError(Diagnostic("E616", SourceLocation(str(file)), what, hint=hint))
 
 
 def _is_below(file: Path, folder: Path) -> bool:

@@ -1,6 +1,6 @@
 """A tuple that is made when it is looked at.
 
-Takes: what makes it. Gives: `Later`.
+Takes: what makes it. Gives: `LazyTuple`.
 Guarantees: made once, whoever looks; equal to what it holds, and copied or sent to another process as that.
 Does not: keep what it was made from, once it is made; until then `make` keeps it.
 """
@@ -13,7 +13,7 @@ from typing import Any, TypeVar, overload
 T = TypeVar("T")
 
 
-class Later(Sequence[T]):
+class LazyTuple(Sequence[T]):
     """What `make` gives, as if it were there already."""
 
     __slots__ = ("_made", "_make")
@@ -46,7 +46,7 @@ class Later(Sequence[T]):
 
     def __eq__(self, other: object) -> bool:
         """Say whether another holds the same, be it there already or not."""
-        return self._all() == (other._all() if isinstance(other, Later) else other)
+        return self._all() == (other._all() if isinstance(other, LazyTuple) else other)
 
     def __hash__(self) -> int:
         """Return the hash of what it holds."""

@@ -35,7 +35,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 
 SMALL = 2**26  # bytes: as much as the program takes by itself; whoever has no more can't run it
 
@@ -44,7 +44,7 @@ PROCESS = Path("/proc/self")
 MACHINE = Path("/proc/meminfo")
 
 
-def refuse_beyond(needed: float, code: str, place: Place, what: str, hint: str) -> None:
+def refuse_beyond(needed: float, code: str, place: SourceLocation, what: str, hint: str) -> None:
     """Refuse what needs more memory than there is.
 
     Parameters
@@ -63,7 +63,7 @@ def refuse_beyond(needed: float, code: str, place: Place, what: str, hint: str) 
     """
     if needed > SMALL and needed > (free := free_memory()):
         text = f"{what} take about {size_text(needed)} of memory, and {size_text(free)} are free"
-        raise ApcError(Mistake(code, place, text, hint=hint))
+        raise ApcError(Diagnostic(code, place, text, hint=hint))
 
 
 def size_text(size: float) -> str:
@@ -93,11 +93,11 @@ def hold_to_memory() -> None:
             resource.setrlimit(limit, (_number(PROCESS / "status", "VmData") + int(free), most))
 
 
-def lacking(command: str) -> Mistake:
+def lacking(command: str) -> Diagnostic:
     """Return the message of a command that ran out of memory."""
     what = "ran out of memory"
-    return Mistake(
-        "E820", Place(command), what, hint="fewer peers that differ, fewer states, or a shorter time"
+    return Diagnostic(
+        "E820", SourceLocation(command), what, hint="fewer peers that differ, fewer states, or a shorter time"
     )
 
 

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING
 from apc.compiler.cache import HANDS_CHANGE, Archive, program_digest
 
 if TYPE_CHECKING:
-    from apc.compiler.compiled import CompiledSystem
+    from apc.compiler.compiled import Model
 
 
-def opened(archive: Archive, folder: Path) -> CompiledSystem:
+def opened(archive: Archive, folder: Path) -> Model:
     """Return the model of a file: its own if this user's apc wrote it, else what its texts compile to.
 
     Parameters
@@ -48,7 +48,7 @@ def opened(archive: Archive, folder: Path) -> CompiledSystem:
     return system
 
 
-def _changed_again(system: CompiledSystem, change: Sequence[tuple[str, str]]) -> CompiledSystem:
+def _changed_again(system: Model, change: Sequence[tuple[str, str]]) -> Model:
     """Make a change that a model's origin tells of. Raises ApcError if there can be none such."""
     from apc.frame.devices import with_hands
     from apc.frame.names import find

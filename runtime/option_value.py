@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
 
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 
 
 def option_value(option: str, text: str, *, what: str, unit: str) -> Fraction:
@@ -38,7 +38,7 @@ def option_value(option: str, text: str, *, what: str, unit: str) -> Fraction:
     from apc.compiler.language.units import quantity
 
     try:
-        return Fraction(quantity(text, Place(option), what=what, unit=unit).value)
+        return Fraction(quantity(text, SourceLocation(option), what=what, unit=unit).value)
     except ApcError as error:
         hints = [mistake.hint.replace(f"{what}: ", "") for mistake in error.mistakes]
         raise ApcError(
@@ -57,7 +57,7 @@ def with_last_unit(texts: Sequence[str]) -> list[str]:
 
 
 def option_values(
-    label: str, unit: str, texts: Sequence[str], place: Place, *, between: str = ":", rest: str = ""
+    label: str, unit: str, texts: Sequence[str], place: SourceLocation, *, between: str = ":", rest: str = ""
 ) -> tuple[Fraction, ...]:
     """Read quantities in SI; one without a unit takes that of the last.
 
@@ -82,9 +82,9 @@ def option_values(
     if unit != "1" and all(_NUMBER.fullmatch(text) for text in texts):
         hint = f"{label}={between.join(f'{text.strip()} {unit}' for text in texts)}{rest}"
         got = f"{between.join(texts)} (no unit)"
-        raise ApcError(Mistake("E204", place, label, unit, got[:80], hint))
+        raise ApcError(Diagnostic("E204", place, label, unit, got[:80], hint))
     values: list[Fraction] = []
-    mistakes: list[Mistake] = []
+    mistakes: list[Diagnostic] = []
     right: list[str] = []  # what is to be written of each
     for text in with_last_unit(texts):
         try:

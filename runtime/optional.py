@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.distribution import install_line
 
 HOME = Path(__file__).parent  # with the settings of matplotlib in it
@@ -33,7 +33,7 @@ def need(module: str, extra: str) -> Any:
 
 def missing(what: str, hint: str) -> ApcError:
     """Return the mistake (E875) that a library or program isn't there; `hint` says what to do."""
-    return ApcError(Mistake("E875", Place("apc"), what, hint=hint))
+    return ApcError(Diagnostic("E875", SourceLocation("apc"), what, hint=hint))
 
 
 @contextmanager

@@ -26,8 +26,8 @@ from multiprocessing.connection import Connection
 from typing import Any, Generic, TypeVar
 
 from apc.compiler import store
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.threads import single_threaded
 
 Shared = TypeVar("Shared")
@@ -81,7 +81,7 @@ def this_process(compute: Callable[[Shared, Task], Result], shared: Shared) -> W
 
 @contextmanager
 def local_processes(
-    compute: Callable[[Shared, Task], Result], shared: Shared, jobs: int, lost: Mistake
+    compute: Callable[[Shared, Task], Result], shared: Shared, jobs: int, lost: Diagnostic
 ) -> Iterator[Workers[Task, Result]]:
     """Start `jobs` processes, and end them on leaving, at once, whatever they are doing.
 
@@ -121,7 +121,7 @@ def local_processes(
 
 
 def results(
-    workers: Workers[Task, Result], tasks: Iterable[Task], patience: Patience, place: Place
+    workers: Workers[Task, Result], tasks: Iterable[Task], patience: Patience, place: SourceLocation
 ) -> Iterator[Result]:
     """Yield each result as it comes; never more tasks are handed out than keep the workers busy.
 
@@ -168,12 +168,12 @@ def results(
         raise trouble from error
 
 
-def _tell_silence(seconds: float, patience: Patience, place: Place) -> None:
+def _tell_silence(seconds: float, patience: Patience, place: SourceLocation) -> None:
     """Say that nothing came for a while. Raises ApcError E889 if that is too long."""
     what = f"no result from the processes that compute for {seconds:g} s"
     if patience.limit is not None and seconds >= patience.limit:
         what += ": they are stuck, or a part takes longer"
-        raise ApcError(Mistake("E889", place, what, hint=f'--patience "{2 * seconds:g} s"'))
+        raise ApcError(Diagnostic("E889", place, what, hint=f'--patience "{2 * seconds:g} s"'))
     patience.notify(f"{what}; still waiting")
 
 
@@ -233,16 +233,16 @@ def _compute(task: Any) -> Any:
         return compute(shared, task)
 
 
-def model_bytes(system: CompiledSystem) -> bytes:
+def model_bytes(system: Model) -> bytes:
     """Return a compiled model as bytes for another process of this program; equal models give equal bytes."""
     return store.encoded(system)
 
 
-def digest_of(system: CompiledSystem) -> bytes:
+def digest_of(system: Model) -> bytes:
     """Return the SHA-256 of a compiled model, its numbers included."""
     return hashlib.sha256(store.model_of(system)).digest()
 
 
-def model_of_bytes(model: bytes) -> CompiledSystem:
+def model_of_bytes(model: bytes) -> Model:
     """Return the compiled model of bytes that another process of this program made."""
     return store.decoded(model)

@@ -1,6 +1,6 @@
 """A result: data that other rooms compute with, and that a person can look at.
 
-Takes: nothing. Gives: `Result`, `Look`.
+Takes: nothing. Gives: `Result`, `PlotStyle`.
 Guarantees: data know the name of what shows them and nothing of it: it is imported when it is asked for. In a
 notebook a result is its text and its picture, elsewhere a line.
 Does not: show anything itself (see `present`).
@@ -15,7 +15,7 @@ from typing import Any, ClassVar, TypedDict
 from apc.optional import need
 
 
-class Look(TypedDict, total=False):
+class PlotStyle(TypedDict, total=False):
     """How a picture looks: `size` (width, height) in inches, `labels`, `style`.
 
     `labels` are other words for some that stand in it; `style` is a style sheet of matplotlib, several, or
@@ -62,7 +62,7 @@ class Result:
         document: dict[str, Any] = self._shown("document")
         return document
 
-    def _drawn(self, *arguments: Any, look: Look) -> Any:
+    def _drawn(self, *arguments: Any, look: PlotStyle) -> Any:
         """Return the picture, a matplotlib Figure or Axes, that looks as it is wanted to."""
         written, labels = need("matplotlib.text", "plot").Text, look.get("labels", {})
         with need("matplotlib.style", "plot").context(look.get("style", [])):

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import is_special
 
 # What goes into a device or pipe whose name has no suffix: text, as whoever reads there expects.
@@ -48,9 +48,11 @@ def check_suffix(path: Path, known: Iterable[str], option: str) -> str:
     if path == DASH:  # whoever writes it wants standard output, which takes text
         as_text = any(text in names for text in TEXTS)
         instead = Path("/dev/stdout") if as_text else Path("result").with_suffix(names[0])
-        raise ApcError(Mistake("E878", Place(str(path)), what, wanted, "none", written(option, instead)))
+        raise ApcError(
+            Diagnostic("E878", SourceLocation(str(path)), what, wanted, "none", written(option, instead))
+        )
     hint = written(option, path.parent / proposed.with_suffix(names[0]))
-    raise ApcError(Mistake("E878", Place(str(path)), what, wanted, path.suffix or "none", hint))
+    raise ApcError(Diagnostic("E878", SourceLocation(str(path)), what, wanted, path.suffix or "none", hint))
 
 
 def written(option: str, path: Path) -> str:

@@ -1,8 +1,8 @@
 """Tables of named columns as files, written as their rows come: CSV or Parquet, by the suffix.
 
 Takes: columns, and rows block by block.
-Gives: `Column`, `Row`, `Tabled`, `Writer` and `WRITERS` of the formats; `check_table_path`, `write_table`,
-`read_table`, `blocks_of`, `keep_room`.
+Gives: `TableColumn`, `Row`, `Tabled`, `TableWriter` and `WRITERS` of the formats; `check_table_path`,
+`write_table`, `read_table`, `blocks_of`, `keep_room`.
 Guarantees: a block is in the file whole or not at all; before a block is written, room is kept on the disk
 for it and for the file's end, so that on a full disk the blocks before it can still be finished. The same
 rows give the same bytes; numbers keep every digit; an empty cell is empty, never NaN; at most a block of rows
@@ -28,7 +28,7 @@ from typing import Any, BinaryIO, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import check_target, write_file
 from apc.distribution import install_line
 from apc.optional import need
@@ -54,7 +54,7 @@ SWOLLEN = 2
 
 
 @dataclass(frozen=True, slots=True)
-class Column:
+class TableColumn:
     """A column of a table: `kind` says what its cells are, if they are anything at all."""
 
     name: str
@@ -68,10 +68,10 @@ class Column:
 
 
 # What a table is made of: its columns, its rows, and what a file says of how it was made.
-Tabled = tuple[list[Column], Iterator[Row], dict[str, Any]]
+Tabled = tuple[list[TableColumn], Iterator[Row], dict[str, Any]]
 
 
-class Writer(ABC):
+class TableWriter(ABC):
     """One format, abstract. `about` is the name and the text of what made the table.
 
     `whole_rows` are in the file for good. `rows` raises OSError when there is no room: of these rows none is
@@ -81,7 +81,7 @@ class Writer(ABC):
 
     plain: ClassVar[bool] = False
 
-    def __init__(self, path: Path, columns: Sequence[Column], about: tuple[str, str]) -> None:
+    def __init__(self, path: Path, columns: Sequence[TableColumn], about: tuple[str, str]) -> None:
         self.path, self.columns, self.about = path, columns, about
         self.file: BinaryIO = path.open("w+b")
         self.whole_rows = 0
@@ -131,12 +131,12 @@ def keep_room(file: BinaryIO, begin: int, end: int) -> None:
     file.seek(place)
 
 
-class Csv(Writer):
+class Csv(TableWriter):
     """Headings with units, then a line a row; numbers in the shortest decimals that give them back."""
 
     plain = True
 
-    def __init__(self, path: Path, columns: Sequence[Column], about: tuple[str, str]) -> None:
+    def __init__(self, path: Path, columns: Sequence[TableColumn], about: tuple[str, str]) -> None:
         super().__init__(path, columns, about)
         self.file.write(_lines([[column.heading for column in columns]]))
         self.file.flush()
@@ -174,10 +174,10 @@ def _lines(rows: Iterable[Sequence[Cell]]) -> bytes:
     return buffer.getvalue().encode()
 
 
-class Parquet(Writer):
+class Parquet(TableWriter):
     """A row group a block; columns are named like headings, `about` is in the schema's metadata."""
 
-    def __init__(self, path: Path, columns: Sequence[Column], about: tuple[str, str]) -> None:
+    def __init__(self, path: Path, columns: Sequence[TableColumn], about: tuple[str, str]) -> None:
         super().__init__(path, columns, about)
         self.arrow = need("pyarrow", "data")
         parquet = need("pyarrow.parquet", "data")
@@ -221,7 +221,7 @@ class Parquet(Writer):
         super().close()
 
 
-WRITERS: dict[str, Callable[[Path, Sequence[Column], tuple[str, str]], Writer]] = {
+WRITERS: dict[str, Callable[[Path, Sequence[TableColumn], tuple[str, str]], TableWriter]] = {
     ".csv": Csv,
     ".parquet": Parquet,
 }
@@ -239,12 +239,12 @@ def check_table_path(path: Path, option: str) -> None:
         except ImportError:
             what = "is a Parquet file, which needs pyarrow; without it, the name can end in .csv"
             hint = install_line("data")
-            raise ApcError(Mistake("E887", Place(str(path)), what, hint=hint)) from None
+            raise ApcError(Diagnostic("E887", SourceLocation(str(path)), what, hint=hint)) from None
     check_target(path)
 
 
 def write_table(
-    path: Path, columns: Sequence[Column], blocks: Iterable[Sequence[Any]], about: Mapping[str, Any]
+    path: Path, columns: Sequence[TableColumn], blocks: Iterable[Sequence[Any]], about: Mapping[str, Any]
 ) -> None:
     """Write a table.
 
@@ -255,7 +255,7 @@ def write_table(
     columns
         What its columns are.
     blocks
-        Some rows at a time, read once, as columns: see `Writer.rows`, `blocks_of`.
+        Some rows at a time, read once, as columns: see `TableWriter.rows`, `blocks_of`.
     about
         What made the table; kept in a Parquet file, left out of a CSV file, which stays plain.
 
@@ -279,7 +279,7 @@ def write_table(
     write_file(path, write)
 
 
-def read_table(path: Path, columns: Sequence[Column]) -> tuple[NDArray[Any], ...]:
+def read_table(path: Path, columns: Sequence[TableColumn]) -> tuple[NDArray[Any], ...]:
     """Return columns of a table that `write_table` wrote, as floats, NaN where nothing is, or as objects."""
     if path.suffix == ".parquet":
         parquet = need("pyarrow.parquet", "data")

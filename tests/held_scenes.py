@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from tests.bruteforce import Luck, Scene, lossy_frame, states_read, ways_of
 from tests.topologies import compiled
 
@@ -46,7 +46,7 @@ links:
 
 
 @cache
-def system_of(text: str) -> CompiledSystem:
+def system_of(text: str) -> Model:
     """Return a scene compiled, once."""
     return compiled(text)
 

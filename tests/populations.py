@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from tests.bruteforce import Scene
 from tests.topologies import compiled, replaced
 from tests.truths import text_of
 
 
-def different(peers: int) -> CompiledSystem:
+def different(peers: int) -> Model:
     """Return peers whose masses, dampings and contacts all differ, by up to 30 %."""
     random, columns = np.random.default_rng(0), []
     for name, least, unit in (

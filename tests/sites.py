@@ -8,7 +8,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.compiler.components.component_library import Library
 from tests.bruteforce import Scene
 from tests.topologies import compiled, replaced
@@ -17,7 +17,7 @@ from tests.truths import text_of
 MS = Fraction(1, 1000)
 
 
-def paper(operator: str = "mean", **values: Any) -> CompiledSystem:
+def paper(operator: str = "mean", **values: Any) -> Model:
     """Return the paper's system for equal users, compiled; the values are those of `bruteforce.Scene`."""
     scene = Scene(operator, **values)
     return compiled(text_of(scene).replace("topology: stepped", "topology: paper"))
@@ -43,7 +43,7 @@ equations:
 """
 
 
-def edged(operator: str, starts: Sequence[float], *, cubic: float = 0.0, **values: Any) -> CompiledSystem:
+def edged(operator: str, starts: Sequence[float], *, cubic: float = 0.0, **values: Any) -> Model:
     """Return the paper's system with F_T an operator over K_T d + B_T ḋ + cubic d³, d to each other user."""
     text = replaced(
         text_of(Scene(peers=len(starts), **values)),
@@ -56,7 +56,7 @@ def edged(operator: str, starts: Sequence[float], *, cubic: float = 0.0, **value
         return compiled(text, Library((Path(folder),)))
 
 
-def alone(rate: str, *ticks: str, variables: str = "", delay: str = "0 s") -> CompiledSystem:
+def alone(rate: str, *ticks: str, variables: str = "", delay: str = "0 s") -> Model:
     """Return one peer without network: 1 s·der(x) = rate; what `ticks` say each millisecond, as `it.x`."""
     clock = ", clock: clock, delay: {unit: s, default: 0 s}" if ticks else ""
     part = (

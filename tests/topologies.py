@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from apc.compiler.cache import Origin, program_digest
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.compiler.components.component_library import Library
 from apc.compiler.equations.clocks import ClockedSystem, partition
 from apc.compiler.equations.flatten import FlatSystem, flatten
@@ -15,7 +15,7 @@ from apc.compiler.equations.structure import SortedSystem, sort
 from apc.compiler.errors import ApcError
 from apc.compiler.functions.functions import build_functions
 from apc.compiler.pipeline import linear_system
-from apc.compiler.scene.scene import Scene, build_scene
+from apc.compiler.scene.scene import Topology, build_scene
 from apc.compiler.source.source import Source, parse_source
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -59,7 +59,7 @@ def built_in() -> Library:
     return Library()
 
 
-def scene(text: str, library: Library | None = None) -> Scene:
+def scene(text: str, library: Library | None = None) -> Topology:
     return build_scene(source(text), library or built_in())
 
 
@@ -76,14 +76,14 @@ def ordered(text: str, library: Library | None = None) -> SortedSystem:
 
 
 @functools.lru_cache(maxsize=32)
-def compiled(text: str, library: Library | None = None) -> CompiledSystem:
+def compiled(text: str, library: Library | None = None) -> Model:
     """Compile a text; the same text gives the same model, with all that it keeps."""
     system = ordered(text, library)
     origin = Origin("scene.yaml", (("scene.yaml", text.encode()),), program_digest())
     return build_functions(system, origin, linear=linear_system(system.scene))
 
 
-def wall(mass: float, damping: float, delay: float, stiffness: float, virtual: float = 0.0) -> CompiledSystem:
+def wall(mass: float, damping: float, delay: float, stiffness: float, virtual: float = 0.0) -> Model:
     """Return a device pressed against a sampled wall, the velocity by backward difference, T = 1 ms."""
     return compiled(
         "topology: wall\nclocks: {tick: 1 ms}\npeers: {user: {count: 1}}\n"

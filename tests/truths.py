@@ -60,7 +60,7 @@ class Case:
 
     name: str
     source: str
-    build: Callable[[], apc.CompiledSystem]
+    build: Callable[[], apc.Model]
     tell: Callable[[], Truth]
 
     def __str__(self) -> str:
@@ -77,7 +77,7 @@ def _stored(path: Path) -> Case:
     return Case(path.stem, "hard", lambda: apc.compile(path), tell)
 
 
-def _followed(name: str, source: str, build: Callable[[], apc.CompiledSystem]) -> Case:
+def _followed(name: str, source: str, build: Callable[[], apc.Model]) -> Case:
     def tell() -> Truth:
         found = spectral_truth(build())
         assert not isinstance(found, str), found
@@ -292,7 +292,7 @@ CASES: dict[str, Case] = {
 
 
 @functools.cache
-def model(name: str) -> apc.CompiledSystem:
+def model(name: str) -> apc.Model:
     """Return the compiled scene of a case."""
     return CASES[name].build()
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import TypeVar
 
-from apc.compiler.errors import Place
+from apc.compiler.errors import SourceLocation
 from apc.compiler.language.dimensions import Dimension
 from apc.compiler.language.expression import (
     FUNCTIONS,
@@ -25,7 +25,7 @@ from apc.compiler.language.expression import (
     names,
 )
 from apc.compiler.language.units import Unit
-from apc.compiler.language.values import Binding, Bounds
+from apc.compiler.language.values import Bounds, ValueBinding
 from apc.compiler.source.nodes import Node
 
 T = TypeVar("T")
@@ -53,7 +53,7 @@ ROLES = (
 
 
 @dataclass(frozen=True, slots=True)
-class Variable:
+class ComponentVariable:
     """A variable of a component or connector; `start` is None for one that needs no start value.
 
     `limit` is the parameter that its size should stay within, empty if there is none.
@@ -63,7 +63,7 @@ class Variable:
     unit: Unit
     start: Fraction | None
     about: str
-    place: Place
+    place: SourceLocation
     limit: str = ""
 
 
@@ -73,12 +73,12 @@ class Connector:
 
     name: str
     about: str
-    potentials: tuple[Variable, ...]
-    flows: tuple[Variable, ...]
+    potentials: tuple[ComponentVariable, ...]
+    flows: tuple[ComponentVariable, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class Number:
+class NumberParameter:
     """A parameter that is a number, in SI; with `divided`, a shared part divides it among the peers.
 
     `words` gives names to values, such as left: -1.
@@ -93,7 +93,7 @@ class Number:
     divided: bool
     words: Named[Fraction]
     about: str
-    place: Place
+    place: SourceLocation
 
     @property
     def bounds(self) -> Bounds:
@@ -109,7 +109,7 @@ class Option:
     words: tuple[str, ...]
     default: str | None
     about: str
-    place: Place
+    place: SourceLocation
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,37 +119,37 @@ class Reference:
     name: str
     role: str
     about: str
-    place: Place
+    place: SourceLocation
     unit: Unit | None = None  # of a table's numbers
 
 
-Parameter = Number | Option | Reference
+Parameter = NumberParameter | Option | Reference
 
 
 @dataclass(frozen=True, slots=True)
-class Send:
+class SentValue:
     """A value that a component sends to the other peers over its link."""
 
     name: str
     expression: Expr
     text: str
-    place: Place
+    place: SourceLocation
     dimension: Dimension
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class PartBindings:
     """What a part's entry says, in the terms of what surrounds it.
 
     `described` are the nodes of parameters that describe something (a graph, a table). `connections` join a
     connector to (part, connector); the part "ground" is fixed, an empty part is the component around.
     """
 
-    values: Named[Binding]
+    values: Named[ValueBinding]
     options: Named[str]
     references: Named[str]
     described: Named[Node]
-    starts: Named[Binding]
+    starts: Named[ValueBinding]
     connections: Joined
 
 
@@ -159,8 +159,8 @@ class Inner:
 
     name: str
     component: Component
-    entry: Entry
-    place: Place
+    entry: PartBindings
+    place: SourceLocation
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,12 +187,12 @@ class Component:
     name: str
     about: str
     source: str
-    place: Place
+    place: SourceLocation
     connectors: Named[Connector] = ()
     parameters: tuple[Parameter, ...] = ()
-    variables: tuple[Variable, ...] = ()
+    variables: tuple[ComponentVariable, ...] = ()
     locals: Named[Dimension] = ()
-    sends: tuple[Send, ...] = ()
+    sends: tuple[SentValue, ...] = ()
     equations: tuple[Equation, ...] = ()
     inner: tuple[Inner, ...] = ()
     passed: Joined = ()
@@ -205,17 +205,17 @@ class Component:
         """Return the parameter of this name, or None."""
         return next((parameter for parameter in self.parameters if parameter.name == name), None)
 
-    def variable(self, name: str) -> Variable | None:
+    def variable(self, name: str) -> ComponentVariable | None:
         """Return the declared variable of this name, or None."""
         return next((variable for variable in self.variables if variable.name == name), None)
 
     @property
-    def numbers(self) -> Iterator[Number]:
+    def numbers(self) -> Iterator[NumberParameter]:
         """The parameters that are numbers."""
-        return (parameter for parameter in self.parameters if isinstance(parameter, Number))
+        return (parameter for parameter in self.parameters if isinstance(parameter, NumberParameter))
 
     @property
-    def flows(self) -> Iterator[tuple[str, Variable]]:
+    def flows(self) -> Iterator[tuple[str, ComponentVariable]]:
         """The flows of its own connectors, those of inner parts left out, each with its connector."""
         passed = {connector for connector, _, _ in self.passed}
         return ((name, flow) for name, kind in self.connectors if name not in passed for flow in kind.flows)
@@ -246,7 +246,9 @@ class Component:
         return own or any(inner.component.hears_others for inner in self.inner)
 
 
-Settable = Number | Option | Reference | Variable  # what a group of peers can set for itself
+Settable = (
+    NumberParameter | Option | Reference | ComponentVariable
+)  # what a group of peers can set for itself
 
 
 def option_test(node: Expr, options: dict[str, Option]) -> tuple[Option, str] | None:

@@ -18,8 +18,8 @@ from fractions import Fraction
 from itertools import count
 from typing import TypeVar
 
-from apc.compiler.components.component import OTHERS, Component, Linearized, Option, Send, option_test
-from apc.compiler.errors import Mistakes, Place, place_in
+from apc.compiler.components.component import OTHERS, Component, Linearized, Option, SentValue, option_test
+from apc.compiler.errors import Mistakes, SourceLocation, place_in
 from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND, Dimension
 from apc.compiler.language.expression import (
     Call,
@@ -32,7 +32,7 @@ from apc.compiler.language.expression import (
     transform,
     walk,
 )
-from apc.compiler.language.expression import Number as Literal
+from apc.compiler.language.expression import NumberLiteral as Literal
 from apc.compiler.language.unit_check import ANY, check_equation, dimension_of
 from apc.compiler.language.values import PEERS
 from apc.compiler.language.vectors import (
@@ -49,7 +49,7 @@ from apc.compiler.words import counted
 TRUE = Call("==", (Literal(Fraction(1)), Literal(Fraction(1))))
 
 Path = tuple[str, ...]  # a name in an equation, between its dots
-Where = Equation | Send  # what an expression stands in
+Where = Equation | SentValue  # what an expression stands in
 Written = tuple[Expr, Where]
 T = TypeVar("T")
 
@@ -89,12 +89,12 @@ class ComponentNames:
         """Return the size of a name: 0 for a number, None for what is to be inferred."""
         return self.sizes.get(parts, 0)
 
-    def completed(self, sends: Collection[Send], mistakes: Mistakes) -> Component:
+    def completed(self, sends: Collection[SentValue], mistakes: Mistakes) -> Component:
         """Return the component with its locals and what it sends, checked, its vectors entry by entry.
 
         The dimensions of `sends` are found here.
         """
-        locals_, sent, equations = self._infer_locals(sends), list[Send](), list[Equation]()
+        locals_, sent, equations = self._infer_locals(sends), list[SentValue](), list[Equation]()
         for send in sends:
             with mistakes:
                 written = written_out(send.expression, self.size_of, send.text, send.place)
@@ -139,7 +139,7 @@ class ComponentNames:
                     replaced.append(written)
         return replace(linearized, equations=tuple(replaced))
 
-    def _infer_locals(self, sends: Collection[Send]) -> list[tuple[str, Dimension]]:
+    def _infer_locals(self, sends: Collection[SentValue]) -> list[tuple[str, Dimension]]:
         """Return the undeclared names that stand alone on the left of an equation, a vector's entry by entry.
 
         What one is may hang on another, on itself, or on what is sent. An unknown name on the right is
@@ -210,7 +210,7 @@ class ComponentNames:
             got = format_expression(node)
             mistakes.add("E506", _place(where, node), what, expected=expected, got=got, hint=hint)
 
-    def _check_sent(self, send: Send) -> None:
+    def _check_sent(self, send: SentValue) -> None:
         """Refuse a send of what is heard: that is known at ticks of the clock, not of the link."""
         for heard in names(send.expression):
             if heard.parts[0] == OTHERS:
@@ -234,7 +234,7 @@ class ComponentNames:
 
         return transform(expression, decided)
 
-    def dimension_of_held(self, expression: Expr, text: str, place: Place) -> Dimension | None:
+    def dimension_of_held(self, expression: Expr, text: str, place: SourceLocation) -> Dimension | None:
         """Return the dimension of a checked expression, or None if it is a variable, which has its own."""
         if isinstance(expression, Name) and expression.parts in self.variables:
             return None
@@ -280,7 +280,7 @@ class ComponentNames:
                 case Name(parts) if node.start not in judged:
                     self._check_name(parts, _place(where, node), mistakes)
 
-    def _check_name(self, parts: Path, place: Place, mistakes: Mistakes) -> None:
+    def _check_name(self, parts: Path, place: SourceLocation, mistakes: Mistakes) -> None:
         """Record a name there isn't, or an entry that a vector hasn't got."""
         whole, index = _whole(parts), whole_and_index(parts[-1])[1]
         shown, size = ".".join(whole), self.size_of(whole) or 0
@@ -304,7 +304,7 @@ def _whole(path: Path) -> Path:
     return (*path[:-1], whole_and_index(path[-1])[0])
 
 
-def _place(where: Where, node: Expr) -> Place:
+def _place(where: Where, node: Expr) -> SourceLocation:
     return place_in(where.place, where.text, node.start)
 
 

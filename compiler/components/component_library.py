@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 from apc.compiler.cache import SUFFIX, builtin_files
 from apc.compiler.components.component import Component, Connector
 from apc.compiler.components.definitions import read_component, read_connector
-from apc.compiler.errors import ApcError, Mistake
+from apc.compiler.errors import ApcError, Diagnostic
 from apc.compiler.files import RefusedError, files_below, read_file, same_file
 from apc.compiler.source.nodes import MAX_BYTES, Mapping, Scalar
 from apc.compiler.source.reading import brief, fault
@@ -122,7 +122,7 @@ def _read(path: Path) -> Source:
             raise
         what, expected = "a file of a library", "YAML that defines a component or connector"
         places = [replace(mistake.place, source_line="") for mistake in error.mistakes]
-        raise ApcError(Mistake("E219", place, what, expected) for place in places) from None
+        raise ApcError(Diagnostic("E219", place, what, expected) for place in places) from None
 
 
 def definition_of(source: Source) -> tuple[str, str]:

@@ -20,28 +20,28 @@ from itertools import chain
 
 from apc.compiler.components.component import (
     ROLES,
+    ComponentVariable,
     Linearized,
     Named,
-    Number,
+    NumberParameter,
     Option,
     Parameter,
     Reference,
-    Send,
-    Variable,
+    SentValue,
 )
-from apc.compiler.errors import ApcError, Mistakes, Place
+from apc.compiler.errors import ApcError, Mistakes, SourceLocation
 from apc.compiler.language.constants import check_constants
 from apc.compiler.language.dimensions import DIMENSIONLESS
 from apc.compiler.language.expression import Equation
 from apc.compiler.language.grammar import parse_equation, parse_expression
 from apc.compiler.language.units import Unit, parse_quantity, parse_unit, quantity
-from apc.compiler.language.values import AlreadyReportedError, Value, text_place
+from apc.compiler.language.values import AlreadyReportedError, ScalarValue, text_place
 from apc.compiler.language.vectors import SIZES
 from apc.compiler.language.vectors import entries as names_of
 from apc.compiler.source.nodes import Mapping as NodeMapping
 from apc.compiler.source.nodes import Node, Scalar, Sequence
 from apc.compiler.source.reading import (
-    Body,
+    MappingReader,
     among,
     brief,
     fault,
@@ -61,7 +61,7 @@ _DEFINES = re.compile(r"\A\s*([A-Za-z]\w*)\s*=", re.ASCII)
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\Z", re.ASCII)
 
 
-def read_equations(root: Body, mistakes: Mistakes) -> tuple[tuple[Equation, ...], set[str]]:
+def read_equations(root: MappingReader, mistakes: Mistakes) -> tuple[tuple[Equation, ...], set[str]]:
     """Read `equations: [a + b = c]`.
 
     Parameters
@@ -86,7 +86,7 @@ def read_equations(root: Body, mistakes: Mistakes) -> tuple[tuple[Equation, ...]
     return tuple(equations), undefined
 
 
-def read_linearized(root: Body, mistakes: Mistakes) -> Linearized | None:
+def read_linearized(root: MappingReader, mistakes: Mistakes) -> Linearized | None:
     """Read `linearized: {equations: [f = b*v], valid: speeds above the threshold}`, or one equation alone.
 
     Parameters
@@ -101,7 +101,7 @@ def read_linearized(root: Body, mistakes: Mistakes) -> Linearized | None:
         return None
     valid, items = "", tuple[Node, ...]((node,))
     if isinstance(node, NodeMapping):
-        body = Body(node, ("equations", "valid"), "linearized", root.mistakes)
+        body = MappingReader(node, ("equations", "valid"), "linearized", root.mistakes)
         valid, items = body.text("valid"), body.read("equations", _items, ())
     elif isinstance(node, Sequence):
         items = node.items
@@ -116,7 +116,7 @@ def read_linearized(root: Body, mistakes: Mistakes) -> Linearized | None:
     return Linearized(tuple(equations), valid)
 
 
-def _equation(text: str, place: Place) -> Equation:
+def _equation(text: str, place: SourceLocation) -> Equation:
     """Return an equation whose constants are bounded."""
     equation = parse_equation(text, place)
     for side in (equation.left, equation.right):
@@ -130,7 +130,7 @@ def _items(node: Node, what: str) -> tuple[Node, ...]:
     raise fault("E203", node.place, what, "a list", form(node), "equations: [a + b = c]")
 
 
-def read_sends(root: Body, mistakes: Mistakes) -> tuple[Send, ...]:
+def read_sends(root: MappingReader, mistakes: Mistakes) -> tuple[SentValue, ...]:
     """Read `sends: {x: sample(object.x)}`, their dimensions left open."""
     sends = []
     for key, value in root.section("sends", "{x: sample(object.x)}"):
@@ -139,33 +139,33 @@ def read_sends(root: Body, mistakes: Mistakes) -> tuple[Send, ...]:
             text, place = text_of(value, name, f"{name}: sample(object.x)"), text_place(value)
             expression = parse_expression(text, place)
             check_constants(expression, text, place)
-            sends.append(Send(name, expression, text, place, DIMENSIONLESS))
+            sends.append(SentValue(name, expression, text, place, DIMENSIONLESS))
     return tuple(sends)
 
 
-def read_variables(root: Body, section: str = "variables") -> tuple[Variable, ...]:
+def read_variables(root: MappingReader, section: str = "variables") -> tuple[ComponentVariable, ...]:
     """Read `variables: {x: {unit: m}}`, or a connector's potentials or flows."""
 
-    def read(key: Scalar, value: Node) -> list[Variable]:
+    def read(key: Scalar, value: Node) -> list[ComponentVariable]:
         name = name_of(key, "a variable")
         meant = value.text if isinstance(value, Scalar) and _is_unit(value.text) else "…"
         node = mapping_of(value, name, f"{name}: {{unit: {meant}}}")
-        body = Body(node, VARIABLE, f"variable {name}", root.mistakes)
+        body = MappingReader(node, VARIABLE, f"variable {name}", root.mistakes)
         about, limit = body.text("about"), body.text("limit", "limit: force_limit")
         unit, size = _unit_and_size(body, name)
         starts = _entry_by_entry(body, "start", name, unit, size)
-        return [Variable(text, unit, start, about, key.place, limit) for text, start in starts]
+        return [ComponentVariable(text, unit, start, about, key.place, limit) for text, start in starts]
 
     return tuple(chain(*root.each(section, "{x: {unit: m}}", read)))
 
 
 def _is_unit(text: str) -> bool:
     with suppress(ApcError):
-        return bool(text.strip() and parse_unit(text, Place("")))
+        return bool(text.strip() and parse_unit(text, SourceLocation("")))
     return False
 
 
-def read_parameters(root: Body) -> tuple[Parameter, ...]:
+def read_parameters(root: MappingReader) -> tuple[Parameter, ...]:
     """Read `parameters: {stiffness: {unit: N/m, min: 0}}`: numbers, options, tables and roles."""
 
     def read(key: Scalar, value: Node) -> Several[Parameter]:
@@ -179,17 +179,17 @@ def read_parameters(root: Body) -> tuple[Parameter, ...]:
             raise fault("E203", value.place, what, expected, got, f"{name}: {hint}")
         node = mapping_of(value, what, f"{name}: {{unit: N/m}}")
         if (table := node.get("table")) is not None:
-            body = Body(node, TABLE, what, root.mistakes)
+            body = MappingReader(node, TABLE, what, root.mistakes)
             unit = _unit(table, "table", "table: N")
             return [Reference(name, "table", body.text("about"), node.place, unit)]
         if isinstance(options := node.get("options"), Sequence):
-            return [_option(name, options, Body(node, OPTION, what, root.mistakes))]
-        return _numbers(name, Body(node, NUMBER, what, root.mistakes))
+            return [_option(name, options, MappingReader(node, OPTION, what, root.mistakes))]
+        return _numbers(name, MappingReader(node, NUMBER, what, root.mistakes))
 
     return tuple(chain(*root.each("parameters", "{stiffness: {unit: N/m, min: 0}}", read)))
 
 
-def _option(name: str, options: Sequence, body: Body) -> Option:
+def _option(name: str, options: Sequence, body: MappingReader) -> Option:
     words = []
     for item in options.items:
         with body.mistakes:
@@ -201,7 +201,7 @@ def _option(name: str, options: Sequence, body: Body) -> Option:
     return Option(name, tuple(words), body.read("default", known, None), body.text("about"), options.place)
 
 
-def _numbers(name: str, body: Body) -> list[Number]:
+def _numbers(name: str, body: MappingReader) -> list[NumberParameter]:
     """Read a number's declaration, or a vector's, of which each entry is a number."""
     about, shared, nodes, mistakes = body.text("about"), body.text("shared"), body.nodes, body.mistakes
     if shared not in ("", "divided", "whole"):
@@ -217,14 +217,14 @@ def _numbers(name: str, body: Body) -> list[Number]:
         mistakes.add("E203", nodes["above"].place, name, expected="either min or above", got="both")
     least = minimum if above is None else above
     first, *_ = names_of(name, size)
-    model = Number(
+    model = NumberParameter(
         first, unit, None, least, above is not None, most, shared == "divided", (), about, body.place
     )
 
     def check(number: Fraction | None, node: Node | None, what: str) -> None:
         """Hold a number of the declaration itself against its bounds."""
         if number is not None and node is not None:
-            model.bounds.check(Value(number, unit.dimension, None, node.place), what, mistakes)
+            model.bounds.check(ScalarValue(number, unit.dimension, None, node.place), what, mistakes)
 
     check(most, nodes.get("max"), f"the max of {first}")
     words: dict[str, Fraction] = {}
@@ -239,7 +239,7 @@ def _numbers(name: str, body: Body) -> list[Number]:
     return [replace(model, name=text, default=default, words=named) for text, default in defaults]
 
 
-def _unit_and_size(body: Body, name: str) -> tuple[Unit, int]:
+def _unit_and_size(body: MappingReader, name: str) -> tuple[Unit, int]:
     """Read the unit that a declaration must have, and `size: 2`, the entries of a vector; 0 for a number."""
     unit = body.read("unit", _unit, None)
     size = body.read("size", partial(_size, name=name), 0)
@@ -264,7 +264,12 @@ def _size(node: Node, what: str, name: str) -> int:
 
 
 def _entry_by_entry(
-    body: Body, key: str, name: str, unit: Unit, size: int, words: Mapping[str, Fraction] | None = None
+    body: MappingReader,
+    key: str,
+    name: str,
+    unit: Unit,
+    size: int,
+    words: Mapping[str, Fraction] | None = None,
 ) -> Named[Fraction | None]:
     """Read the default or start of a number, or the list of a vector's, by names; None of one not given."""
 

@@ -16,12 +16,12 @@ from apc.compiler.components.component import (
     RESERVED,
     SYMBOLS,
     Component,
+    ComponentVariable,
     Connector,
     Inner,
-    Number,
+    NumberParameter,
     Parameter,
     Reference,
-    Variable,
 )
 from apc.compiler.components.component_check import ComponentNames, check_balance
 from apc.compiler.components.declarations import (
@@ -31,7 +31,14 @@ from apc.compiler.components.declarations import (
     read_sends,
     read_variables,
 )
-from apc.compiler.components.parts import MOST_PARTS, Definitions, Parts, Scope, component_named, read_entry
+from apc.compiler.components.parts import (
+    MOST_PARTS,
+    Definitions,
+    EntryScope,
+    PartEntries,
+    component_named,
+    read_entry,
+)
 from apc.compiler.errors import Mistakes
 from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension
 from apc.compiler.language.unit_text import format_dimension
@@ -40,7 +47,7 @@ from apc.compiler.language.vectors import by_vector
 from apc.compiler.language.vectors import entries as elements
 from apc.compiler.source.nodes import Mapping, Node, Scalar
 from apc.compiler.source.reading import (
-    Body,
+    MappingReader,
     among,
     brief,
     fault,
@@ -65,7 +72,9 @@ DEEPEST = 10  # levels of parts inside parts
 def read_connector(source: Source) -> Connector:
     """Read a connector definition. Raises ApcError with all its mistakes."""
     mistakes = Mistakes()
-    root = Body(mapping_of(source.root, "a connector definition"), CONNECTOR, "a connector", mistakes)
+    root = MappingReader(
+        mapping_of(source.root, "a connector definition"), CONNECTOR, "a connector", mistakes
+    )
     name, about = root.text("connector"), root.text("about")
     potentials, flows = (read_variables(root, key) for key in ("potentials", "flows"))
     _check_limits((*potentials, *flows), (), mistakes)
@@ -80,7 +89,9 @@ def read_connector(source: Source) -> Connector:
 def read_component(source: Source, library: Definitions) -> Component:
     """Read and check a component definition. Raises ApcError with all its mistakes."""
     mistakes, unread = Mistakes(), Mistakes()  # an equation that can't be read hides no mistake of the others
-    root = Body(mapping_of(source.root, "a component definition"), COMPONENT, "a component", mistakes)
+    root = MappingReader(
+        mapping_of(source.root, "a component definition"), COMPONENT, "a component", mistakes
+    )
     equations, undefined = read_equations(root, unread)
     draft = _read_declarations(root, library, mistakes)
     linearized = read_linearized(root, unread) or draft.linearized
@@ -97,7 +108,7 @@ def read_component(source: Source, library: Definitions) -> Component:
     return component
 
 
-def _symbols(root: Body, component: Component) -> tuple[tuple[str, str], ...]:
+def _symbols(root: MappingReader, component: Component) -> tuple[tuple[str, str], ...]:
     """Read `symbols: {K: stiffness}`: the parameters that play symbols of published conditions."""
     names = {parameter.name: None for parameter in component.parameters}
 
@@ -109,7 +120,7 @@ def _symbols(root: Body, component: Component) -> tuple[tuple[str, str], ...]:
     return tuple(root.each("symbols", "{K: stiffness}", read))
 
 
-def _read_declarations(root: Body, library: Definitions, mistakes: Mistakes) -> Component:
+def _read_declarations(root: MappingReader, library: Definitions, mistakes: Mistakes) -> Component:
     """Read everything but equations and sends; what the component extends comes first."""
     title = root.nodes["component"]
     assert isinstance(title, Scalar)  # or the library would not know it
@@ -147,7 +158,9 @@ def _read_declarations(root: Body, library: Definitions, mistakes: Mistakes) -> 
     return _with_inner(root, draft, library, mistakes)
 
 
-def _check_limits(variables: Iterable[Variable], numbers: Iterable[Number], mistakes: Mistakes) -> None:
+def _check_limits(
+    variables: Iterable[ComponentVariable], numbers: Iterable[NumberParameter], mistakes: Mistakes
+) -> None:
     """Record limits of variables that are no number of the same dimension of the component around."""
     known = {number.name: number.unit.dimension for number in numbers}
     for variable in variables:
@@ -168,7 +181,7 @@ def _peers(node: Node, what: str) -> int:
     raise fault("E203", node.place, what, "a whole number from 2 on", form(node), "peers: 2")
 
 
-Declared = TypeVar("Declared", bound=Parameter | Variable)
+Declared = TypeVar("Declared", bound=Parameter | ComponentVariable)
 
 
 def _overridden(
@@ -185,9 +198,9 @@ def _overridden(
     return tuple({item.name: item for item in (*base, *own)}.values())
 
 
-def _with_inner(root: Body, outer: Component, library: Definitions, mistakes: Mistakes) -> Component:
+def _with_inner(root: MappingReader, outer: Component, library: Definitions, mistakes: Mistakes) -> Component:
     """Return a component with the parts inside it, and the connectors that it passes on to them."""
-    parts = Parts(library, mistakes)
+    parts = PartEntries(library, mistakes)
     parts.read("parts", root)
     dimensions: dict[tuple[str, ...], Dimension] = {(p.name,): p.unit.dimension for p in outer.numbers}
     dimensions[PEERS] = DIMENSIONLESS
@@ -196,7 +209,7 @@ def _with_inner(root: Body, outer: Component, library: Definitions, mistakes: Mi
         return [p.name for p in outer.parameters if isinstance(p, Reference) and p.role == role]
 
     names, whole = [".".join(name) for name in dimensions], f"the parts of {outer.name}"
-    scope = Scope(dimensions.get, names, references, parts, whole, outer=outer)
+    scope = EntryScope(dimensions.get, names, references, parts, whole, outer=outer)
     inner = [
         Inner(name, part.component, read_entry(part, scope, mistakes, index), part.place)
         for part in parts.entries.values()
@@ -229,13 +242,13 @@ def _with_inner(root: Body, outer: Component, library: Definitions, mistakes: Mi
     return component
 
 
-def _connectors(root: Body, library: Definitions) -> list[tuple[str, Connector, bool]]:
+def _connectors(root: MappingReader, library: Definitions) -> list[tuple[str, Connector, bool]]:
     """Read `connectors: {flange: Flange, grip: {type: Flange, for: hands}}`, each with whether it is that."""
 
     def read(key: Scalar, value: Node) -> tuple[str, Connector, bool]:
         name, kind, for_hands = name_of(key, "a connector"), value, isinstance(value, Mapping)
         if isinstance(value, Mapping):
-            body = Body(value, ("type", "for"), f"connector {name}", root.mistakes)
+            body = MappingReader(value, ("type", "for"), f"connector {name}", root.mistakes)
             if body.text("for", "for: hands") != "hands":
                 meant = body.nodes.get("for")
                 got, place = ("nothing", value.place) if meant is None else (form(meant), meant.place)

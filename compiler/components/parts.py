@@ -1,7 +1,7 @@
 """The entries of parts, in a topology or inside a component, read against the components they are of.
 
-Takes: YAML mappings, the components, and the scope they stand in. Gives: `PartEntry`, `Parts`; `Entry` by
-`read_entry`.
+Takes: YAML mappings, the components, and the scope they stand in. Gives: `PartEntry`, `PartEntries`;
+`PartBindings` by `read_entry`.
 Guarantees: every number, word, reference and connection a component asks for is there, or a mistake says so;
 what is missing or faulty is reported once.
 Does not: know the sections of a topology.
@@ -18,27 +18,33 @@ from typing import Protocol, TypeVar
 from apc.compiler.components.component import (
     RESERVED,
     Component,
+    ComponentVariable,
     Connector,
-    Entry,
     Named,
-    Number,
+    NumberParameter,
     Option,
     Parameter,
+    PartBindings,
     Reference,
     Settable,
-    Variable,
 )
-from apc.compiler.errors import Mistakes, Place
+from apc.compiler.errors import Mistakes, SourceLocation
 from apc.compiler.language.dimensions import Dimension
 from apc.compiler.language.expression import format_expression
 from apc.compiler.language.grammar import parse_expression
 from apc.compiler.language.units import Unit
-from apc.compiler.language.values import AlreadyReportedError, Binding, is_quantity, read_binding, text_place
+from apc.compiler.language.values import (
+    AlreadyReportedError,
+    ValueBinding,
+    is_quantity,
+    read_binding,
+    text_place,
+)
 from apc.compiler.language.vectors import by_vector, sizes_of, whole_and_index, written_out
 from apc.compiler.source.nodes import Mapping as MappingNode
 from apc.compiler.source.nodes import Node, Scalar
 from apc.compiler.source.reading import (
-    Body,
+    MappingReader,
     among,
     brief,
     fault,
@@ -73,7 +79,7 @@ EXAMPLES = {
     "hands": ("hand", "{type: ConstantForce}", "ConstantForce"),
     "parts": ("tip", "{type: Mass}", "Mass"),
 }
-_FAULTY = MappingNode((), Place(""))  # stands for an entry of a vector whose fault was reported
+_FAULTY = MappingNode((), SourceLocation(""))  # stands for an entry of a vector whose fault was reported
 DEFAULT_TYPES = {"masses": "Mass", "links": "Link"}
 # A part, the first and last elements of an array, a connector.
 _TARGET = re.compile(
@@ -100,7 +106,7 @@ class Definitions(Protocol):
         """Return a connector type, or None if there is no such name."""
 
 
-def component_named(name: str, place: Place, library: Definitions, hint: str) -> Component:
+def component_named(name: str, place: SourceLocation, library: Definitions, hint: str) -> Component:
     """Return a component that is named at a place. Raises ApcError where there is none, or its mistakes."""
     component = library.component(name)
     if component is not None:
@@ -118,7 +124,7 @@ class PartEntry:
     section: str
     body: MappingNode
     component: Component
-    place: Place
+    place: SourceLocation
     count: int | None
 
     @property
@@ -132,7 +138,7 @@ class PartEntry:
 
 
 @dataclass(frozen=True, slots=True)
-class Parts:
+class PartEntries:
     """The parts of a topology or component, section by section, before their entries are read.
 
     `entries` are those of a known component; `faulty` names parts that are there and can't be read, which
@@ -145,7 +151,7 @@ class Parts:
     entries: dict[str, PartEntry] = field(default_factory=dict)
     faulty: set[str] = field(default_factory=set)
 
-    def read(self, section: str, root: Body) -> None:
+    def read(self, section: str, root: MappingReader) -> None:
         """Collect the parts of a section and their components, so that names can be resolved."""
         name, example, _ = EXAMPLES[section]
         what, words = ("a part", ()) if self.taken is None else (f"a part of {section}", RESERVED)
@@ -200,7 +206,7 @@ def _count(name: str, section: str, body: MappingNode) -> int | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Scope:
+class EntryScope:
     """What an entry can refer to.
 
     `dimension` and `names` are the names an expression may use; `references` gives the names of a role, for
@@ -212,13 +218,13 @@ class Scope:
     dimension: Callable[[tuple[str, ...]], Dimension | None]
     names: Collection[str]
     references: Callable[[str, str], Collection[str]]
-    parts: Parts
+    parts: PartEntries
     whole: str
     complete: bool = True
     outer: Component | None = None
 
 
-def read_entry(entry: PartEntry, scope: Scope, mistakes: Mistakes, index: int = 1) -> Entry:
+def read_entry(entry: PartEntry, scope: EntryScope, mistakes: Mistakes, index: int = 1) -> PartBindings:
     """Read the entry of a part.
 
     Parameters
@@ -239,8 +245,8 @@ def read_entry(entry: PartEntry, scope: Scope, mistakes: Mistakes, index: int = 
     named = (whole_and_index(item.name)[0] for item in (*component.parameters, *starts))
     common = PART_KEYS if within is None else ("count",)
     keys = dict.fromkeys(("type", *common, *dict(component.connectors), *named))
-    nodes = Body(entry.body, keys, f"{entry.name} ({component.name})", mistakes).nodes
-    numbers: tuple[Number | Variable, ...] = (*component.numbers, *starts)
+    nodes = MappingReader(entry.body, keys, f"{entry.name} ({component.name})", mistakes).nodes
+    numbers: tuple[NumberParameter | ComponentVariable, ...] = (*component.numbers, *starts)
     for name, vector in by_vector(numbers).items():
         if len(vector) > 1 and name in nodes:  # a key for each entry, x[1], in the place of x: [1 m, 0 m]
             values: tuple[Node, ...] = (_FAULTY,) * len(vector)
@@ -257,13 +263,13 @@ def read_entry(entry: PartEntry, scope: Scope, mistakes: Mistakes, index: int = 
             return ""
         return parameter.words[0] if isinstance(parameter, Option) else _one(parameter.unit)
 
-    def number(item: Number | Variable) -> Binding | None:
+    def number(item: NumberParameter | ComponentVariable) -> ValueBinding | None:
         """Return a parameter's number, the default of one that isn't given, or a variable's start value."""
         node, unit, words = nodes.get(item.name), item.unit, Named[Fraction]()
-        if isinstance(item, Number):
+        if isinstance(item, NumberParameter):
             words = item.words
             if node is None and item.default is not None:
-                return Binding(item.default, None, unit.dimension, entry.place, unit.text)
+                return ValueBinding(item.default, None, unit.dimension, entry.place, unit.text)
         if node is None or node is _FAULTY:
             return None
         what, pair = (item.name, unit.dimension, unit.text), (scope.dimension, scope.names)
@@ -322,7 +328,7 @@ def read_entry(entry: PartEntry, scope: Scope, mistakes: Mistakes, index: int = 
     targets = [(part, its) for _, part, its in connections if part != GROUND]
     if len(targets) > 1 and len(set(targets)) == 1:
         mistakes.add("E210", entry.place, f"{entry.name} joins {targets[0][0]} to itself")
-    return Entry(
+    return PartBindings(
         each(component.numbers, number),
         each((parameter for parameter in component.parameters if isinstance(parameter, Option)), option),
         each(references, reference),
@@ -332,7 +338,9 @@ def read_entry(entry: PartEntry, scope: Scope, mistakes: Mistakes, index: int = 
     )
 
 
-def _vector(node: Node, name: str, vector: Sequence[Number | Variable], scope: Scope) -> tuple[Node, ...]:
+def _vector(
+    node: Node, name: str, vector: Sequence[NumberParameter | ComponentVariable], scope: EntryScope
+) -> tuple[Node, ...]:
     """Return a node for each entry of a vector, which inside a component may be an expression."""
     if isinstance(node, Scalar) and scope.outer is not None and not is_quantity(node.text):
         place = text_place(node)
@@ -345,7 +353,7 @@ def _vector(node: Node, name: str, vector: Sequence[Number | Variable], scope: S
 
 
 def _joined(
-    connector: str, kind: str, node: Node | None, entry: PartEntry, scope: Scope, index: int
+    connector: str, kind: str, node: Node | None, entry: PartEntry, scope: EntryScope, index: int
 ) -> tuple[str, str] | None:
     """Return the part and the connector of it that a connector, of a type, of an entry is joined to."""
     name, outer, parts = entry.name, scope.outer, scope.parts.entries
@@ -390,7 +398,7 @@ def _element(
     entry: PartEntry,
     index: int,
     connector: str,
-    at: Place,
+    at: SourceLocation,
 ) -> str:
     """Return the part that an entry is joined to; of an array from `first` to `last`, the element."""
     other, size, what, hint = part.name, part.count, "", ""
@@ -413,7 +421,7 @@ def _element(
 
 
 def _its_connector(
-    part: PartEntry, named: str | None, connector: str, kind: str, by_hand: bool, at: Place
+    part: PartEntry, named: str | None, connector: str, kind: str, by_hand: bool, at: SourceLocation
 ) -> str:
     """Return the connector of another part that is named, or meant where none is."""
     shown, fitting = f"{part.name} ({part.component.name})", part.connectors(kind)

@@ -11,7 +11,7 @@ from collections.abc import Sequence, Set
 
 from sympy import Add
 
-from apc.compiler.equations.derivatives import Derivative, Moving
+from apc.compiler.equations.derivatives import Derivative, DifferentiatedNames
 from apc.compiler.equations.solution import Assignment, Residual
 from apc.compiler.equations.terms import Term, derivative, symbol
 
@@ -24,7 +24,7 @@ class Aliases:
     masses with one position are seen to have one velocity; it is shown by its name.
     """
 
-    def __init__(self, moving: Moving, started: Set[str]) -> None:
+    def __init__(self, moving: DifferentiatedNames, started: Set[str]) -> None:
         self.moving = moving
         self.names = sorted(moving.variables, key=lambda name: (name not in started, name.count(".")))
         self.rank = {name: place for place, name in enumerate(self.names)}

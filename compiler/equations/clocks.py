@@ -31,7 +31,7 @@ from apc.compiler.components.component import Component
 from apc.compiler.equations.flatten import (
     CONNECTION,
     FlatEquation,
-    FlatKind,
+    FlatPeerType,
     FlatSystem,
     HoldCrossing,
     PreviousCrossing,
@@ -39,9 +39,9 @@ from apc.compiler.equations.flatten import (
     SampleCrossing,
     flatten_alone,
 )
-from apc.compiler.errors import Mistakes, Place
+from apc.compiler.errors import Mistakes, SourceLocation
 from apc.compiler.language.expression import Call, Expr, Name, format_expression, names, transform, walk
-from apc.compiler.scene.scene import Scene
+from apc.compiler.scene.scene import Topology
 
 CONTINUOUS = "continuous"
 
@@ -56,10 +56,10 @@ class Partition:
 
 
 @dataclass(frozen=True, slots=True)
-class ClockedKind:
+class ClockedPeerType:
     """A kind of peer, partitioned. `partitions` starts with the continuous one."""
 
-    flat: FlatKind
+    flat: FlatPeerType
     partitions: tuple[Partition, ...]
     samples: tuple[SampleCrossing, ...]
     holds: tuple[HoldCrossing, ...]
@@ -71,8 +71,8 @@ class ClockedKind:
 class ClockedSystem:
     """The scene, partitioned."""
 
-    scene: Scene
-    kinds: tuple[ClockedKind, ...]
+    scene: Topology
+    kinds: tuple[ClockedPeerType, ...]
 
 
 def partition(flat: FlatSystem) -> ClockedSystem:
@@ -83,7 +83,7 @@ def partition(flat: FlatSystem) -> ClockedSystem:
     return ClockedSystem(flat.scene, kinds)
 
 
-def check_alone(component: Component, place: Place, mistakes: Mistakes) -> None:
+def check_alone(component: Component, place: SourceLocation, mistakes: Mistakes) -> None:
     """Record what a component by itself says of clocks that no scene can mend."""
     flat = flatten_alone(component, place, mistakes)
     if mistakes:
@@ -96,7 +96,7 @@ def check_alone(component: Component, place: Place, mistakes: Mistakes) -> None:
                 clocks.report_flow(other, clocks.given[other])
 
 
-def _partitioned(kind: FlatKind, mistakes: Mistakes) -> ClockedKind:
+def _partitioned(kind: FlatPeerType, mistakes: Mistakes) -> ClockedPeerType:
     clocks = _Clocks(kind, mistakes)
     crossings = [
         crossing
@@ -138,7 +138,7 @@ def _partitioned(kind: FlatKind, mistakes: Mistakes) -> ClockedKind:
     for variable in clocks.variables:
         members.setdefault(clocks.of(variable), ([], []))[0].append(variable)
     partitions = tuple(Partition(clock, tuple(its), tuple(of)) for clock, (its, of) in members.items())
-    return ClockedKind(kind, partitions, samples, holds, previous, receives)
+    return ClockedPeerType(kind, partitions, samples, holds, previous, receives)
 
 
 # Operators beneath which nothing is sampled once more.
@@ -175,7 +175,7 @@ class _Clocks:
     their left side; `variables` say which have a start value.
     """
 
-    def __init__(self, kind: FlatKind, mistakes: Mistakes) -> None:
+    def __init__(self, kind: FlatPeerType, mistakes: Mistakes) -> None:
         self.mistakes = mistakes
         self.variables = {variable.name: variable.start for variable in kind.variables}
         self.given: dict[str, FlatEquation] = {}
@@ -208,7 +208,7 @@ class _Clocks:
         """Return the clock that something asks for, empty if nothing does."""
         return self._clocks.get(self._root(name), "")
 
-    def check_start(self, name: str, place: Place) -> None:
+    def check_start(self, name: str, place: SourceLocation) -> None:
         """Record a value at the start, or at the tick before, of a variable that has no start value."""
         call, _, variable = name[:-1].partition("(")
         if call in ("initial", "previous") and not self.variables.get(variable, True):

@@ -12,15 +12,17 @@ from collections.abc import Iterator, Sequence
 from fractions import Fraction
 
 from apc.compiler.components.parts import GROUND
-from apc.compiler.errors import Mistakes, Place
-from apc.compiler.language.expression import Call, Expr, Name, Number
-from apc.compiler.scene.instances import Part
+from apc.compiler.errors import Mistakes, SourceLocation
+from apc.compiler.language.expression import Call, Expr, Name, NumberLiteral
+from apc.compiler.scene.instances import PartInstance
 
 Terminal = tuple[str, str]  # (part, connector)
-ZERO = Number(Fraction(0))
+ZERO = NumberLiteral(Fraction(0))
 
 
-def connection_equations(parts: Sequence[Part], mistakes: Mistakes) -> Iterator[tuple[Expr, Expr, Place]]:
+def connection_equations(
+    parts: Sequence[PartInstance], mistakes: Mistakes
+) -> Iterator[tuple[Expr, Expr, SourceLocation]]:
     """Yield the equations (left, right, place) of each set of connectors that meet.
 
     Each set reads from what is joined to outwards: a mass's connector stands before those joined to it. The

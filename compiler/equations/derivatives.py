@@ -1,6 +1,6 @@
 """Which symbols of a term move, and time derivatives of terms.
 
-Takes: names of variables, and which values jump. Gives: `Derivative`, `Moving`.
+Takes: names of variables, and which values jump. Gives: `Derivative`, `DifferentiatedNames`.
 Guarantees: a derivative that doesn't exist is refused.
 Does not: choose states (see `index`).
 """
@@ -27,7 +27,7 @@ Derivative = tuple[str, int]  # a variable and how often it is differentiated
 
 
 @dataclass(frozen=True, slots=True)
-class Moving:
+class DifferentiatedNames:
     """The names of what moves: `variables`, and those of held forces, which jump."""
 
     variables: Collection[str]

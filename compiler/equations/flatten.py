@@ -1,9 +1,9 @@
 """A scene to equations: per kind of peer, the scalar equations after connection.
 
-Takes: `Scene`. Gives: `FlatSystem`.
-Guarantees: peers of one structure share one `FlatKind`, whatever their numbers and their count; every name
-is whole (`contact.a.x`); potentials that meet are equal, flows that meet sum to zero; options are decided; a
-value crosses between what is continuous, clocks and peers only through a named crossing.
+Takes: `Topology`. Gives: `FlatSystem`.
+Guarantees: peers of one structure share one `FlatPeerType`, whatever their numbers and their count; every
+name is whole (`contact.a.x`); potentials that meet are equal, flows that meet sum to zero; options are
+decided; a value crosses between what is continuous, clocks and peers only through a named crossing.
 Does not: put a number in the place of a parameter, or find out what belongs to which clock (see `clocks`).
 """
 
@@ -18,16 +18,16 @@ from apc.compiler.compiled import count_of
 from apc.compiler.components.component import (
     OTHERS,
     Component,
+    ComponentVariable,
     Named,
     Option,
     Reference,
-    Send,
-    Variable,
+    SentValue,
     option_test,
 )
 from apc.compiler.components.component_check import TRUE, ComponentNames
 from apc.compiler.equations.connections import ZERO, connection_equations
-from apc.compiler.errors import Mistakes, Place, place_in
+from apc.compiler.errors import Mistakes, SourceLocation, place_in
 from apc.compiler.language.dimensions import Dimension
 from apc.compiler.language.expression import (
     INTERVAL,
@@ -37,16 +37,16 @@ from apc.compiler.language.expression import (
     Equation,
     Expr,
     Name,
-    Number,
+    NumberLiteral,
     format_expression,
     names,
     transform,
     walk,
 )
-from apc.compiler.language.values import Value
+from apc.compiler.language.values import ScalarValue
 from apc.compiler.scene.groups import SceneGroup
-from apc.compiler.scene.instances import Part
-from apc.compiler.scene.scene import Scene
+from apc.compiler.scene.instances import PartInstance
+from apc.compiler.scene.scene import Topology
 
 HEARD_AGE = f"{OTHERS}.age"  # in what a reduction runs over; no send has this name, as a part's stands before
 CONNECTION = "connection"  # where an equation comes from that is no part's
@@ -62,7 +62,7 @@ class FlatVariable:
 
     name: str
     dimension: Dimension
-    declared: Variable | None = None
+    declared: ComponentVariable | None = None
 
     @property
     def start(self) -> bool:
@@ -86,7 +86,7 @@ class FlatEquation:
     right: Expr
     origin: str
     clock: str | None
-    place: Place
+    place: SourceLocation
     written: Equation | None = None
 
     @property
@@ -103,7 +103,7 @@ class FlatSend:
     link: str
     expression: Expr
     dimension: Dimension
-    place: Place
+    place: SourceLocation
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +126,7 @@ class HoldCrossing:
     variable: str
     delay: Expr
     shown: str
-    place: Place
+    place: SourceLocation
     clock: str = ""
 
 
@@ -136,7 +136,7 @@ class PreviousCrossing:
 
     symbol: str
     variable: str
-    place: Place
+    place: SourceLocation
     clock: str = ""
 
 
@@ -152,7 +152,7 @@ class ReceiveCrossing:
     operator: str
     argument: Expr
     link: str
-    place: Place
+    place: SourceLocation
     clock: str = ""
 
 
@@ -160,7 +160,7 @@ Crossing = SampleCrossing | HoldCrossing | PreviousCrossing | ReceiveCrossing
 
 
 @dataclass(frozen=True, slots=True)
-class FlatKind:
+class FlatPeerType:
     """The equations of all peers of one structure.
 
     `delays` are computational delays that its only group sets for itself: (whole name, value).
@@ -168,8 +168,8 @@ class FlatKind:
 
     name: str
     groups: tuple[str, ...]
-    delays: Named[Value]
-    parts: tuple[Part, ...]
+    delays: Named[ScalarValue]
+    parts: tuple[PartInstance, ...]
     variables: tuple[FlatVariable, ...]
     equations: tuple[FlatEquation, ...]
     crossings: tuple[Crossing, ...]
@@ -180,11 +180,11 @@ class FlatKind:
 class FlatSystem:
     """The scene as equations; every group of peers belongs to one kind."""
 
-    scene: Scene
-    kinds: tuple[FlatKind, ...]
+    scene: Topology
+    kinds: tuple[FlatPeerType, ...]
 
 
-def flatten(scene: Scene, *, linear: bool = False) -> FlatSystem:
+def flatten(scene: Topology, *, linear: bool = False) -> FlatSystem:
     """Write out the equations of every kind; `linear` those of a linear analysis.
 
     Raises ApcError with every mistake found on the way.
@@ -204,7 +204,7 @@ def flatten(scene: Scene, *, linear: bool = False) -> FlatSystem:
         kind = replace(kind, equations=(*kind.equations, *equations))
         delays = _delay_names(kind)
         # The schedule is a kind's: a group that sets a delay can have it changed without the others'.
-        sharing: dict[str, tuple[list[str], Named[Value]]] = {}
+        sharing: dict[str, tuple[list[str], Named[ScalarValue]]] = {}
         for group in groups:
             for name in delays.intersection(name for name, _ in group.columns):
                 what = f"{name} can't differ from peer to peer within a group"
@@ -217,7 +217,7 @@ def flatten(scene: Scene, *, linear: bool = False) -> FlatSystem:
     return FlatSystem(scene, tuple(kinds))
 
 
-def _delay_names(kind: FlatKind) -> set[str]:
+def _delay_names(kind: FlatPeerType) -> set[str]:
     """Return the numbers of parts that a hold's delay is or depends on: of the schedule, not of equations."""
     delays = [crossing.delay for crossing in kind.crossings if isinstance(crossing, HoldCrossing)]
     texts = {format_expression(name) for delay in delays for name in names(delay)}
@@ -228,18 +228,18 @@ def _delay_names(kind: FlatKind) -> set[str]:
     return texts
 
 
-def flatten_alone(component: Component, place: Place, mistakes: Mistakes) -> FlatKind:
+def flatten_alone(component: Component, place: SourceLocation, mistakes: Mistakes) -> FlatPeerType:
     """Write out a component by itself: a clock or link has the name it has there, an option its first word.
 
     What parts inside give is not written.
     """
     options = tuple((p.name, p.words[0]) for p in component.parameters if isinstance(p, Option))
     references = tuple((p.name, p.name) for p in component.parameters if isinstance(p, Reference))
-    part = Part(component.name, "", component, (), options, references, (), (), (), False, (), place)
+    part = PartInstance(component.name, "", component, (), options, references, (), (), (), False, (), place)
     return _flat_kind(component.name, [part], mistakes)
 
 
-def _with_words(part: Part, words: Mapping[str, str]) -> Part:
+def _with_words(part: PartInstance, words: Mapping[str, str]) -> PartInstance:
     """Return a part with the options, clocks and links that a group of peers sets for itself."""
 
     def own(named: Named[str]) -> Named[str]:
@@ -248,7 +248,9 @@ def _with_words(part: Part, words: Mapping[str, str]) -> Part:
     return replace(part, options=own(part.options), references=own(part.references))
 
 
-def _flat_kind(name: str, parts: Sequence[Part], mistakes: Mistakes, *, linear: bool = False) -> FlatKind:
+def _flat_kind(
+    name: str, parts: Sequence[PartInstance], mistakes: Mistakes, *, linear: bool = False
+) -> FlatPeerType:
     """Write out parts, without their connections."""
     variables: list[FlatVariable] = []
     equations: list[FlatEquation] = []
@@ -256,7 +258,7 @@ def _flat_kind(name: str, parts: Sequence[Part], mistakes: Mistakes, *, linear: 
     crossings: dict[str, Crossing] = {}
     for part in parts:
         writer, component = _PartWriter(part, crossings, mistakes), part.component
-        own: list[tuple[str, Dimension, Variable | None]] = [
+        own: list[tuple[str, Dimension, ComponentVariable | None]] = [
             *((variable.name, variable.unit.dimension, variable) for variable in component.variables),
             *((local, dimension, None) for local, dimension in component.locals),
             *(
@@ -281,7 +283,7 @@ def _flat_kind(name: str, parts: Sequence[Part], mistakes: Mistakes, *, linear: 
         variables += [variable for variable, _ in writer.held]
         equations += [equation for _, equation in writer.held]
     unknowns, listed = tuple(variables), tuple(crossings.values())
-    return FlatKind(name, (), (), tuple(parts), unknowns, tuple(equations), listed, tuple(sends))
+    return FlatPeerType(name, (), (), tuple(parts), unknowns, tuple(equations), listed, tuple(sends))
 
 
 def _unsampled(node: Expr) -> Expr | None:
@@ -300,16 +302,16 @@ class _PartWriter:
     An expression that is held gets a variable and an equation of its own; `where` is what is being written.
     """
 
-    def __init__(self, part: Part, crossings: dict[str, Crossing], mistakes: Mistakes) -> None:
+    def __init__(self, part: PartInstance, crossings: dict[str, Crossing], mistakes: Mistakes) -> None:
         self.part, self.crossings, self.mistakes = part, crossings, mistakes
         self.clock, self.link = part.reference("clock"), part.reference("link")
         self.references = dict(part.references)
         self.passed = {connector: inner for connector, *inner in part.component.passed}
         self.names = ComponentNames(part.component)
         self.held: list[tuple[FlatVariable, FlatEquation]] = []
-        self.where: Equation | Send
+        self.where: Equation | SentValue
 
-    def written(self, expression: Expr, where: Equation | Send) -> Expr:
+    def written(self, expression: Expr, where: Equation | SentValue) -> Expr:
         """Return an expression of a part's equation, or of what it sends, in whole names."""
         self.where = where
         return self._whole(expression)
@@ -468,6 +470,6 @@ class _PartWriter:
         declared, whole = component.parameter(head), Name((*part, head))
         words = {word: value for number in component.numbers for word, value in number.words}
         if head in words and declared is None:
-            return Number(words[head])
+            return NumberLiteral(words[head])
         divided = self.part.shared and getattr(declared, "divided", False)
         return Call("/", (whole, Name(("peers",)))) if divided else whole

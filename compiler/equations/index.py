@@ -22,7 +22,7 @@ from collections.abc import Iterable, Mapping, Sequence, Set
 import sympy
 
 from apc.compiler.equations.blocks import balanced
-from apc.compiler.equations.derivatives import TIME, Derivative, Moving
+from apc.compiler.equations.derivatives import TIME, Derivative, DifferentiatedNames
 from apc.compiler.equations.elimination import Elimination
 from apc.compiler.equations.matching import match
 from apc.compiler.equations.solution import Problem, Residual
@@ -68,7 +68,11 @@ class IndexReduction:
     """
 
     def __init__(
-        self, residuals: Iterable[Residual], orders: Mapping[str, int], moving: Moving, problem: Problem
+        self,
+        residuals: Iterable[Residual],
+        orders: Mapping[str, int],
+        moving: DifferentiatedNames,
+        problem: Problem,
     ) -> None:
         self.moving = moving
         self.problem = problem

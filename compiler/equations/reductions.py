@@ -1,6 +1,6 @@
 """What a peer hears of the others, linear reductions taken apart.
 
-Takes: `ReceiveCrossing`s. Gives: `Heard`, `taken_apart`.
+Takes: `ReceiveCrossing`s. Gives: `PeerReduction`, `taken_apart`.
 Guarantees: the term has the value of the reduction it was taken from.
 Does not: know how many others there are: that is a parameter of the site.
 
@@ -20,7 +20,7 @@ from apc.compiler.compiled import count_of
 from apc.compiler.components.component import OTHERS
 from apc.compiler.equations.flatten import HEARD_AGE, ReceiveCrossing
 from apc.compiler.equations.terms import ZERO, Symbol, Term, linear_form, symbol, to_term
-from apc.compiler.errors import Mistakes, Place
+from apc.compiler.errors import Mistakes, SourceLocation
 from apc.compiler.language.expression import format_expression, names
 
 AGE = symbol(HEARD_AGE)
@@ -29,7 +29,7 @@ TEXTS = {"": "others.{0}", "factor": "age(others.{0})*others.{0}", "alone": "age
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class PeerReduction:
     """`symbol` stands at a tick for the `operator` over the peers that are heard over `link`.
 
     Without an `edge` it is of what they sent as `send`, as `age` and `before` say (see `compiled.Receive`);
@@ -41,7 +41,7 @@ class Heard:
     send: str
     link: str
     clock: str
-    place: Place
+    place: SourceLocation
     age: str = ""
     before: bool = False
     edge: Term | None = None
@@ -54,7 +54,7 @@ class Heard:
         return list(dict.fromkeys([self.send, *others]))
 
 
-def taken_apart(crossing: ReceiveCrossing, mistakes: Mistakes) -> tuple[Term, list[Heard]]:
+def taken_apart(crossing: ReceiveCrossing, mistakes: Mistakes) -> tuple[Term, list[PeerReduction]]:
     """Return a reduction as a term, and what it holds that is heard; an edge where it is not linear.
 
     Parameters
@@ -77,7 +77,7 @@ def taken_apart(crossing: ReceiveCrossing, mistakes: Mistakes) -> tuple[Term, li
                 values[symbol(name)] = send, call == "previous"
     term = to_term(crossing.argument).xreplace(dict.fromkeys(ages, AGE))
     first = next(iter((*ages.values(), *(send for send, _ in values.values()))), "")
-    whole = Heard(crossing.symbol, operator, first, link, crossing.clock, crossing.place)
+    whole = PeerReduction(crossing.symbol, operator, first, link, crossing.clock, crossing.place)
     parts = _linear_parts(term, values.keys()) if operator in ("mean", "sum") else None
     if parts is None or any(aged and value in values and values[value][1] for value, aged in parts):
         for earlier in (send for send, before in values.values() if before):
@@ -89,7 +89,7 @@ def taken_apart(crossing: ReceiveCrossing, mistakes: Mistakes) -> tuple[Term, li
         if operator == "sum" and whole.age and values.keys().isdisjoint(term.free_symbols):
             whole = replace(whole, symbol=f"mean{whole.symbol.removeprefix(operator)}", operator="mean")
         return symbol(whole.symbol) * (1 if whole.operator == operator else count), [whole]
-    total, heard = ZERO, list[Heard]()
+    total, heard = ZERO, list[PeerReduction]()
     for (value, aged), coefficient in parts.items():
         send, before = values.get(value, (first, False))
         many = count if operator == "sum" and value is None else 1

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from apc.compiler.equations.flatten import FlatEquation
 from apc.compiler.equations.terms import NoDerivativeError, Symbol, Term, symbol
 from apc.compiler.equations.zero_test import Divisors
-from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
+from apc.compiler.errors import ApcError, Diagnostic, Mistakes, SourceLocation
 
 Assignment = tuple[str, Term]  # an unknown, and the expression that gives it
 MOST_LISTED = 8  # equations or unknowns in one message
@@ -41,14 +41,14 @@ class Problem:
     """
 
     where: str
-    place: Place
+    place: SourceLocation
     divisors: Divisors
     mistakes: Mistakes
 
     def fault(self, code: str, residuals: Sequence[Residual], what: str, hint: str = "") -> ApcError:
         """Return a mistake where the first of some equations stands."""
         place = residuals[0].equation.place if residuals else self.place
-        return ApcError(Mistake(code, place, what, hint=hint))
+        return ApcError(Diagnostic(code, place, what, hint=hint))
 
     def no_number(self, residuals: Sequence[Residual]) -> ApcError:
         """Return the mistake E512: equations in which a constant is none, maybe after others are put in."""

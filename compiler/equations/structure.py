@@ -19,11 +19,11 @@ from operator import itemgetter
 
 from apc.compiler.equations.aliases import Aliases
 from apc.compiler.equations.blocks import solve_blocks
-from apc.compiler.equations.clocks import CONTINUOUS, ClockedKind, ClockedSystem, Partition
-from apc.compiler.equations.derivatives import Moving
+from apc.compiler.equations.clocks import CONTINUOUS, ClockedPeerType, ClockedSystem, Partition
+from apc.compiler.equations.derivatives import DifferentiatedNames
 from apc.compiler.equations.flatten import FlatEquation
 from apc.compiler.equations.index import IndexReduction
-from apc.compiler.equations.reductions import Heard, taken_apart
+from apc.compiler.equations.reductions import PeerReduction, taken_apart
 from apc.compiler.equations.solution import Assignment, Definition, ImplicitBlock, Problem, Residual, Step
 from apc.compiler.equations.terms import (
     ZERO,
@@ -36,11 +36,11 @@ from apc.compiler.equations.terms import (
     to_term,
 )
 from apc.compiler.equations.zero_test import Divisors, Given
-from apc.compiler.errors import Mistakes, Place
+from apc.compiler.errors import Mistakes, SourceLocation
 from apc.compiler.language.expression import Name, format_expression, names
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.values import AlreadyReportedError
-from apc.compiler.scene.scene import Scene
+from apc.compiler.scene.scene import Topology
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,15 +65,15 @@ class SortedSend:
 
 
 @dataclass(frozen=True, slots=True)
-class SortedKind:
+class SortedPeerType:
     """A kind of peer as explicit equations. `aliases` are unknowns that equal ± another, or zero."""
 
-    clocked: ClockedKind
+    clocked: ClockedPeerType
     states: tuple[str, ...]
     aliases: tuple[Assignment, ...]
     partitions: tuple[SortedPartition, ...]
     samples: tuple[Assignment, ...]
-    receives: tuple[Heard, ...]
+    receives: tuple[PeerReduction, ...]
     sends: tuple[SortedSend, ...]
 
     @property
@@ -89,8 +89,8 @@ class SortedKind:
 class SortedSystem:
     """The scene as explicit equations."""
 
-    scene: Scene
-    kinds: tuple[SortedKind, ...]
+    scene: Topology
+    kinds: tuple[SortedPeerType, ...]
 
 
 def sort(clocked: ClockedSystem) -> SortedSystem:
@@ -111,7 +111,7 @@ def sort(clocked: ClockedSystem) -> SortedSystem:
     return SortedSystem(scene, tuple(kinds))
 
 
-def _numbers(scene: Scene, kind: ClockedKind) -> list[dict[Symbol, Given]]:
+def _numbers(scene: Topology, kind: ClockedPeerType) -> list[dict[Symbol, Given]]:
     """Return the numbers of each group of a kind, those that differ from peer to peer as they do."""
     common = {f"{part.name}.{name}": value for part in scene.parts for name, value in part.values}
     result = []
@@ -128,16 +128,17 @@ def _numbers(scene: Scene, kind: ClockedKind) -> list[dict[Symbol, Given]]:
     return result
 
 
-def _sorted(kind: ClockedKind, divisors: Divisors, mistakes: Mistakes) -> SortedKind:
+def _sorted(kind: ClockedPeerType, divisors: Divisors, mistakes: Mistakes) -> SortedPeerType:
     """Sort and solve a kind. Raises ApcError with what stands in the way of the continuous equations."""
 
     def problem(where: str, part: Partition) -> Problem:
         place = next(
-            (equation.place for equation in (*part.equations, *kind.flat.equations)), Place("topology")
+            (equation.place for equation in (*part.equations, *kind.flat.equations)),
+            SourceLocation("topology"),
         )
         return Problem(where, place, divisors, mistakes)
 
-    heard: dict[str, Heard] = {}
+    heard: dict[str, PeerReduction] = {}
     reductions: dict[Symbol, Term] = {}
     for crossing in kind.receives:
         reductions[symbol(crossing.symbol)], parts = taken_apart(crossing, mistakes)
@@ -158,7 +159,7 @@ def _sorted(kind: ClockedKind, divisors: Divisors, mistakes: Mistakes) -> Sorted
     )
     samples = zip((sample.symbol for sample in kind.samples), read, strict=False)
     sends = zip(kind.flat.sends, read[len(kind.samples) :], strict=True)
-    return SortedKind(
+    return SortedPeerType(
         kind,
         states,
         aliases,
@@ -173,12 +174,12 @@ def _sorted(kind: ClockedKind, divisors: Divisors, mistakes: Mistakes) -> Sorted
 
 
 def _sorted_continuous(
-    kind: ClockedKind, problem: Problem
+    kind: ClockedPeerType, problem: Problem
 ) -> tuple[tuple[str, ...], tuple[Assignment, ...], tuple[Step, ...], list[Term]]:
     """Return states, aliases, steps, and what is sampled and sent. Raises ApcError where there is no way."""
     variables, equations = kind.partitions[0].variables, kind.partitions[0].equations
     started = {variable.name for variable in kind.flat.variables if variable.start}
-    moving = Moving(dict.fromkeys(variables), {hold.symbol for hold in kind.holds})
+    moving = DifferentiatedNames(dict.fromkeys(variables), {hold.symbol for hold in kind.holds})
     # What is read, each as an equation of its own, `sample(x) = x`, for messages.
     where = problem.place
     reads = [FlatEquation(Name((s.symbol,)), s.expression, s.clock, s.clock, where) for s in kind.samples]

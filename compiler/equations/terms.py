@@ -23,14 +23,14 @@ from typing import Any, TypeAlias
 
 import sympy
 
-from apc.compiler.language.evaluation import FaultError, constant_value
+from apc.compiler.language.evaluation import EvaluationError, constant_value
 from apc.compiler.language.expression import (
     CONDITIONS,
     SMOOTH,
     Call,
     Expr,
     Name,
-    Number,
+    NumberLiteral,
     fold,
     format_expression,
     transform,
@@ -53,17 +53,17 @@ class NoDerivativeError(Exception):
     """A value was to be differentiated that has no derivative, because it jumps or bends: which, and why."""
 
 
-class Choice(sympy.Function):  # type: ignore[misc]  # SymPy has no types
+class PiecewiseFunction(sympy.Function):  # type: ignore[misc]  # SymPy has no types
     """A function with corners or jumps, abstract."""
 
     is_extended_real = True
 
 
-class Condition(Choice):
+class Condition(PiecewiseFunction):
     """A comparison, or conditions joined, abstract: it has a value, and no slope."""
 
 
-class If(Choice):
+class If(PiecewiseFunction):
     """One of two values by a condition; where it has a corner, its slope is that of the branch taken."""
 
     @classmethod
@@ -76,7 +76,7 @@ class If(Choice):
         return self.between(condition, then.diff(by), otherwise.diff(by))
 
 
-class Abs(Choice):
+class Abs(PiecewiseFunction):
     """The absolute value; SymPy's has no slope of what it doesn't know to be real, such as x/y."""
 
     @classmethod
@@ -94,7 +94,7 @@ class Abs(Choice):
         return sympy.sign(self.args[0]) * self.args[0].diff(by)
 
 
-class Max(Choice):
+class Max(PiecewiseFunction):
     """The largest of its arguments."""
 
     stays = ">="  # what the best so far is to the next
@@ -113,7 +113,7 @@ class Min(Max):
     stays = "<="
 
 
-class Interpolate(Choice):
+class Interpolate(PiecewiseFunction):
     """The value of a table at a time, linear between its rows."""
 
     def _eval_derivative(self, by: Symbol) -> Term:
@@ -187,7 +187,7 @@ def size(term: Term) -> int:
 def to_term(expression: Expr, differentiate: Callable[[Term], Term] | None = None) -> Term:
     """Build the term; `differentiate` gives the time derivative of one, where `der` can occur."""
 
-    def leaf(node: Name | Number) -> Term:
+    def leaf(node: Name | NumberLiteral) -> Term:
         if isinstance(node, Name):
             return symbol(".".join(node.parts))
         return sympy.Rational(node.value.numerator, node.value.denominator)
@@ -219,9 +219,11 @@ def _short_constant(node: Expr) -> Expr | None:
         return None
     try:
         value = constant_value(node)
-    except FaultError:
-        return Call("/", (Number(Fraction(1)), Number(Fraction(0))))
-    return Number(Fraction(value)) if isinstance(value, float) or (chosen and value is not None) else None
+    except EvaluationError:
+        return Call("/", (NumberLiteral(Fraction(1)), NumberLiteral(Fraction(0))))
+    return (
+        NumberLiteral(Fraction(value)) if isinstance(value, float) or (chosen and value is not None) else None
+    )
 
 
 def _is_wide(operands: Sequence[Term]) -> bool:
@@ -300,7 +302,7 @@ def _written(term: Term) -> Expr:
     if term.is_Symbol:
         return Name((term.name,))
     if term.is_Rational:
-        return Number(Fraction(term.p, term.q))
+        return NumberLiteral(Fraction(term.p, term.q))
     if term.is_Add:
         first, *others = sorted(term.args, key=_is_negative)
         total = _written(first)

@@ -20,7 +20,7 @@ import numpy as np
 import sympy
 from numpy.typing import NDArray
 
-from apc.compiler.equations.terms import NAMES, Abs, Choice, Symbol, Term, in_order, size
+from apc.compiler.equations.terms import NAMES, Abs, PiecewiseFunction, Symbol, Term, in_order, size
 from apc.compiler.plain import ROUNDED
 
 # A number of the scene: one for all peers, one a peer (count,), or an expression over other numbers.
@@ -159,7 +159,7 @@ def _is_identity(expression: Term) -> bool:
         return any(map(_is_identity, expression.args))
     if expression.is_Pow:
         return bool(expression.exp.is_positive) and _is_identity(expression.base)
-    if size(expression) > MOST or expression.has(Choice):
+    if size(expression) > MOST or expression.has(PiecewiseFunction):
         return bool(expression == 0)
     chance = random.Random(0)
     point = {s: sympy.Rational(chance.randrange(1, 999), 499) for s in in_order(expression.free_symbols)}

@@ -1,6 +1,6 @@
 """Terms written as CasADi's, each definition once.
 
-Takes: `SortedKind`. Gives: `Writer`.
+Takes: `SortedPeerType`. Gives: `CasadiWriter`.
 Guarantees: written in the order in which things depend on one another, and nothing that isn't needed; a chain
 of definitions may be as long as it likes; what a nonlinear loop finds is a symbol, and a function that needs
 it solves the loop by Newton's iteration first.
@@ -20,19 +20,19 @@ from sympy import Mul, tan
 
 from apc.compiler.components.component import OTHERS
 from apc.compiler.equations.flatten import HoldCrossing, PreviousCrossing
-from apc.compiler.equations.reductions import Heard
+from apc.compiler.equations.reductions import PeerReduction
 from apc.compiler.equations.solution import Definition, ImplicitBlock
-from apc.compiler.equations.structure import SortedKind
+from apc.compiler.equations.structure import SortedPeerType
 from apc.compiler.equations.terms import HALF, NAMES, ONE, Symbol, Term, in_order, symbol
 from apc.compiler.interpolation import Interpolation, function_of
 from apc.compiler.language.expression import SMOOTH
-from apc.compiler.plain import Loop, composed
+from apc.compiler.plain import AlgebraicLoop, composed
 
 MOST_FACTORS = 100  # of a power that is written as a product
 # Functions that are infinite or no number somewhere, or whose slopes are; and where none of them is.
 _SOMEWHERE_NONE = ("exp", "log", "tan", "asin", "acos", "sinh", "cosh", "atan2")
 HARMLESS = 0.5
-Crossing = TypeVar("Crossing", HoldCrossing, PreviousCrossing, Heard)
+Crossing = TypeVar("Crossing", HoldCrossing, PreviousCrossing, PeerReduction)
 _CASADI: dict[str, Callable[..., Any]] = {
     "+": operator.add,
     "min": casadi.fmin,
@@ -53,14 +53,14 @@ _CASADI: dict[str, Callable[..., Any]] = {
 }
 
 
-class Writer:
+class CasadiWriter:
     """Translates terms of a kind to CasADi's SX, each definition once.
 
     `known` are the symbols written so far: what has no definition is a symbol of its own there, which crosses
     into the site, or is one of the `parameters`, the numbers and start values that were needed.
     """
 
-    def __init__(self, kind: SortedKind) -> None:
+    def __init__(self, kind: SortedPeerType) -> None:
         flat = kind.clocked.flat
         self.kind = kind
         self.definitions = kind.definitions
@@ -120,7 +120,7 @@ class Writer:
         for z, begin, residual in needed:
             q = casadi.vertcat(*(s for s in casadi.symvar(residual) if not casadi.depends_on(s, z)))
             given = casadi.Function("given", [*columns, *solved], [begin, q])
-            loops.append(Loop(given, casadi.Function("residual", [z, q], [residual])))
+            loops.append(AlgebraicLoop(given, casadi.Function("residual", [z, q], [residual])))
             solved.append(z)
         more = [f"z{place}" for place in range(len(solved))]
         result = casadi.Function("result", [*columns, *solved], [value], [*words, *more], [output])

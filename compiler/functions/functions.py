@@ -1,6 +1,6 @@
 """Explicit equations to CasADi functions, and the exchange between sites as structure.
 
-Takes: `SortedSystem`. Gives: `CompiledSystem`.
+Takes: `SortedSystem`. Gives: `Model`.
 Guarantees: a kind's functions hold only what its states, its samples and what it sends depend on; what the
 scene named but nothing reads is listed in `dropped`. One is an SX function, unless it needs a nonlinear loop:
 then it is an MX function that calls SX functions, with a Newton solver for each loop between them.
@@ -19,11 +19,11 @@ from apc.compiler.cache import Origin
 from apc.compiler.compiled import (
     Axis,
     ClockPartition,
-    CompiledSystem,
+    ForcePorts,
     Hold,
-    Kind,
     Limit,
-    Ports,
+    Model,
+    PeerType,
     Receive,
     Replaced,
     SendPartition,
@@ -33,12 +33,12 @@ from apc.compiler.components.component import OTHERS
 from apc.compiler.components.parts import GROUND
 from apc.compiler.equations.derivatives import TIME
 from apc.compiler.equations.flatten import HEARD_AGE, FlatVariable, HoldCrossing, PreviousCrossing
-from apc.compiler.equations.reductions import Heard
+from apc.compiler.equations.reductions import PeerReduction
 from apc.compiler.equations.solution import Definition, ImplicitBlock
-from apc.compiler.equations.structure import SortedKind, SortedSystem
+from apc.compiler.equations.structure import SortedPeerType, SortedSystem
 from apc.compiler.equations.terms import Symbol, symbol
-from apc.compiler.errors import ApcError, Mistake
-from apc.compiler.functions.casadi_writer import Writer
+from apc.compiler.errors import ApcError, Diagnostic
+from apc.compiler.functions.casadi_writer import CasadiWriter
 from apc.compiler.functions.scene_data import (
     Timings,
     all_parameters,
@@ -53,15 +53,13 @@ from apc.compiler.language.dimensions import Dimension
 from apc.compiler.language.expression import format_expression, names
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.vectors import whole_and_index
-from apc.compiler.scene.instances import Part
+from apc.compiler.scene.instances import PartInstance
 from apc.compiler.scene.oddities import warning_texts
 
 WORK = Dimension((("kg", 1), ("m", 2), ("s", -2)))  # the joule
 
 
-def build_functions(
-    system: SortedSystem, origin: Origin, *, linear: SortedSystem | None = None
-) -> CompiledSystem:
+def build_functions(system: SortedSystem, origin: Origin, *, linear: SortedSystem | None = None) -> Model:
     """Write every kind as CasADi functions, and the network between the peers as data.
 
     Parameters
@@ -108,7 +106,7 @@ def build_functions(
     dropped += [(clock.name, "nothing ticks with it") for clock in scene.clocks if clock.name not in used]
     parameters = all_parameters(scene, kinds, links)
     groups = compiled_groups(scene, kinds, places, links, timings)
-    return CompiledSystem(
+    return Model(
         scene.name,
         scene.about,
         clocks,
@@ -132,9 +130,9 @@ def build_functions(
     )
 
 
-def _followed(system: SortedSystem) -> tuple[list[Writer], list[str]]:
+def _followed(system: SortedSystem) -> tuple[list[CasadiWriter], list[str]]:
     """Return a writer of each kind, with all that is needed written, and the names that are received."""
-    writers = [Writer(kind) for kind in system.kinds]
+    writers = [CasadiWriter(kind) for kind in system.kinds]
     before, received = -1, list[str]()
     while before < (before := sum(len(writer.known) for writer in writers)):  # until nothing new is read
         for writer in writers:
@@ -144,7 +142,7 @@ def _followed(system: SortedSystem) -> tuple[list[Writer], list[str]]:
     return writers, received
 
 
-def _replaced(kind: SortedKind) -> Iterable[Replaced]:
+def _replaced(kind: SortedPeerType) -> Iterable[Replaced]:
     """Yield the parts of a kind that other equations represent in a linear analysis."""
     for part in kind.clocked.flat.parts:
         if (linearized := part.component.linearized) is not None:
@@ -155,7 +153,7 @@ def _replaced(kind: SortedKind) -> Iterable[Replaced]:
             yield Replaced(part.name, tuple(texts), linearized.valid)
 
 
-def _symbols(kind: SortedKind) -> tuple[tuple[str, str], ...]:
+def _symbols(kind: SortedPeerType) -> tuple[tuple[str, str], ...]:
     """Return the symbols of published conditions by full parameter name, none unless every part has some."""
     result = []
     for part in kind.clocked.flat.parts:
@@ -171,7 +169,7 @@ def _symbols(kind: SortedKind) -> tuple[tuple[str, str], ...]:
     return tuple(result)
 
 
-def _check_states(kind: SortedKind, full: Kind, linear: Kind) -> None:
+def _check_states(kind: SortedPeerType, full: PeerType, linear: PeerType) -> None:
     """Refuse equations of a linear analysis that have other states, held or sent values."""
     for nonlinear, own in (
         ([state.name for state in full.states], [state.name for state in linear.states]),
@@ -186,10 +184,10 @@ def _check_states(kind: SortedKind, full: Kind, linear: Kind) -> None:
             names = ", ".join(sorted(set(nonlinear) ^ set(own)))
             what = f"linearized of {part.component.name}: {names} would be in one set of equations only"
             hint = "equations that keep the same states, held and sent values"
-            raise ApcError(Mistake("E514", part.component.place, what, hint=hint))
+            raise ApcError(Diagnostic("E514", part.component.place, what, hint=hint))
 
 
-def _kind(writer: Writer, heard: Iterable[str], timings: Timings) -> Kind:
+def _kind(writer: CasadiWriter, heard: Iterable[str], timings: Timings) -> PeerType:
     """Write a kind's functions; `heard` are the names of the sends that any kind hears."""
     kind, flat = writer.kind, writer.kind.clocked.flat
     holds, previous = writer.read(kind.clocked.holds), writer.read(kind.clocked.previous)
@@ -212,7 +210,7 @@ def _kind(writer: Writer, heard: Iterable[str], timings: Timings) -> Kind:
     def function(name: str, output: str, value: Any, between: Mapping[str, Any]) -> Any:
         return writer.function(name, {**around[0], **between, **around[1]}, output, value)
 
-    def edge(heard: Heard, m: Any, r: Any) -> Any | None:
+    def edge(heard: PeerReduction, m: Any, r: Any) -> Any | None:
         """Write what a reduction runs over, for one peer that hears and one that is heard, if anything."""
         if heard.edge is None:
             return None
@@ -222,7 +220,7 @@ def _kind(writer: Writer, heard: Iterable[str], timings: Timings) -> Kind:
         if casadi.depends_on(value, r):
             what = f"{heard.symbol} asks of each other peer what depends on all that are heard"
             expected = "a mean or sum that is linear in what the others send"
-            raise ApcError(Mistake("E506", heard.place, what, expected))
+            raise ApcError(Diagnostic("E506", heard.place, what, expected))
         return function("edge", "value", value, {"m": m, "s": sent})
 
     def clock(name: str, computed: Sequence[str]) -> ClockPartition:
@@ -258,7 +256,7 @@ def _kind(writer: Writer, heard: Iterable[str], timings: Timings) -> Kind:
             assert variable.declared is not None
             what = f"{name} has a limit and is computed at ticks; a limit is of what holds at every moment"
             hint = f"acting = hold({whole_and_index(own)[0]}), with the limit of acting"
-            raise ApcError(Mistake("E513", variable.declared.place, what, hint=hint))
+            raise ApcError(Diagnostic("E513", variable.declared.place, what, hint=hint))
         value = None if name in kind.states else function("limited", "value", writer.column([name]), {})
         return Limit(name, units[name], f"{part}.{variable.limit}", value)
 
@@ -268,7 +266,7 @@ def _kind(writer: Writer, heard: Iterable[str], timings: Timings) -> Kind:
     ports = [port for port in _held_ports(kind) if port[3] <= writer.known.keys()]
     acting = writer.column([*(port[1] for port in ports), *(port[2] for port in ports)])
     port = function("port", "potentials_flows", acting, {})
-    return Kind(
+    return PeerType(
         flat.name,
         tuple(State(name, units[name], name) for name in kind.states),
         tuple(
@@ -284,7 +282,7 @@ def _kind(writer: Writer, heard: Iterable[str], timings: Timings) -> Kind:
         function("derivative", "dx", rates, {}),
         tuple(clock(name, list(computed)) for name, computed in outputs.items() if computed),
         tuple(send(link, channel) for link, channel in channels.items()),
-        Ports(tuple(part for part, *_ in ports), port) if ports else None,
+        ForcePorts(tuple(part for part, *_ in ports), port) if ports else None,
         hands=tuple(part.name for part in hands if "." not in part.name and _answers(part)),
         limits=tuple(limit(variable) for variable in flat.variables if variable.limit),
         held=tuple(
@@ -294,7 +292,7 @@ def _kind(writer: Writer, heard: Iterable[str], timings: Timings) -> Kind:
     )
 
 
-def _held_ports(kind: SortedKind) -> Iterable[tuple[str, str, str, set[Symbol]]]:
+def _held_ports(kind: SortedPeerType) -> Iterable[tuple[str, str, str, set[Symbol]]]:
     """Yield (part, potential, flow into it, what these follow from) where a part's own hold gives the flow.
 
     The work a part does at a port over an interval in which nothing switches is, exactly, minus the flow
@@ -328,7 +326,7 @@ def _follows_from(wanted: Symbol, definitions: Mapping[Symbol, Definition]) -> s
     return ends
 
 
-def _answers(part: Part) -> bool:
+def _answers(part: PartInstance) -> bool:
     """Say whether a hand answers to how it is moved; one that only pushes changes no stability."""
     component = part.component
     moved = {

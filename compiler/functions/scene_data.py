@@ -1,6 +1,6 @@
 """The numbers of a scene by name, its groups, and who hears whom: all of a compiled model but its functions.
 
-Takes: `Scene`, and the kinds once they are written. Gives: `Timings`, parameters, groups, links, clocks.
+Takes: `Topology`, and the kinds once they are written. Gives: `Timings`, parameters, groups, links, clocks.
 Guarantees: periods, phases and delays stay exact; what depends on a name has its formula.
 Does not: write functions.
 """
@@ -19,32 +19,32 @@ from apc.compiler.compiled import (
     PEERS,
     Channel,
     Clock,
-    Column,
     Formula,
     Group,
-    Kind,
     Link,
     Loss,
     PairDelay,
     Parameter,
+    PeerColumn,
+    PeerType,
     Timing,
     count_of,
     group_count,
 )
-from apc.compiler.components.component import Number as NumberParameter
-from apc.compiler.components.component import Variable
+from apc.compiler.components.component import ComponentVariable
+from apc.compiler.components.component import NumberParameter as NumberParameter
 from apc.compiler.equations.connections import ZERO
-from apc.compiler.equations.flatten import FlatKind, HoldCrossing
-from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
+from apc.compiler.equations.flatten import FlatPeerType, HoldCrossing
+from apc.compiler.errors import ApcError, Diagnostic, Mistakes, SourceLocation
 from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND
 from apc.compiler.language.evaluation import evaluate, formula_of
 from apc.compiler.language.expression import Expr, Name, format_expression
 from apc.compiler.language.unit_text import format_dimension
-from apc.compiler.language.values import Value, renamed
+from apc.compiler.language.values import ScalarValue, renamed
 from apc.compiler.peer_counts import COUNT_ABOUT, heard_sums, with_heard
 from apc.compiler.scene.groups import SceneGroup
 from apc.compiler.scene.links import PROBABILITIES
-from apc.compiler.scene.scene import Scene
+from apc.compiler.scene.scene import Topology
 from apc.compiler.words import enumerated
 
 NO_DELAY = "no delay"
@@ -54,7 +54,7 @@ Path = tuple[str, ...]  # a name, between its dots
 class Timings:
     """The periods, phases and delays that the model refers to, each once."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Topology) -> None:
         self.scene = scene
         self._values = {f"{clock.name}.period": clock.period for clock in scene.clocks}
         self._values |= {f"{part.name}.{name}": value for part in scene.parts for name, value in part.values}
@@ -65,15 +65,15 @@ class Timings:
         """All timings in use, in the order of first use."""
         return tuple(self._found.values())
 
-    def use(self, name: str, value: Value) -> str:
+    def use(self, name: str, value: ScalarValue) -> str:
         """Register a timing and return its name."""
         self._found.setdefault(name, Timing(name, value.number, _formula(value.expression)))
         return name
 
-    def delay(self, hold: HoldCrossing, kind: FlatKind) -> str:
+    def delay(self, hold: HoldCrossing, kind: FlatPeerType) -> str:
         """Register the delay of a hold: none, a parameter of a part, or an expression over such."""
         if hold.delay == ZERO:
-            return self.use(NO_DELAY, Value(ZERO.value, SECOND, None, Place("")))
+            return self.use(NO_DELAY, ScalarValue(ZERO.value, SECOND, None, SourceLocation("")))
 
         def number(parts: Path) -> Fraction:
             return Fraction(self.scene.peers) if parts == (PEERS,) else self._found[".".join(parts)].value
@@ -81,11 +81,11 @@ class Timings:
         tree = renamed(hold.delay, lambda parts: parts if parts == (PEERS,) else self._parameter(parts, kind))
         if isinstance(tree, Name):
             return format_expression(tree)
-        value = Fraction(evaluate(tree, number, Place(self.scene.name)))
+        value = Fraction(evaluate(tree, number, SourceLocation(self.scene.name)))
         name = f"delay of {hold.variable}" + (f" at {kind.name}" if kind.delays else "")
-        return self.use(name, Value(value, SECOND, tree, hold.place))
+        return self.use(name, ScalarValue(value, SECOND, tree, hold.place))
 
-    def _parameter(self, parts: Path, kind: FlatKind) -> Path:
+    def _parameter(self, parts: Path, kind: FlatPeerType) -> Path:
         """Register a delay parameter, under the group's name if it sets its own; return its name's parts.
 
         What a group's own number depends on is its own as well, if it has one of that name.
@@ -102,7 +102,7 @@ class Timings:
         return tuple(self.use(f"{kind.groups[0]}.{name}", replace(own[name], expression=tree)).split("."))
 
 
-def used_links(scene: Scene, kinds: Sequence[Kind], timings: Timings) -> tuple[Link, ...]:
+def used_links(scene: Topology, kinds: Sequence[PeerType], timings: Timings) -> tuple[Link, ...]:
     """Return the links over which something is heard.
 
     Parameters
@@ -130,7 +130,7 @@ def used_links(scene: Scene, kinds: Sequence[Kind], timings: Timings) -> tuple[L
 
 
 def used_clocks(
-    scene: Scene, kinds: Sequence[Kind], links: Sequence[Link], timings: Timings
+    scene: Topology, kinds: Sequence[PeerType], links: Sequence[Link], timings: Timings
 ) -> tuple[Clock, ...]:
     """Return the clocks that something ticks with.
 
@@ -157,7 +157,7 @@ def used_clocks(
     )
 
 
-def check_links(scene: Scene, kinds: Sequence[Kind], places: Sequence[int]) -> None:
+def check_links(scene: Topology, kinds: Sequence[PeerType], places: Sequence[int]) -> None:
     """Refuse a link whose peers can't all hear what they ask for.
 
     Parameters
@@ -208,7 +208,7 @@ def check_links(scene: Scene, kinds: Sequence[Kind], places: Sequence[int]) -> N
     mistakes.raise_if_any()
 
 
-def _taken(kind: Kind, link: str) -> str:
+def _taken(kind: PeerType, link: str) -> str:
     """Return what a kind takes over those it hears over a link that is nothing over nobody, if anything."""
     operators = (
         receive.operator for clock in kind.clocks for receive in clock.receives if receive.link == link
@@ -217,7 +217,7 @@ def _taken(kind: Kind, link: str) -> str:
 
 
 def compiled_groups(
-    scene: Scene, kinds: Sequence[Kind], places: Sequence[int], links: Sequence[Link], timings: Timings
+    scene: Topology, kinds: Sequence[PeerType], places: Sequence[int], links: Sequence[Link], timings: Timings
 ) -> tuple[Group, ...]:
     """Return the groups, with how many peers each hears: a setting that is a timing follows that timing.
 
@@ -246,18 +246,18 @@ def compiled_groups(
             timing = f"{group.name}.{name}"
             own = replace(value, expression=Name(tuple(timing.split(".")))) if timing in exact else value
             values.append(_of_part(name, own, declared))
-        columns = tuple(Column(name, numbers) for name, numbers in group.columns)
+        columns = tuple(PeerColumn(name, numbers) for name, numbers in group.columns)
         groups.append(Group(group.name, group.count, place, tuple(values), columns))
     for link in (link for link in scene.links if link.graph.shape != "complete"):
         sending = [any(send.link == link.name for send in kind.sends) for kind in kinds]
         silent = [group.name for group in groups if not sending[group.kind]]
         if silent and any(count_of(link.name) in kind.parameters for kind in kinds):
             what = f"the graph of {link.name} joins all peers, and those of {silent[0]} send nothing over it"
-            raise ApcError(Mistake("E215", link.place, what))
+            raise ApcError(Diagnostic("E215", link.place, what))
     return with_heard(groups, kinds, links)
 
 
-def with_rounded(scene: Scene, kind: Kind, links: Sequence[Link]) -> Kind:
+def with_rounded(scene: Topology, kind: PeerType, links: Sequence[Link]) -> PeerType:
     """Return a kind that knows which counts of peers heard are rounded.
 
     Raises
@@ -272,7 +272,9 @@ def with_rounded(scene: Scene, kind: Kind, links: Sequence[Link]) -> Kind:
             values = set(heard_sums(link, scene.peers).tolist())
             if len(set(map(float, values))) < len(values):
                 what = f"what two peers hear over {link.name} adds up to sums that doubles can't tell apart"
-                raise ApcError(Mistake("E217", places[link.name], what, hint="weights of at most 15 digits"))
+                raise ApcError(
+                    Diagnostic("E217", places[link.name], what, hint="weights of at most 15 digits")
+                )
             if any(Fraction(float(value)) != value for value in values):
                 rounded.append((kind.parameters.index(count_of(link.name)), tuple(sorted(values))))
     return replace(kind, rounded=tuple(rounded))
@@ -283,7 +285,7 @@ def with_rounded(scene: Scene, kind: Kind, links: Sequence[Link]) -> Kind:
 
 def _named(
     name: str,
-    value: Value,
+    value: ScalarValue,
     about: str = "",
     minimum: Fraction | float | None = None,
     maximum: Fraction | float | None = None,
@@ -307,25 +309,29 @@ def _named(
     )
 
 
-def _declared(scene: Scene) -> dict[str, NumberParameter | Variable]:
+def _declared(scene: Topology) -> dict[str, NumberParameter | ComponentVariable]:
     """Return by whole name what declares each number and start value of the parts."""
-    result: dict[str, NumberParameter | Variable] = {}
+    result: dict[str, NumberParameter | ComponentVariable] = {}
     for part in scene.parts:
         for declared in (part.component.variables, part.component.numbers):
             result |= {f"{part.name}.{item.name}": item for item in declared}
     return result
 
 
-def _of_part(name: str, value: Value, all_declared: Mapping[str, NumberParameter | Variable]) -> Parameter:
+def _of_part(
+    name: str, value: ScalarValue, all_declared: Mapping[str, NumberParameter | ComponentVariable]
+) -> Parameter:
     """Return a number or start value of a part, with its bounds and what it is about."""
     declared = all_declared[name]
-    if isinstance(declared, Variable):
+    if isinstance(declared, ComponentVariable):
         return _named(name, value, f"start value: {declared.about}")
     least, most = declared.minimum, declared.maximum
     return _named(name, value, declared.about, least, most, open_minimum=declared.open_minimum)
 
 
-def all_parameters(scene: Scene, kinds: Sequence[Kind], links: Sequence[Link]) -> tuple[Parameter, ...]:
+def all_parameters(
+    scene: Topology, kinds: Sequence[PeerType], links: Sequence[Link]
+) -> tuple[Parameter, ...]:
     """Return every parameter of the scene: named ones, each part's, start values in use, those of links.
 
     Parameters
@@ -356,14 +362,14 @@ def all_parameters(scene: Scene, kinds: Sequence[Kind], links: Sequence[Link]) -
             parameters.append(_named(name, clock.period, about, 0, open_minimum=True))
     for group in scene.groups:
         expression = None if group.counted is None else group.counted.expression
-        count = Value(Fraction(group.count), DIMENSIONLESS, expression, group.place)
+        count = ScalarValue(Fraction(group.count), DIMENSIONLESS, expression, group.place)
         about, most = f"number of peers of group {group.name}", _most_peers(scene, group)
         parameters.append(_named(group_count(group.name), count, about, 1, most))
     parameters.append(Parameter(PEERS, "1", float(scene.peers), about="number of peers"))
     return tuple({parameter.name: parameter for parameter in parameters}.values())
 
 
-def _most_peers(scene: Scene, group: SceneGroup) -> float | None:
+def _most_peers(scene: Topology, group: SceneGroup) -> float | None:
     """Return how many peers a group can have, the others as they are, by the components that say so."""
     counts = {group.name: group.count for group in scene.groups}
     room = [

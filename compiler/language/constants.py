@@ -11,9 +11,9 @@ from __future__ import annotations
 import math
 from fractions import Fraction
 
-from apc.compiler.errors import ApcError, Mistake, Place, place_in
-from apc.compiler.language.evaluation import FaultError, constant_value
-from apc.compiler.language.expression import Call, Expr, Name, Number, children, format_expression
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, place_in
+from apc.compiler.language.evaluation import EvaluationError, constant_value
+from apc.compiler.language.expression import Call, Expr, Name, NumberLiteral, children, format_expression
 from apc.compiler.source.reading import brief
 
 # Of the integer coefficients that powers and products can make: a power of a power of a power reaches 2^10^6.
@@ -23,7 +23,7 @@ RANGE = "constants between 2.2e-308 and 1.8e308"
 POWERS = ("^", "*", "/", "exp", "sinh", "cosh")
 
 
-def check_constants(expression: Expr, text: str, place: Place) -> None:
+def check_constants(expression: Expr, text: str, place: SourceLocation) -> None:
     """Refuse constants that are too large, too small or too long.
 
     Parameters
@@ -41,17 +41,17 @@ def check_constants(expression: Expr, text: str, place: Place) -> None:
 
     def refuse(node: Expr, why: str) -> None:
         what = f"{brief(format_expression(node))} {why}"
-        raise ApcError(Mistake("E331", place_in(place, text, node.start), what, RANGE))
+        raise ApcError(Diagnostic("E331", place_in(place, text, node.start), what, RANGE))
 
     def bits(node: Expr) -> float:
         """Return a bound on the bits of the coefficients of a subexpression."""
-        if isinstance(node, Number):
+        if isinstance(node, NumberLiteral):
             return float(node.value.numerator.bit_length() + node.value.denominator.bit_length())
         if isinstance(node, Name):
             return 0.0
         inner = [bits(part) for part in children(node)]
         total = sum(inner)
-        if node.function == "^" and isinstance(exponent := node.arguments[1], Number):
+        if node.function == "^" and isinstance(exponent := node.arguments[1], NumberLiteral):
             total = inner[0] * abs(float(exponent.value)) + inner[1]
         if total > MOST_BITS:
             refuse(node, f"makes a coefficient of more than {MOST_BITS} bits")
@@ -60,13 +60,13 @@ def check_constants(expression: Expr, text: str, place: Place) -> None:
     def is_constant(node: Expr) -> bool:
         """Return whether a subexpression is constant, its range checked from the inside out."""
         if not isinstance(node, Call):
-            return isinstance(node, Number)
+            return isinstance(node, NumberLiteral)
         constant = [is_constant(part) for part in children(node)]  # each is checked
         if not all(constant):
             return False
         try:
             value = constant_value(node)
-        except FaultError as error:
+        except EvaluationError as error:
             if isinstance(error.cause, OverflowError):
                 refuse(node, "is too large for a float")
             return False  # no real value: nothing computes it

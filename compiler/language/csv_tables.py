@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.digits import plain_float
-from apc.compiler.errors import ApcError, Mistakes, Place
+from apc.compiler.errors import ApcError, Mistakes, SourceLocation
 from apc.compiler.files import RefusedError, read_file
 from apc.compiler.language.units import NO_UNIT, Unit, parse_unit
 from apc.compiler.source.reading import brief, fault
@@ -39,7 +39,7 @@ _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_.\[\]]*\Z")
 # The last bracket holds the unit; those before it, the index of an entry or of an element.
 _HEADING = re.compile(r"(?P<name>[^\[\]]*(\[[0-9]+\][^\[\]]*)*?)(\[(?P<unit>[^\[\]]*)\])?\Z")
 
-Headings = tuple[tuple[str, Unit, Place], ...]  # name, unit and where it stands
+Headings = tuple[tuple[str, Unit, SourceLocation], ...]  # name, unit and where it stands
 
 
 F = TypeVar("F")
@@ -63,13 +63,13 @@ class NamedFiles:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Column:
+class CsvColumn:
     """A column: name and unit of its heading, its numbers in SI (rows,)."""
 
     name: str
     unit: Unit
     numbers: NDArray[np.float64]
-    place: Place
+    place: SourceLocation
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ class Table:
     """A CSV file, whole. `lines` are the lines its rows stand in."""
 
     file: str
-    columns: tuple[Column, ...]
+    columns: tuple[CsvColumn, ...]
     lines: tuple[int, ...]
 
     @property
@@ -86,7 +86,7 @@ class Table:
         return len(self.columns[0].numbers) if self.columns else 0
 
 
-def read_table(path: Path, named_at: Place) -> Table:
+def read_table(path: Path, named_at: SourceLocation) -> Table:
     """Read a CSV file of numbers below headings such as `device.mass [kg]`.
 
     Parameters
@@ -108,14 +108,14 @@ def read_table(path: Path, named_at: Place) -> Table:
         )
     numbers = cells.reshape(len(lines), len(headings))
     columns = tuple(
-        Column(name, unit, numbers[:, i] * float(unit.scale), place)
+        CsvColumn(name, unit, numbers[:, i] * float(unit.scale), place)
         for i, (name, unit, place) in enumerate(headings)
     )
     return Table(opened.file, columns, lines)
 
 
 @dataclass(frozen=True, slots=True)
-class Opened:
+class CsvReader:
     """A CSV file whose headings are read, each a name, a unit and a place; `rows` are the rest."""
 
     file: str
@@ -153,7 +153,7 @@ class Opened:
         begin = self.rows.line_num + 1
         for cells in self.rows:
             # A cell in quotes may go over several lines.
-            place, begin = Place(self.file, begin, 1), self.rows.line_num + 1
+            place, begin = SourceLocation(self.file, begin, 1), self.rows.line_num + 1
             filled = len(cells) > 1 or (cells and not cells[0].isspace())
             if not (filled if empty_too else any(map(str.strip, cells))):
                 continue
@@ -175,12 +175,12 @@ class Opened:
                 break
         mistakes.raise_if_any()
         if not lines:
-            raise fault("E703", Place(self.file, 2, 1), "the table has headings but no rows")
+            raise fault("E703", SourceLocation(self.file, 2, 1), "the table has headings but no rows")
         return np.frombuffer(numbers, dtype=np.float64), tuple(lines)
 
 
 @contextmanager
-def open_table(path: Path, named_at: Place, known: Collection[str] = ()) -> Iterator[Opened]:
+def open_table(path: Path, named_at: SourceLocation, known: Collection[str] = ()) -> Iterator[CsvReader]:
     """Open a CSV file and read its headings.
 
     Parameters
@@ -202,14 +202,14 @@ def open_table(path: Path, named_at: Place, known: Collection[str] = ()) -> Iter
     first: list[str] = []
     try:
         first = next(rows, [])
-        yield Opened(file, _headings(first, file), rows)
+        yield CsvReader(file, _headings(first, file), rows)
     except csv.Error as error:
-        raise fault("E703", Place(file, rows.line_num or 1, 1), f"is no CSV: {error}") from None
+        raise fault("E703", SourceLocation(file, rows.line_num or 1, 1), f"is no CSV: {error}") from None
     except ApcError:
         if not any(map(str.strip, first)) or _is_table(first, known):
             raise
         expected = "a name and its unit in each heading"
-        raise fault("E702", Place(file, 1, 1), "a table", expected, hint=_EXAMPLE) from None
+        raise fault("E702", SourceLocation(file, 1, 1), "a table", expected, hint=_EXAMPLE) from None
 
 
 def _is_table(headings: list[str], texts: Collection[str]) -> bool:
@@ -220,7 +220,7 @@ def _is_table(headings: list[str], texts: Collection[str]) -> bool:
     )
 
 
-def read_bytes(path: Path, named_at: Place, *, any_text: bool = False) -> bytes:
+def read_bytes(path: Path, named_at: SourceLocation, *, any_text: bool = False) -> bytes:
     """Return a file's bytes, unpacked if it is called .gz.
 
     Raises
@@ -248,14 +248,14 @@ def read_bytes(path: Path, named_at: Place, *, any_text: bool = False) -> bytes:
 
 
 def _headings(texts: list[str], file: str) -> Headings:
-    place = Place(file, 1, 1)
+    place = SourceLocation(file, 1, 1)
     if not any(text.strip() for text in texts):
         raise fault("E702", place, "the table has no headings", hint=_EXAMPLE)
     if len(texts) > MOST_COLUMNS:
         what = f"the table has {len(texts)} columns, and {MOST_COLUMNS} are the most"
         raise fault("E702", place, what, hint="several groups, each with a table")
     mistakes = Mistakes()
-    result: dict[str, tuple[str, Unit, Place]] = {}
+    result: dict[str, tuple[str, Unit, SourceLocation]] = {}
     for text in texts:
         name, written = _parts(text)
         unit = NO_UNIT

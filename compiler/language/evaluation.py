@@ -2,7 +2,7 @@
 
 Takes: an `Expr` tree or a `Formula`, and the values of its names.
 Gives: `formula_of`; `evaluate`, `exact_value`; `exactly` and `computed`, by the rules of another kind of
-number; `FaultError`.
+number; `EvaluationError`.
 Guarantees: exact as long as every operation is rational; exact rationals stay below 2^4096, so that computing
 always ends soon; a value is finite. A branch that is not taken is not evaluated.
 Does not: know units, or values that change with time or with the peers.
@@ -17,14 +17,14 @@ from functools import lru_cache, reduce
 from typing import Any, NoReturn
 
 from apc.compiler.compiled import Formula
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.language.expression import (
     FUNCTIONS,
     SMOOTH,
     Call,
     Expr,
     Name,
-    Number,
+    NumberLiteral,
     children,
     fold,
     format_expression,
@@ -63,7 +63,7 @@ _OPERATIONS = {
 }
 
 
-class FaultError(Exception):
+class EvaluationError(Exception):
     """A node of an expression has no value: what is wrong with it in words, and why."""
 
     def __init__(self, node: Expr, cause: Exception) -> None:
@@ -82,7 +82,7 @@ def formula_of(expr: Expr) -> Formula:
     )
 
 
-def evaluate(expr: Expr, lookup: Lookup, place: Place) -> Value:
+def evaluate(expr: Expr, lookup: Lookup, place: SourceLocation) -> Value:
     """Return the value of an expression of parameters.
 
     Parameters
@@ -111,7 +111,7 @@ def evaluate(expr: Expr, lookup: Lookup, place: Place) -> Value:
             _fail(place, node, "E332", what)
     try:
         value: Value = _exactly(expr, lookup, EXACT.__getitem__)
-    except FaultError as fault:
+    except EvaluationError as fault:
         _fail(place, fault.node, "E331", f"{cut(format_expression(fault.node))} {fault.words}")
     return value
 
@@ -121,7 +121,7 @@ def constant_value(expr: Expr) -> Value | None:
 
     Raises
     ------
-    FaultError
+    EvaluationError
         It has no finite real value.
     """
     if any(isinstance(node, Call) and node.function not in {*_OPERATIONS, "if"} for node in walk(expr)):
@@ -148,7 +148,7 @@ def exact_value(name: str, formula: Formula, values: Sequence[Fraction]) -> Frac
         E331 it has no finite real value.
     """
     text, lookup = formula.text, _lookup(formula, values)
-    return Fraction(evaluate(_tree(text), lookup, Place(name, 1, 1, text)))
+    return Fraction(evaluate(_tree(text), lookup, SourceLocation(name, 1, 1, text)))
 
 
 def exactly(formula: Formula, values: Sequence[Any], rule: Rule) -> Any:
@@ -163,7 +163,7 @@ def exactly(formula: Formula, values: Sequence[Any], rule: Rule) -> Any:
 
     Raises
     ------
-    FaultError
+    EvaluationError
         It has none.
     """
     return _exactly(_tree(formula.text), _lookup(formula, values), rule)
@@ -181,8 +181,8 @@ def computed(formula: Formula, values: Sequence[Any], rule: Rule) -> Any:
     """
     lookup = _lookup(formula, values)
 
-    def leaf(expr: Name | Number) -> Any:
-        return float(expr.value) if isinstance(expr, Number) else lookup(expr.parts)
+    def leaf(expr: Name | NumberLiteral) -> Any:
+        return float(expr.value) if isinstance(expr, NumberLiteral) else lookup(expr.parts)
 
     def apply(word: str, *operands: Any) -> Any:
         if word != "if":
@@ -213,9 +213,9 @@ def _exactly(expr: Expr, lookup: Lookup, rule: Rule) -> Any:
         try:
             if isinstance(expr, Call):
                 return _apply(expr.function, operands, rule)
-            return _finite(expr.value if isinstance(expr, Number) else lookup(expr.parts))
+            return _finite(expr.value if isinstance(expr, NumberLiteral) else lookup(expr.parts))
         except (ArithmeticError, ValueError) as cause:
-            raise FaultError(expr, cause) from None
+            raise EvaluationError(expr, cause) from None
 
     return value(expr)
 
@@ -228,15 +228,15 @@ def _apply(word: str, operands: Sequence[Any], rule: Rule) -> Any:
     return operation(*(operands[::-1] if word in (">", ">=") else operands))
 
 
-def _fail(place: Place, node: Expr, code: str, what: str) -> NoReturn:
+def _fail(place: SourceLocation, node: Expr, code: str, what: str) -> NoReturn:
     # Without the text we can only trust a column that exists.
     fits = not place.source_line or place.column + node.start <= len(place.source_line)
-    raise ApcError(Mistake(code, place.shifted(node.start) if fits else place, what))
+    raise ApcError(Diagnostic(code, place.shifted(node.start) if fits else place, what))
 
 
 @lru_cache(maxsize=1024)
 def _tree(text: str) -> Expr:
-    return parse_expression(text, Place("a formula", 1, 1, text))
+    return parse_expression(text, SourceLocation("a formula", 1, 1, text))
 
 
 def _finite(value: Any) -> Any:

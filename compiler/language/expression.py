@@ -16,7 +16,7 @@ from decimal import Context, Decimal, Inexact
 from fractions import Fraction
 from typing import TypeVar
 
-from apc.compiler.errors import Place
+from apc.compiler.errors import SourceLocation
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,7 +28,7 @@ class Spanned:
 
 
 @dataclass(frozen=True, slots=True)
-class Number(Spanned):
+class NumberLiteral(Spanned):
     """A number without a unit, exact."""
 
     value: Fraction
@@ -45,9 +45,9 @@ class Name(Spanned):
 class Call(Spanned):
     """An operator or a function, and what it is applied to.
 
-    `function` is one of `FUNCTIONS` or an operator: `neg` of -x; ^, whose right side is a `Number`, maybe
-    negative or a fraction; `if` of a condition, a value and another, where an `elseif` is an `if` in its
-    place; `{` of the entries of a vector, of which none is left behind `vectors`.
+    `function` is one of `FUNCTIONS` or an operator: `neg` of -x; ^, whose right side is a `NumberLiteral`,
+    maybe negative or a fraction; `if` of a condition, a value and another, where an `elseif` is an `if` in
+    its place; `{` of the entries of a vector, of which none is left behind `vectors`.
     """
 
     function: str
@@ -60,7 +60,7 @@ V = TypeVar("V")
 
 PI = Fraction("3.1415926535897932384626433832795028841971693993751")  # OEIS A000796; the name `pi`
 
-Expr = Number | Name | Call
+Expr = NumberLiteral | Name | Call
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +70,7 @@ class Equation:
     left: Expr
     right: Expr
     text: str
-    place: Place
+    place: SourceLocation
 
 
 # Smooth functions of a number, as Modelica has them (Language Specification 3.6, section 3.7.3).
@@ -107,7 +107,7 @@ _FORMS = {"if": "if {} then {} else {}", "neg": "-{}", "not": "not {}"} | {
 def format_expression(expr: Expr) -> str:
     """Return the text of a tree, with no more parentheses than it needs.
 
-    A `Number` no parsed text can hold (1/3, −2) prints as the operation that gives it.
+    A `NumberLiteral` no parsed text can hold (1/3, −2) prints as the operation that gives it.
     """
     return _format(expr)[0]
 
@@ -119,7 +119,7 @@ def as_written(expr: Expr, text: str) -> str:
 
 def _format(expr: Expr) -> tuple[str, int]:
     """Return a text and how tightly it binds."""
-    if isinstance(expr, Number):
+    if isinstance(expr, NumberLiteral):
         return _format_number(expr.value)
     if isinstance(expr, Name):
         return ".".join(expr.parts), ATOM
@@ -193,7 +193,7 @@ def transform(expr: Expr, function: Callable[[Expr], Expr | None]) -> Expr:
     return expr if same else replace(expr, arguments=changed)
 
 
-def fold(expr: Expr, leaf: Callable[[Name | Number], V], apply: Callable[..., V]) -> V:
+def fold(expr: Expr, leaf: Callable[[Name | NumberLiteral], V], apply: Callable[..., V]) -> V:
     """Return what a tree comes to.
 
     Parameters

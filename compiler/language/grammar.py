@@ -23,7 +23,7 @@ from typing import Any, NoReturn
 from lark import Token
 from lark.exceptions import UnexpectedCharacters, UnexpectedToken
 
-from apc.compiler.errors import Place, nearest
+from apc.compiler.errors import SourceLocation, nearest
 from apc.compiler.language.expression import (
     CONDITIONS,
     FUNCTIONS,
@@ -33,14 +33,14 @@ from apc.compiler.language.expression import (
     Equation,
     Expr,
     Name,
-    Number,
+    NumberLiteral,
     children,
     format_expression,
     interval_of,
 )
 from apc.compiler.language.parsing import (
     TREE,
-    FaultError,
+    ParseError,
     check_size,
     exponent_of,
     kind_of,
@@ -82,7 +82,7 @@ _STRAY = {
 _OPENED = {"LPAR": "an opened (", "LBRACE": "an opened {", "THEN": "an if … then"}
 
 
-def parse_expression(text: str, place: Place) -> Expr:
+def parse_expression(text: str, place: SourceLocation) -> Expr:
     """Return the tree of an expression that is a number; a condition stands inside an `if` only.
 
     Parameters
@@ -104,18 +104,18 @@ def parse_expression(text: str, place: Place) -> Expr:
         return expr
 
 
-def parse_equation(text: str, place: Place) -> Equation:
+def parse_equation(text: str, place: SourceLocation) -> Equation:
     """Return both sides of `left = right`: as `parse_expression`, and E329 unless there is just one `=`."""
     with placing(text, place):
         left, *others = _parsed(text, "equation")
         if isinstance(left, Call) and left.function == "==" and not others:
             # The usual slip: `a == b` for `a = b`.
             hint = " = ".join(map(format_expression, left.arguments))
-            raise FaultError("E329", len(text), "an equation", "one =", "==, which compares", hint=hint)
+            raise ParseError("E329", len(text), "an equation", "one =", "==, which compares", hint=hint)
         if not others:
-            raise FaultError("E329", len(text), "an equation", "one =, as in a = b", "none")
+            raise ParseError("E329", len(text), "an equation", "one =, as in a = b", "none")
         if len(others) > 2:
-            raise FaultError("E329", others[2], "an equation", "one =", "a second one")
+            raise ParseError("E329", others[2], "an equation", "one =", "a second one")
         _check(left, text)
         _check(others[1], text)
         return Equation(left, others[1], text, place)
@@ -126,10 +126,10 @@ def _parsed(text: str, start: str) -> list[Any]:
     """Return an expression, or the sides of an equation and between them where its signs stand."""
     if len(text) > MAX_LENGTH:
         expected = f"at most {MAX_LENGTH} characters"
-        raise FaultError("E328", 0, "an expression", expected, f"{len(text)}")
+        raise ParseError("E328", 0, "an expression", expected, f"{len(text)}")
     nesting = accumulate((c in "({") - (c in ")}") for c in text)
     if (deep := next((at for at, depth in enumerate(nesting) if depth >= MAX_DEPTH), None)) is not None:
-        raise FaultError("E328", deep + 1, TOO_DEEP)
+        raise ParseError("E328", deep + 1, TOO_DEEP)
     try:
         sides: list[Any] = _grammar()(text, start)
     except UnexpectedCharacters as fault:
@@ -148,13 +148,13 @@ def _refuse_character(text: str, at: int) -> NoReturn:
     """Raise E321: what the character is, and what was probably meant."""
     character = text[at]
     if character in _UNEXPECTED:
-        raise FaultError("E321", at, f"{character} cannot stand here: {_UNEXPECTED[character]}")
+        raise ParseError("E321", at, f"{character} cannot stand here: {_UNEXPECTED[character]}")
     got = character if character.isascii() and character.isprintable() else ""
     if not got:
         name = unicodedata.name(character, "no character that has a name")
         got = f"{character if character.isprintable() else ''} (U+{ord(character):04X}, {name})".lstrip()
     expected, hint = "ASCII letters, digits and + - * / ^ ( )", _LOOKALIKES.get(character, "")
-    raise FaultError("E321", at, "an expression", expected, got, hint=hint)
+    raise ParseError("E321", at, "an expression", expected, got, hint=hint)
 
 
 def _refuse_token(text: str, fault: UnexpectedToken) -> NoReturn:
@@ -171,16 +171,16 @@ def _refuse_token(text: str, fault: UnexpectedToken) -> NoReturn:
     kinds = [kind_of(value) for value in tail]
     if "POWER" in kinds[1:] and "$END" not in fault.expected:
         start = tail[kinds.index("POWER", 1) - 1]
-        raise FaultError("E326", start, "an exponent", "a number written out, as in x^2 or x^(1/2)", got)
+        raise ParseError("E326", start, "an exponent", "a number written out, as in x^2 or x^(1/2)", got)
     if "NAME" in fault.expected:
         if token.type in ("IF", "NOT"):
-            raise FaultError("E322", token, f"{token} … needs parentheses here")
+            raise ParseError("E322", token, f"{token} … needs parentheses here")
         if kinds[1:2] == ["COMMA"] and got == _CLOSERS[opener]:
             each = f"an argument of {called[:-1]}" if called else "an entry of a vector"
-            raise FaultError("E322", token, f"{each} is missing behind the comma")
-        raise FaultError("E322", token, f"a number, a name or ( was expected here, not {got}")
+            raise ParseError("E322", token, f"{each} is missing behind the comma")
+        raise ParseError("E322", token, f"a number, a name or ( was expected here, not {got}")
     if token.type == "POWER":
-        raise FaultError("E326", token, "a power of a power needs parentheses", hint="(x^2)^3")
+        raise ParseError("E326", token, "a power of a power needs parentheses", hint="(x^2)^3")
     if kinds[1:2] == ["NUMBER"] and "POWER" not in kinds and kinds[0] in ("NAME", "FUNCTION", "NUMBER"):
         number = tail[1]
         said = text[number.start_pos : token.end_pos]
@@ -194,29 +194,29 @@ def _refuse_token(text: str, fault: UnexpectedToken) -> NoReturn:
             hint = hint if Fraction(number) else str(number)  # nothing is nothing in any unit
             with contextlib.suppress(ValueError):
                 hint = str(int(said, 0))  # 0x10 is 16
-            raise FaultError("E323", number, what, hint="" if kinds[0] == "NUMBER" else hint)
+            raise ParseError("E323", number, what, hint="" if kinds[0] == "NUMBER" else hint)
     if token.type == "COMPARISON":
-        raise FaultError("E322", token, "a comparison has two sides", hint="a < b and b < c")
+        raise ParseError("E322", token, "a comparison has two sides", hint="a < b and b < c")
     if opener:
         inside = called or _OPENED.get(opener, "an if")
-        raise FaultError("E322", token, inside, _CLOSERS[opener], got)
+        raise ParseError("E322", token, inside, _CLOSERS[opener], got)
     what = _STRAY.get(token, f"an operator was expected here, not {got}")
     if token in KEYWORDS:
         what = f"{token} belongs to an if … then … else, and none is open here"
-    raise FaultError("E322", token, what)
+    raise ParseError("E322", token, what)
 
 
 def _check(expr: Expr, text: str, depth: int = 1, *, conditional: bool = False) -> None:
     """Raise E328 if a tree is too deep, E327 for a condition where a number is due or the reverse."""
     if depth > MAX_DEPTH:
-        raise FaultError("E328", expr.start, TOO_DEEP)
+        raise ParseError("E328", expr.start, TOO_DEEP)
     word = expr.function if isinstance(expr, Call) else ""
     condition = word in CONDITIONS
     # A name may stand for a condition; what it is, only its declaration can tell.
     if condition != conditional and not isinstance(expr, Name):
         kinds = "a condition, and a number" if condition else "a number, and a condition"
         what = f"{cut(text[expr.start : expr.end])} is {kinds} is due here"
-        raise FaultError("E327", expr.start, what)
+        raise ParseError("E327", expr.start, what)
     parts = children(expr)
     for place, part in enumerate(parts):
         due = word in ("and", "or", "not") or (place == 0 and word == "if")
@@ -230,11 +230,11 @@ def _check_name(token: Token) -> None:
     for segment in token.split("."):
         word, _, index = segment.rstrip("]").partition("[")
         if word.startswith("_"):
-            raise FaultError("E324", token, "a name", "a letter first", cut(token))
+            raise ParseError("E324", token, "a name", "a letter first", cut(token))
         if segment in KEYWORDS:
-            raise FaultError("E324", token, f"{word} is a word of the language, not a name")
+            raise ParseError("E324", token, f"{word} is a word of the language, not a name")
         if index.startswith("0") or len(index) > 9:
-            raise FaultError("E324", token, "an index", "a whole number counted from 1", cut(index))
+            raise ParseError("E324", token, "an index", "a whole number counted from 1", cut(index))
 
 
 class _Trees(TREE):
@@ -243,7 +243,7 @@ class _Trees(TREE):
     def NUMBER(self, token: Token) -> Token:
         if len(token) > MAX_DIGITS:
             expected = f"at most {MAX_DIGITS} characters"
-            raise FaultError("E323", token, "a number", expected, f"{len(token)}")
+            raise ParseError("E323", token, "a number", expected, f"{len(token)}")
         check_size(token, token, "E323")
         return token
 
@@ -258,7 +258,7 @@ class _Trees(TREE):
             what = f"there is no function {cut(token)}"
             if not close:
                 what += f"; there are: {', '.join(sorted(FUNCTIONS))}"
-            raise FaultError("E325", token, what, hint=f"{close}(…)" if close else "")
+            raise ParseError("E325", token, what, hint=f"{close}(…)" if close else "")
         return token
 
     def expression(self, parts: list[Any]) -> list[Any]:
@@ -268,22 +268,22 @@ class _Trees(TREE):
         return [part.start_pos if kind_of(part) else part for part in parts]
 
     def number(self, parts: list[Token]) -> Expr:
-        return Number(Fraction(parts[0]), **_span(*parts))
+        return NumberLiteral(Fraction(parts[0]), **_span(*parts))
 
     def name(self, parts: list[Token]) -> Expr:
         if parts[0] == "pi":
-            return Number(PI, **_span(*parts))
+            return NumberLiteral(PI, **_span(*parts))
         return Name(tuple(parts[0].split(".")), **_span(*parts))
 
     def exponent(self, parts: list[Token]) -> Expr:
         try:
             value = exponent_of(parts)
         except ZeroDivisionError:
-            raise FaultError("E326", parts[0], "this exponent divides by zero") from None
+            raise ParseError("E326", parts[0], "this exponent divides by zero") from None
         if abs(value) > MAX_POWER or value.denominator > MAX_POWER:
             limit = f"-{MAX_POWER} to {MAX_POWER}, or a fraction of such numbers"
-            raise FaultError("E326", parts[0], "an exponent", limit, cut(str(value)))
-        return Number(value, **_span(*parts))
+            raise ParseError("E326", parts[0], "an exponent", limit, cut(str(value)))
+        return NumberLiteral(value, **_span(*parts))
 
     def binary(self, parts: list[Any]) -> Any:
         left, operator, right = parts
@@ -296,7 +296,7 @@ class _Trees(TREE):
             return Call("neg" if sign == "-" else "not", (operand,), **_span(*parts))
         if isinstance(operand, Call) and operand.function in CONDITIONS:
             what = f"{cut(format_expression(operand))} is a condition, and a number is due here"
-            raise FaultError("E327", operand.start, what)
+            raise ParseError("E327", operand.start, what)
         return operand
 
     def parenthesis(self, parts: list[Any]) -> Any:
@@ -305,7 +305,7 @@ class _Trees(TREE):
     def vector(self, parts: list[Any]) -> Expr:
         if len(parts) == 2:
             what = "a vector has entries; one of zeros is {0, 0}"
-            raise FaultError("E322", parts[0], what)
+            raise ParseError("E322", parts[0], what)
         return Call("{", tuple(parts[1:-1]), **_span(*parts))
 
     def call(self, parts: list[Any]) -> Expr:
@@ -314,13 +314,13 @@ class _Trees(TREE):
         if not least <= len(arguments) <= most:
             wanted = f"{least}" if least == most else f"{least} to {most}"
             plural = "argument" if most == 1 else "arguments"
-            raise FaultError("E325", function, function, f"{wanted} {plural}", f"{len(arguments)}")
+            raise ParseError("E325", function, function, f"{wanted} {plural}", f"{len(arguments)}")
         if function != "interval":
             return Call(str(function), tuple(arguments), **_span(*parts))
         [clock] = arguments
         if not isinstance(clock, Name) or len(clock.parts) > 1:
             got = format_expression(clock)
-            raise FaultError("E325", clock.start, function, "the name of a clock", got)
+            raise ParseError("E325", clock.start, function, "the name of a clock", got)
         return Name((interval_of(clock.parts[0]),), **_span(*parts))
 
     def conditional(self, parts: list[Any]) -> Expr:

@@ -1,7 +1,7 @@
 """The grammars of the language, read by Lark.
 
 Takes: a grammar beside this module, and what its rules build.
-Gives: `parser`, `FaultError`, `placing`, `TREE`, `kind_of`, `unclosed`, `exponent_of`, `check_size`.
+Gives: `parser`, `ParseError`, `placing`, `TREE`, `kind_of`, `unclosed`, `exponent_of`, `check_size`.
 Guarantees: a mistake knows the offset in its text, and its place once it is placed.
 Does not: bound a text: whoever parses it does, before.
 """
@@ -18,7 +18,7 @@ from typing import Any
 
 from lark import Lark, Token, Transformer
 
-from apc.compiler.errors import ApcError, Mistake, Place, place_in
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, place_in
 from apc.compiler.words import cut
 
 MAX_NUMBER_EXPONENT = 300  # of 1e300: still a float
@@ -27,7 +27,7 @@ _OPENED_BY = {"RPAR": "LPAR", "RBRACE": "LBRACE", "ELSE": "IF"}
 _OPENERS = ("LPAR", "LBRACE", "IF", "THEN", "ELSEIF")
 
 
-class FaultError(Exception):
+class ParseError(Exception):
     """A mistake that does not know yet where its text stands, so that results can be kept by text."""
 
     def __init__(
@@ -35,15 +35,15 @@ class FaultError(Exception):
     ) -> None:
         super().__init__(what)
         self.offset = (at.start_pos if isinstance(at, Token) else at) or 0
-        self.mistake = Mistake(code, Place(""), what, expected, got, hint)
+        self.mistake = Diagnostic(code, SourceLocation(""), what, expected, got, hint)
 
 
 @contextmanager
-def placing(text: str, place: Place) -> Iterator[None]:
+def placing(text: str, place: SourceLocation) -> Iterator[None]:
     """Turn a FaultError of a text that starts at `place` into ApcError."""
     try:
         yield
-    except FaultError as fault:
+    except ParseError as fault:
         at = place_in(place, text, fault.offset)
         raise ApcError(replace(fault.mistake, place=at)) from None
 
@@ -67,7 +67,7 @@ def check_size(number: str, at: int | Token, code: str) -> None:
     for exponent in re.findall(r"[eE]([+-]?[0-9]+)", number):
         if abs(int(exponent)) > MAX_NUMBER_EXPONENT:
             limit = f"an exponent from -{MAX_NUMBER_EXPONENT} to {MAX_NUMBER_EXPONENT}"
-            raise FaultError(code, at, "a number", limit, cut(exponent))
+            raise ParseError(code, at, "a number", limit, cut(exponent))
 
 
 def unclosed(stack: Sequence[object]) -> int:

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.errors import ApcError, Place
+from apc.compiler.errors import ApcError, SourceLocation
 from apc.compiler.source.reading import fault
 
 HALVED = (
@@ -82,12 +82,12 @@ def read_probe(text: str, file: str = "") -> Probe | None:
         its statistics.
     """
     if text.lstrip()[:1] == "{":
-        return _irtt(text, Place(file))
+        return _irtt(text, SourceLocation(file))
     lines = _LINE_END.split(text)
     return _ping(lines, file) or _windows_ping(lines, file)
 
 
-def _irtt(text: str, place: Place) -> Probe | None:
+def _irtt(text: str, place: SourceLocation) -> Probe | None:
     try:
         written = json.loads(text)
         trips = {int(item["seqno"]): _round_trip(item) for item in written["round_trips"]}
@@ -132,52 +132,54 @@ def _ping(lines: Sequence[str], file: str) -> Probe | None:
     stamps: list[tuple[int, float]] = []
     statistics: tuple[float, float, float] | None = None
     turns, last, first, headed = 0, 0, 1, False
-    ended = Place(file)
+    ended = SourceLocation(file)
     for at, line in enumerate(lines, start=1):
         counted = _NUMBER.search(line)
         if counted is not None and at == len(lines) and counted.end() == len(line):
             break  # the recording ends within a number
         if counted is None:
             if _CUT_HEADING.match(line):
-                raise _second_run(Place(file, at, 1))
+                raise _second_run(SourceLocation(file, at, 1))
             if _HEADING.match(line):
                 if headed or trips or statistics:
-                    raise _second_run(Place(file, at, 1))
+                    raise _second_run(SourceLocation(file, at, 1))
                 headed, first = True, 0 if _FROM_ZERO.match(line) else 1
             elif not (headed or trips):
                 continue  # no line of a ping yet
             elif (found := _statistics(line)) is not None:
                 if statistics:
-                    raise _second_run(Place(file, at, 1))
-                statistics, ended = found, Place(file, at, 1)
+                    raise _second_run(SourceLocation(file, at, 1))
+                statistics, ended = found, SourceLocation(file, at, 1)
             elif line.startswith("--") and statistics is None and _unread(lines[at : at + 1]):
                 expected = "numbers of packets sent, received and lost"
-                raise fault("E704", Place(file, at + 1, 1), "the statistics of a recording", expected)
+                raise fault(
+                    "E704", SourceLocation(file, at + 1, 1), "the statistics of a recording", expected
+                )
             elif "TTL=" in line and _windows_answer(line):
-                raise _second_run(Place(file, at, 1))
+                raise _second_run(SourceLocation(file, at, 1))
             continue
         if statistics:
-            raise _second_run(Place(file, at, 1))
+            raise _second_run(SourceLocation(file, at, 1))
         number = int(counted["number"]) + turns * _WRAPS
         if trips and number < last - _WRAPS // 2:  # the count of packets has begun again
             turns, number = turns + 1, number + _WRAPS
         if abs(number - last) > _LONGEST_GAP:
             expected = f"at most {_LONGEST_GAP} away from the one before"
-            raise fault("E704", Place(file, at, 1), "the number of a packet", expected)
+            raise fault("E704", SourceLocation(file, at, 1), "the number of a packet", expected)
         last = max(last, number)
         took = _TOOK.search(line)
         if took is None:
             if _ANSWERED.search(line):
                 if at == len(lines):  # the recording ends within this line
                     break
-                raise _untimed(Place(file, at, 1))
+                raise _untimed(SourceLocation(file, at, 1))
             trips.setdefault(number, math.inf)  # no answer yet: one may come
         elif math.isinf(trips.get(number, math.inf)):
             trips[number] = _seconds(took, file, at)
             if (stamp := _STAMP.match(line)) is not None:
                 stamps.append((number, float(stamp["stamp"]) - trips[number]))
         elif number < last and not _DUPLICATE.search(line):
-            raise _second_run(Place(file, at, 1))
+            raise _second_run(SourceLocation(file, at, 1))
     first = min(first, *trips) if trips else first
     final = max(trips, default=first - 1)
     total = math.nan
@@ -236,7 +238,7 @@ def _windows_ping(lines: Sequence[str], file: str) -> Probe | None:
     """Read a ping without numbers: each line between its heading and a blank line is the next packet."""
     trips: list[float] = []
     statistics: tuple[int, ...] | None = None
-    ended, again, replies = Place(file), None, 0
+    ended, again, replies = SourceLocation(file), None, 0
     headed = inside = False
     for at, line in enumerate(lines, start=1):
         if _TCPING.match(line):
@@ -245,7 +247,7 @@ def _windows_ping(lines: Sequence[str], file: str) -> Probe | None:
             continue  # routes and time stamps of the answer above
         if not line.strip() or line[0].isspace():
             if statistics is None and (found := _WINDOWS_STATISTICS.match(line)):
-                statistics, ended = tuple(map(int, found.groups())), Place(file, at, 1)
+                statistics, ended = tuple(map(int, found.groups())), SourceLocation(file, at, 1)
             headed = headed and not line.strip()  # the heading of statistics has indented lines below it
             inside = False
         elif line.rstrip().endswith((":", "：")):
@@ -253,13 +255,13 @@ def _windows_ping(lines: Sequence[str], file: str) -> Probe | None:
         else:
             took = _windows_answer(line)
             if headed and trips:
-                again = again or Place(file, at, 1)
+                again = again or SourceLocation(file, at, 1)
             inside, headed = inside or headed or took is not None, False
             if took is not None:
                 trips.append(_seconds(took, file, at))
             elif inside and (at < len(lines) or line.endswith((".", "。"))):  # not cut within this line
                 if _ANSWERED.search(line):
-                    raise _untimed(Place(file, at, 1))
+                    raise _untimed(SourceLocation(file, at, 1))
                 trips.append(math.inf)
                 replies += ":" in line
     if not np.isfinite(trips).any() and (statistics is None or not trips):
@@ -286,7 +288,7 @@ def _seconds(took: re.Match[str], file: str, line: int) -> float:
     """Return the time of an answer in seconds. Raises ApcError of a time no packet takes."""
     seconds = float(took["time"].replace(",", ".")) * _SECONDS.get(took["unit"], 1e-3)
     if seconds > LATEST_DELAY:
-        raise _untimed(Place(file, line, 1))
+        raise _untimed(SourceLocation(file, line, 1))
     return seconds
 
 
@@ -294,16 +296,16 @@ def _answers(trips: dict[int, float]) -> int:
     return sum(map(math.isfinite, trips.values()))
 
 
-def _second_run(place: Place) -> ApcError:
+def _second_run(place: SourceLocation) -> ApcError:
     return fault("E704", place, "a recording", "one run of ping", "a second run from this line on")
 
 
-def _untimed(place: Place) -> ApcError:
+def _untimed(place: SourceLocation) -> ApcError:
     expected = f"a round trip of at most {LATEST_DELAY:.0e} s, such as time=12.3 ms"
     return fault("E704", place, "an answer", expected)
 
 
-def _disagreement(what: str, expected: float, got: int, place: Place) -> ApcError:
+def _disagreement(what: str, expected: float, got: int, place: SourceLocation) -> ApcError:
     of_statistics = f"{expected:.12g}, as in its statistics"
     return fault("E704", place, f"the number of {what} in a recording", of_statistics, str(got))
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.digits import plain_float
-from apc.compiler.errors import Place
+from apc.compiler.errors import SourceLocation
 from apc.compiler.language.csv_tables import Headings, open_table, read_bytes, read_table
 from apc.compiler.language.dimensions import SECOND
 from apc.compiler.language.probes import LATEST_DELAY, read_probe
@@ -39,7 +39,7 @@ class TimeTable:
     numbers: NDArray[np.float64]
 
 
-def read_time_table(path: Path, name: str, unit: Unit, named_at: Place) -> TimeTable:
+def read_time_table(path: Path, name: str, unit: Unit, named_at: SourceLocation) -> TimeTable:
     """Read a quantity over time: two columns, time and the quantity, and two or more rows of rising time.
 
     Parameters
@@ -83,7 +83,7 @@ class Trace:
     interval: float = math.nan
 
 
-def read_trace(path: Path, named_at: Place) -> Trace:
+def read_trace(path: Path, named_at: SourceLocation) -> Trace:
     """Read the column `delay` of a CSV file: 0 or more a packet; `lost`, or nothing, if it was lost.
 
     Other columns may say anything. A line without a character is no packet. What ping or irtt wrote is read
@@ -110,7 +110,7 @@ def read_trace(path: Path, named_at: Place) -> Trace:
         if (probe := read_probe(text, str(path))) is not None:
             return Trace(probe.delays, probe.program, probe.interval)
         if DELAY not in text.partition("\n")[0]:
-            raise fault("E702", Place(str(path), 1, 1), "a recording", RECORDINGS)
+            raise fault("E702", SourceLocation(str(path), 1, 1), "a recording", RECORDINGS)
     with open_table(path, named_at, known=(DELAY,)) as opened:
         column = _delay_column(opened.headings)
         scale = float(opened.headings[column][1].scale)

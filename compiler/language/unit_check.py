@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from fractions import Fraction
 
-from apc.compiler.errors import Mistakes, Place, place_in
+from apc.compiler.errors import Mistakes, SourceLocation, place_in
 from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND, Dimension
 from apc.compiler.language.expression import (
     CONDITIONS,
@@ -22,7 +22,7 @@ from apc.compiler.language.expression import (
     Equation,
     Expr,
     Name,
-    Number,
+    NumberLiteral,
     as_written,
 )
 from apc.compiler.language.unit_text import format_dimension
@@ -30,14 +30,14 @@ from apc.compiler.language.unit_text import format_dimension
 ANY = Dimension((("any", 1),))
 """The dimension of the literal 0, which fits every other."""
 
-_HALF = Number(Fraction(1, 2))
+_HALF = NumberLiteral(Fraction(1, 2))
 
 # What the arguments behind the first have to be.
 _TIMES = {"hold": "s, as a delay", "interpolate": "s, as tables are over time"}
 Lookup = Callable[[Name], Dimension | None]
 
 
-def dimension_of(expr: Expr, lookup: Lookup, text: str, place: Place) -> Dimension | None:
+def dimension_of(expr: Expr, lookup: Lookup, text: str, place: SourceLocation) -> Dimension | None:
     """Return the dimension of an expression.
 
     Parameters
@@ -98,7 +98,7 @@ def _said(dimension: Dimension) -> str:
 class _Checker:
     """Finds dimensions and collects mistakes; a part with a mistake counts as unknown, to say it once."""
 
-    def __init__(self, lookup: Lookup, text: str, place: Place) -> None:
+    def __init__(self, lookup: Lookup, text: str, place: SourceLocation) -> None:
         self.lookup, self.text, self.place = lookup, text, place
         self.mistakes = Mistakes()
 
@@ -135,7 +135,7 @@ class _Checker:
         return DIMENSIONLESS if dimension == ANY else dimension
 
     def dimension(self, expr: Expr) -> Dimension | None:
-        if isinstance(expr, Number):
+        if isinstance(expr, NumberLiteral):
             return DIMENSIONLESS if expr.value else ANY
         if isinstance(expr, Name):
             return self.lookup(expr)
@@ -167,7 +167,7 @@ class _Checker:
 
     def product(self, word: str, left: Expr, right: Expr) -> Dimension | None:
         base = self.factor(left)
-        if word == "^" and isinstance(right, Number):
+        if word == "^" and isinstance(right, NumberLiteral):
             return base and base.power(right.value)
         if word == "^":
             for part in (right, left):  # x^n has a unit only for a written n

@@ -10,7 +10,7 @@ from __future__ import annotations
 from fractions import Fraction
 from functools import cache
 
-from apc.compiler.errors import Place
+from apc.compiler.errors import SourceLocation
 from apc.compiler.language.dimensions import Dimension
 from apc.compiler.language.units import Unit, parse_unit
 
@@ -45,7 +45,7 @@ def format_dimension(dimension: Dimension) -> str:
 @cache
 def _forms() -> dict[Dimension, str]:
     """Return the usual form of each dimension of `FORMS`."""
-    return {parse_unit(text, Place("")).dimension: text for text in reversed(FORMS)}
+    return {parse_unit(text, SourceLocation("")).dimension: text for text in reversed(FORMS)}
 
 
 def _powered(base: str, power: Fraction | int) -> str:

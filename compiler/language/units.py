@@ -24,12 +24,12 @@ import pint
 from lark import Token
 from lark.exceptions import UnexpectedCharacters, UnexpectedToken
 
-from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
 from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension
 from apc.compiler.language.expression import PI
 from apc.compiler.language.parsing import (
     TREE,
-    FaultError,
+    ParseError,
     check_size,
     exponent_of,
     kind_of,
@@ -128,7 +128,7 @@ class Quantity:
 NO_UNIT = Unit("1", Fraction(1), DIMENSIONLESS)
 
 
-def parse_unit(text: str, place: Place) -> Unit:
+def parse_unit(text: str, place: SourceLocation) -> Unit:
     """Read a unit; `1` is the unit of a plain number.
 
     Raises
@@ -141,7 +141,7 @@ def parse_unit(text: str, place: Place) -> Unit:
         return _unit(text)
 
 
-def parse_quantity(text: str, place: Place) -> Quantity:
+def parse_quantity(text: str, place: SourceLocation) -> Quantity:
     """Read a number and its unit, if it has one.
 
     Raises
@@ -153,7 +153,7 @@ def parse_quantity(text: str, place: Place) -> Quantity:
         return _quantity(text)
 
 
-def quantity(text: str, place: Place, *, what: str, unit: str) -> Quantity:
+def quantity(text: str, place: SourceLocation, *, what: str, unit: str) -> Quantity:
     """Read a quantity that has to fit a unit.
 
     Parameters
@@ -188,7 +188,7 @@ def quantity(text: str, place: Place, *, what: str, unit: str) -> Quantity:
         if mistake.code != "E221" or mistake.hint:
             raise
         example = f"{what}: 1 {unit}".removesuffix(" 1")
-        raise ApcError(Mistake("E221", place, what, named, cut(text) or "nothing", example)) from None
+        raise ApcError(Diagnostic("E221", place, what, named, cut(text) or "nothing", example)) from None
     actual, due = parsed.unit.dimension, wanted.dimension
     got, right = cut(text.strip()), unit
     if actual == due:
@@ -209,7 +209,7 @@ def quantity(text: str, place: Place, *, what: str, unit: str) -> Quantity:
         # A rate in the place of a time, or the other way round; radians don't say how long a turn takes.
         if actual == due.power(-1) and actual.turning != "rad" and parsed.value:
             hint = f"{what}: {float(1 / (parsed.value * wanted.scale)):.9g} {unit}"
-    raise ApcError(Mistake("E204", place, what, named, got, hint))
+    raise ApcError(Diagnostic("E204", place, what, named, got, hint))
 
 
 def _meant(unit: Unit, wanted: Unit) -> tuple[str, str]:
@@ -233,36 +233,36 @@ def _is_of(text: str, wanted: Dimension) -> bool:
     """Say whether a text is a unit of a dimension; made from another unit it may be none, as a root of mm."""
     try:
         return _unit(text).dimension == wanted
-    except FaultError:
+    except ParseError:
         return False
 
 
 @lru_cache(maxsize=4096)
 def _quantity(text: str) -> Quantity:
     if len(text) > MAX_LENGTH:
-        raise FaultError("E221", 0, "a quantity", f"at most {MAX_LENGTH} characters", f"{len(text)}")
+        raise ParseError("E221", 0, "a quantity", f"at most {MAX_LENGTH} characters", f"{len(text)}")
     match = _QUANTITY_START.match(text)
     if match is None:
         bare = text.strip()
         expected = "a finite number" if _NOT_FINITE.match(bare) else "a number and its unit"
         hint = bare.replace("−", "-") if bare.startswith("−") else ""
-        raise FaultError("E221", 0, "a quantity", expected, cut(bare) or "nothing", hint=hint)
+        raise ParseError("E221", 0, "a quantity", expected, cut(bare) or "nothing", hint=hint)
     number, rest, end = match.group().strip(), text[match.end() :], match.end()
     if re.match(r",[0-9]", rest):
         hint = cut(f"{number}.{rest[1:].strip()}")
-        raise FaultError("E221", end, "a number has a decimal point, not a comma", hint=hint)
+        raise ParseError("E221", end, "a number has a decimal point, not a comma", hint=hint)
     value = _number(number, end - len(number))
     if re.match(r"\s*/", rest):
         hint = f"{number} 1{rest.strip()}"
-        raise FaultError("E222", end, "a unit", "something above the /", "nothing", hint=hint)
+        raise ParseError("E222", end, "a unit", "something above the /", "nothing", hint=hint)
     try:
         unit = _unit(rest) if rest.strip() else NO_UNIT
         float(value * unit.scale)
-    except FaultError as fault:
+    except ParseError as fault:
         fault.offset += end
         raise
     except OverflowError:
-        raise FaultError("E226", 0, "this quantity is too large for a number") from None
+        raise ParseError("E226", 0, "this quantity is too large for a number") from None
     return Quantity(value * unit.scale, unit, number)
 
 
@@ -273,25 +273,25 @@ def _number(text: str, offset: int) -> Fraction:
     try:
         return Fraction(above) / Fraction(below or "1")
     except ZeroDivisionError:
-        raise FaultError("E221", offset, f"{cut(text)} divides by zero") from None
+        raise ParseError("E221", offset, f"{cut(text)} divides by zero") from None
 
 
 @lru_cache(maxsize=1024)
 def _unit(text: str) -> Unit:
     """Return a unit: what its names come to by Pint."""
     if len(text) > MAX_LENGTH:
-        raise FaultError("E222", 0, "a unit", f"at most {MAX_LENGTH} characters", f"{len(text)}")
+        raise ParseError("E222", 0, "a unit", f"at most {MAX_LENGTH} characters", f"{len(text)}")
     try:
         powers = _grammar()(text, "unit")
     except UnexpectedCharacters as fault:
         expected = "names joined by * and /, with exponents such as ^2"
-        raise FaultError("E222", fault.pos_in_stream, "a unit", expected, repr(fault.char)) from None
+        raise ParseError("E222", fault.pos_in_stream, "a unit", expected, repr(fault.char)) from None
     except UnexpectedToken as fault:
         _refuse(text, fault)
     dimensions = registry().get_dimensionality(powers)
     if any(abs(power) > MAX_EXPONENT for power in (*powers.values(), *dimensions.values())):
         what = f"{cut(text.strip())} is no unit of this world: an exponent or its scale is too large"
-        raise FaultError("E225", 0, what)
+        raise ParseError("E225", 0, what)
     # The square of the scale, so that the root of a square is exact; Pint's unit of mass is the gram.
     square, _ = registry().get_root_units(powers**2)
     square = square / Fraction(1000) ** (2 * dimensions["[mass]"])
@@ -299,7 +299,7 @@ def _unit(text: str) -> Unit:
     scale = Fraction(math.isqrt(rational.numerator), math.isqrt(rational.denominator))
     if isinstance(square, float) or scale**2 != square:
         expected = "a root whose scale is a rational number"
-        raise FaultError("E222", len(text.rstrip()), "a unit", expected, "its end")
+        raise ParseError("E222", len(text.rstrip()), "a unit", expected, "its end")
     exponents = tuple(sorted((_BASES[base], power) for base, power in dimensions.items()))
     return Unit(text.strip(), scale, Dimension(exponents, _turning(text)))
 
@@ -318,7 +318,7 @@ def _refuse(text: str, fault: UnexpectedToken) -> NoReturn:
         hint = joined if joined != bare and "+" not in bare else ""
     at = len(text.rstrip()) if token.type == "$END" else token
     got = {"$END": "its end", "POWER": "^"}.get(token.type, str(token))
-    raise FaultError("E222", at, "a unit", expected, got, hint)
+    raise ParseError("E222", at, "a unit", expected, got, hint)
 
 
 def _turning(text: str) -> str:
@@ -340,7 +340,7 @@ class _Units(TREE):
     def one(self, parts: list[Token]) -> Any:
         if parts[0] != "1":
             expected = "a name such as N, m or s"
-            raise FaultError("E222", parts[0], "a unit", expected, str(parts[0]))
+            raise ParseError("E222", parts[0], "a unit", expected, str(parts[0]))
         return registry().UnitsContainer()
 
     def times(self, parts: list[Any]) -> Any:
@@ -357,12 +357,12 @@ class _Units(TREE):
         for part in parts:
             if part.type == "NUMBER" and int(part) > MAX_EXPONENT:
                 expected = f"a whole exponent up to {MAX_EXPONENT}"
-                raise FaultError("E222", part, "a unit", expected, str(part))
+                raise ParseError("E222", part, "a unit", expected, str(part))
         try:
             return exponent_of(parts)
         except ZeroDivisionError:
             expected = "an exponent that does not divide by zero"
-            raise FaultError("E222", parts[-1].end_pos, "a unit", expected, ")") from None
+            raise ParseError("E222", parts[-1].end_pos, "a unit", expected, ")") from None
 
 
 @cache
@@ -399,20 +399,20 @@ def _looked_up(name: Token) -> str:
     # Nm is a yarn count to Pint, and a slip for N*m to everyone else.
     others = [(prefix, unit) for prefix, unit, _ in every.parse_unit_name(name) if unit != "number_meter"]
     if not others:
-        raise FaultError("E223", name, f"there is no unit {cut(name)}", hint=_proposal(name))
+        raise ParseError("E223", name, f"there is no unit {cut(name)}", hint=_proposal(name))
     (prefix, unit), *_ = others
     spelled = f"{prefix}{unit}".replace("_", " ")
     roots = every.get_root_units(unit)[1]._units
     if not every._units[unit].is_multiplicative or any(root not in registry() for root in roots):
         what = f"{name} ({prefix}{unit}) is no multiple of an SI unit"
-        raise FaultError("E224", name, what, hint="K" if "degree_" in unit else "")
+        raise ParseError("E224", name, what, hint="K" if "degree_" in unit else "")
     dimension = every.get_dimensionality(unit)
     like = [other for other in COMMON if registry().get_dimensionality(other) == dimension]
     proposed = f"; there are {', '.join(like[:3])}" if like else ""
     what = f"there is no unit {name} here: {spelled} is out of use{proposed}"
     lower = name.lower()
     similar = (other for other in like if lower == other.lower() or lower.startswith(other))
-    raise FaultError("E223", name, what, hint=next(similar, ""))
+    raise ParseError("E223", name, what, hint=next(similar, ""))
 
 
 def _proposal(name: str) -> str:

@@ -1,6 +1,6 @@
 """Numbers in the text: quantities, words that stand for numbers, and expressions over named numbers.
 
-Takes: scalars of YAML. Gives: `Binding` (what was written) and `Value` (what it comes to).
+Takes: scalars of YAML. Gives: `ValueBinding` (what was written) and `ScalarValue` (what it comes to).
 Guarantees: dimensions agree and bounds hold, or a mistake says so at its place.
 Does not: know sections, parts or peers.
 """
@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from graphlib import CycleError, TopologicalSorter
 
-from apc.compiler.errors import ApcError, Mistakes, Place, place_in
+from apc.compiler.errors import ApcError, Mistakes, SourceLocation, place_in
 from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension
 from apc.compiler.language.evaluation import evaluate
 from apc.compiler.language.expression import FUNCTIONS, Expr, Name, format_expression, names, transform
@@ -44,24 +44,26 @@ _WORD_NUMBER = re.compile(r"[+-]?\.?(nan|inf|infinity)\b", re.IGNORECASE)
 
 
 @dataclass(frozen=True, slots=True)
-class Binding:
+class ValueBinding:
     """A number as written: `number` in SI and the `unit` it was written in, or an `expression` over names."""
 
     number: Fraction | None
     expression: Expr | None
     dimension: Dimension
-    place: Place
+    place: SourceLocation
     unit: str = ""
 
 
 @dataclass(frozen=True, slots=True)
-class Value:
-    """A number, in SI; `expression` is its tree if it depends on others; `unit` is that of its `Binding`."""
+class ScalarValue:
+    """A number, in SI; `expression` is its tree if it depends on others; `unit` is that of its
+    `ValueBinding`.
+    """
 
     number: Fraction
     dimension: Dimension
     expression: Expr | None
-    place: Place
+    place: SourceLocation
     unit: str = ""
 
     def __str__(self) -> str:
@@ -99,7 +101,7 @@ class Bounds:
             return f"{self._shown(self.maximum)} {self.unit} or less"
         return ""
 
-    def check(self, value: Value, what: str, mistakes: Mistakes) -> None:
+    def check(self, value: ScalarValue, what: str, mistakes: Mistakes) -> None:
         """Record a number that breaks the bounds."""
         if expected := self.fault(value.number):
             got = f"{self._shown(value.number)} {self.unit}"
@@ -114,7 +116,7 @@ def is_quantity(text: str) -> bool:
     return bool(_QUANTITY.match(text) or _WORD_NUMBER.match(text))
 
 
-def text_place(node: Node) -> Place:
+def text_place(node: Node) -> SourceLocation:
     """Return where a scalar's text starts: behind the opening quote, if it has one."""
     quoted = isinstance(node, Scalar) and not node.plain
     return node.place.shifted(1) if quoted else node.place
@@ -128,7 +130,7 @@ def read_binding(
     known: Callable[[tuple[str, ...]], Dimension | None],
     names_known: Collection[str],
     words: Collection[tuple[str, Fraction]] = (),
-) -> Binding:
+) -> ValueBinding:
     """Read a number: a quantity, a word that stands for one, or an expression.
 
     Parameters
@@ -164,15 +166,15 @@ def read_binding(
             if actual is not None and actual != ANY and (actual != dimension or actual.clashes(dimension)):
                 got, hint = _misfit(tree, actual, dimension, unit)
                 raise fault("E204", place, what, unit, f"{brief(text)}, which {got}", f"{what}: {hint}")
-            return Binding(None, tree, dimension, place)
+            return ValueBinding(None, tree, dimension, place)
         _refuse_beside(text, place, what, names_known)
         _refuse_mixture(text, place, what, names_known)
         read = quantity(text, place, what=what, unit=unit)
         number, own = read.value, read.unit.text
-    return Binding(number, None, dimension, place, own)
+    return ValueBinding(number, None, dimension, place, own)
 
 
-def _refuse_marks(text: str, place: Place, what: str) -> None:
+def _refuse_marks(text: str, place: SourceLocation, what: str) -> None:
     """Raise ApcError for a number with a decimal comma, or whose thousands are set apart."""
     bare = text.strip()
     if (match := _COMMA.fullmatch(bare)) is not None:
@@ -183,7 +185,7 @@ def _refuse_marks(text: str, place: Place, what: str) -> None:
         raise fault("E221", place, what, expected, brief(text), f"{what}: {joined}")
 
 
-def _refuse_computed(text: str, place: Place, what: str, unit: str) -> None:
+def _refuse_computed(text: str, place: SourceLocation, what: str, unit: str) -> None:
     """Raise ApcError for numbers that are computed and have a unit behind them, as 2*pi*100 N/m."""
     match = _COMPUTED.fullmatch(text.strip())
     if match is None or is_quantity(text) or not match["numbers"].strip():
@@ -201,7 +203,7 @@ def _refuse_computed(text: str, place: Place, what: str, unit: str) -> None:
 _BESIDE = re.compile(r"(?P<number>[+-]?[\d.]+(?:[eE][+-]?\d+)?)\s*(?P<rest>\(*(?P<word>[A-Za-z]\w*))")
 
 
-def _refuse_beside(text: str, place: Place, what: str, names_known: Collection[str]) -> None:
+def _refuse_beside(text: str, place: SourceLocation, what: str, names_known: Collection[str]) -> None:
     """Raise ApcError for a number beside a name, with no sign between them, as 2pi*f."""
     beside = _BESIDE.match(text.strip())
     if beside is None or beside["word"] not in {*names_known, "pi", *FUNCTIONS}:
@@ -213,7 +215,7 @@ def _refuse_beside(text: str, place: Place, what: str, names_known: Collection[s
     raise fault("E204", place, what, _NO_UNITS, brief(text), hint)
 
 
-def _refuse_mixture(text: str, place: Place, what: str, names_known: Collection[str]) -> None:
+def _refuse_mixture(text: str, place: SourceLocation, what: str, names_known: Collection[str]) -> None:
     """Raise ApcError for a quantity with a unit that goes on as an expression, as 500 N/m/(peers - 1)."""
     for word in re.finditer(r"[A-Za-z]\w*", text):
         before = text[: word.start()].rstrip(" (")
@@ -238,14 +240,14 @@ def _misfit(tree: Expr, actual: Dimension, due: Dimension, unit: str) -> tuple[s
     return f"is in {format_dimension(actual)}", hint
 
 
-def _tree(text: str, place: Place) -> Expr:
+def _tree(text: str, place: SourceLocation) -> Expr:
     return number_of(parse_expression(text, place), text, place)
 
 
 def _dimension(
     tree: Expr,
     text: str,
-    place: Place,
+    place: SourceLocation,
     what: str,
     known: Callable[[tuple[str, ...]], Dimension | None],
     names_known: Collection[str],
@@ -261,28 +263,28 @@ def _dimension(
     return dimension_of(tree, lambda name: known(name.parts), text, place)
 
 
-def settle(binding: Binding, number_of: Callable[[tuple[str, ...]], Fraction]) -> Value:
+def settle(binding: ValueBinding, number_of: Callable[[tuple[str, ...]], Fraction]) -> ScalarValue:
     """Return what a binding comes to, given what its names come to. Raises ApcError if it has no value."""
     if binding.expression is None:
         assert binding.number is not None
-        return Value(binding.number, binding.dimension, None, binding.place, binding.unit)
+        return ScalarValue(binding.number, binding.dimension, None, binding.place, binding.unit)
     number = Fraction(evaluate(binding.expression, number_of, binding.place))
-    return Value(number, binding.dimension, binding.expression, binding.place)
+    return ScalarValue(number, binding.dimension, binding.expression, binding.place)
 
 
-def read_free(node: Node, what: str, others: Collection[str]) -> Binding:
+def read_free(node: Node, what: str, others: Collection[str]) -> ValueBinding:
     """Read a number of any unit: a quantity, or an expression over others whose names are checked later."""
     text, place = text_of(node, what, f"{what}: 2000 N/m"), text_place(node)
     if not is_quantity(text):
-        return Binding(None, _tree(text, place), DIMENSIONLESS, place)
+        return ValueBinding(None, _tree(text, place), DIMENSIONLESS, place)
     _refuse_beside(text, place, what, others)
     parsed = parse_quantity(text, node.place)
-    return Binding(parsed.value, None, parsed.unit.dimension, node.place, parsed.unit.text)
+    return ValueBinding(parsed.value, None, parsed.unit.dimension, node.place, parsed.unit.text)
 
 
 def resolve_in_order(
-    waiting: Mapping[str, Binding], peers: int | None, mistakes: Mistakes
-) -> dict[str, Value]:
+    waiting: Mapping[str, ValueBinding], peers: int | None, mistakes: Mistakes
+) -> dict[str, ScalarValue]:
     """Settle named numbers that depend on each other, in the order in which they can be known.
 
     Parameters
@@ -310,7 +312,7 @@ def resolve_in_order(
         chain = [*chain[first:], *chain[:first], chain[first]]
         mistakes.add("E209", waiting[chain[0]].place, f"parameters depend in a circle: {' → '.join(chain)}")
         return {}
-    settled = {"peers": Value(Fraction(peers or 0), DIMENSIONLESS, None, Place(""))}
+    settled = {"peers": ScalarValue(Fraction(peers or 0), DIMENSIONLESS, None, SourceLocation(""))}
     if peers is None:
         settled.clear()
     for name in order:
@@ -320,7 +322,7 @@ def resolve_in_order(
     return {name: settled[name] for name in waiting if name in settled}
 
 
-def _settled(name: str, binding: Binding, settled: Mapping[str, Value]) -> Value:
+def _settled(name: str, binding: ValueBinding, settled: Mapping[str, ScalarValue]) -> ScalarValue:
     def dimension(parts: tuple[str, ...]) -> Dimension | None:
         value = settled.get(".".join(parts))
         return None if value is None else value.dimension

@@ -23,7 +23,7 @@ from itertools import islice
 from operator import attrgetter
 from typing import NoReturn, TypeVar
 
-from apc.compiler.errors import ApcError, Mistake, Place, place_in
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, place_in
 from apc.compiler.language.expression import (
     CONDITIONS,
     FUNCTIONS,
@@ -31,7 +31,7 @@ from apc.compiler.language.expression import (
     Equation,
     Expr,
     Name,
-    Number,
+    NumberLiteral,
     as_written,
     format_expression,
     walk,
@@ -89,7 +89,7 @@ def sizes_of(names: Iterable[tuple[str, ...]]) -> dict[tuple[str, ...], int]:
     return sizes
 
 
-def written_out(expr: Expr, size_of: SizeOf, text: str, place: Place) -> Written:
+def written_out(expr: Expr, size_of: SizeOf, text: str, place: SourceLocation) -> Written:
     """Return an expression for each entry of a vector, one for a number; None if its size isn't known yet.
 
     Parameters
@@ -106,43 +106,43 @@ def written_out(expr: Expr, size_of: SizeOf, text: str, place: Place) -> Written
     ApcError
         E328 it gets too long, E406 sizes that differ, E407 a vector where a number is due or the reverse.
     """
-    written = _Writer(size_of, text, place).written(expr)
+    written = _VectorWriter(size_of, text, place).written(expr)
     for tree in written or (expr,):
         if len(list(islice(walk(tree), MAX_LENGTH + 1))) > MAX_LENGTH:
             what = f"entry by entry this has more than {MAX_LENGTH} terms: give a part of it a name"
-            raise ApcError(Mistake("E328", place_in(place, text, expr.start), what))
+            raise ApcError(Diagnostic("E328", place_in(place, text, expr.start), what))
     return written
 
 
 def written_equation(equation: Equation, size_of: SizeOf) -> tuple[Equation, ...]:
     """Return an equation for each entry; raises as `written_out`, also where its sides differ in size."""
-    writer = _Writer(size_of, equation.text, equation.place)
+    writer = _VectorWriter(size_of, equation.text, equation.place)
     sides = (equation.left, equation.right)
     written = [written_out(side, size_of, equation.text, equation.place) or (side,) for side in sides]
     writer.agree(sides, written)
     return tuple(replace(equation, left=lhs, right=rhs) for lhs, rhs in zip(*written, strict=True))
 
 
-def number_of(expr: Expr, text: str, place: Place) -> Expr:
+def number_of(expr: Expr, text: str, place: SourceLocation) -> Expr:
     """Return an expression over numbers without `dot`, `norm` and the like. Raises E407 if it is a vector."""
-    return _Writer(lambda _: 0, text, place).number(expr)
+    return _VectorWriter(lambda _: 0, text, place).number(expr)
 
 
-class _Writer:
+class _VectorWriter:
     """Writes one text out; the first mistake is raised."""
 
-    def __init__(self, size_of: SizeOf, text: str, place: Place) -> None:
+    def __init__(self, size_of: SizeOf, text: str, place: SourceLocation) -> None:
         self.size_of, self.text, self.place = size_of, text, place
 
     def fail(
         self, code: str, at: Expr, expected: str, got: str = "", hint: str = "", within: str = ""
     ) -> NoReturn:
         what, place = as_written(at, self.text) + within, place_in(self.place, self.text, at.start)
-        raise ApcError(Mistake(code, place, what, expected, got, hint))
+        raise ApcError(Diagnostic(code, place, what, expected, got, hint))
 
     def written(self, expr: Expr) -> Written:
         match expr:
-            case Number() | Call("count"):  # peers are counted, whatever they send
+            case NumberLiteral() | Call("count"):  # peers are counted, whatever they send
                 return (expr,)
             case Name(path):
                 size = self.size_of(path)
@@ -183,7 +183,7 @@ class _Writer:
         word, vectors = expr.function, list[tuple[Expr, ...]]()
         for argument in expr.arguments:
             if (written := self.written(argument)) is None:
-                return None if word == "cross" else (Number(Fraction(0)),)
+                return None if word == "cross" else (NumberLiteral(Fraction(0)),)
             if not _is_vector(written):
                 shown = [format_expression(part) for part in expr.arguments]
                 hint = {"norm": f"abs({shown[0]})", "dot": "*".join(shown)}.get(word, "")
@@ -200,7 +200,7 @@ class _Writer:
             return tuple(call("-", call("*", a[i], b[j]), call("*", a[j], b[i])) for i, j in pairs)
         if word == "dot":
             return (reduce(partial(call, "+"), map(partial(call, "*"), a, b)),)
-        squares = (call("^", x, Number(Fraction(2))) for x in a)
+        squares = (call("^", x, NumberLiteral(Fraction(2))) for x in a)
         return (call("sqrt", reduce(partial(call, "+"), squares)),)
 
     def number(self, expr: Expr, hint: str = "") -> Expr:

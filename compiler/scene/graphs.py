@@ -17,13 +17,13 @@ import numpy as np
 
 from apc.compiler.compiled import MOST_PLACED, Graph
 from apc.compiler.digits import plain_float
-from apc.compiler.errors import Mistakes, Place
+from apc.compiler.errors import Mistakes, SourceLocation
 from apc.compiler.language.csv_tables import open_table
 from apc.compiler.language.dimensions import SECOND
-from apc.compiler.language.values import AlreadyReportedError, Value
+from apc.compiler.language.values import AlreadyReportedError, ScalarValue
 from apc.compiler.scene.named_numbers import NamedNumbers
 from apc.compiler.source.nodes import Node, Scalar, Sequence
-from apc.compiler.source.reading import Body, among, brief, fault, form, mapping_of, text_of, unknown
+from apc.compiler.source.reading import MappingReader, among, brief, fault, form, mapping_of, text_of, unknown
 
 SHAPES = ("complete", "ring", "star")
 
@@ -40,7 +40,7 @@ class SceneDelay:
 
     sender: str
     receiver: str
-    delay: Value
+    delay: ScalarValue
 
 
 def read_graph(node: Node, numbers: NamedNumbers) -> Graph:
@@ -70,7 +70,7 @@ def read_graph(node: Node, numbers: NamedNumbers) -> Graph:
             raise fault("E206", node.place, what, hint=COMPLETE.shape)
         raise unknown("E206", node.place, what, word, (*SHAPES, *PAIRS))
     hint = "[[1, 2], [2, 3]]"
-    body = Body(mapping_of(node, "graph", f"graph: {{edges: {hint}}}"), PAIRS, "graph", mistakes)
+    body = MappingReader(mapping_of(node, "graph", f"graph: {{edges: {hint}}}"), PAIRS, "graph", mistakes)
     if len(body.nodes) != 1:
         raise fault("E203", node.place, "graph", "either edges or arcs", hint=f"edges: {hint}")
     [(key, pairs)] = body.nodes.items()
@@ -100,7 +100,7 @@ def read_graph(node: Node, numbers: NamedNumbers) -> Graph:
     return Graph("arcs", np.array([*result], np.int64).reshape(-1, 2), np.array([*result.values()]))
 
 
-def _read_pairs(path: Path, named_at: Place, numbered: Mapping[str, int]) -> tuple[Node, ...]:
+def _read_pairs(path: Path, named_at: SourceLocation, numbered: Mapping[str, int]) -> tuple[Node, ...]:
     """Return the rows of a table with the columns from, to and weight or none as pairs.
 
     A peer is written by its number or by its name, as in YAML. Raises ApcError (E701 to E703).
@@ -120,7 +120,7 @@ def _read_pairs(path: Path, named_at: Place, numbered: Mapping[str, int]) -> tup
         numbers, lines = opened.numbers(range(len(names)), readers, "a cell", expected)
     pairs = []
     for line, *row in zip(lines, *numbers.reshape(-1, len(names)).T.tolist(), strict=True):
-        at = Place(opened.file, line, 1)
+        at = SourceLocation(opened.file, line, 1)
         values = (int(number) if number.is_integer() else number for number in row)
         pairs.append(Sequence(tuple(Scalar(str(value), value, True, at) for value in values), at))
     return tuple(pairs)

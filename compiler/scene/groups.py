@@ -22,20 +22,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import LARGEST_COUNT, MOST_GROUPS
-from apc.compiler.components.component import Named, Number, Option, Reference, Settable, Variable
-from apc.compiler.errors import Mistakes, Place
-from apc.compiler.language.csv_tables import Column, NamedFiles, Table, read_table
+from apc.compiler.components.component import (
+    ComponentVariable,
+    Named,
+    NumberParameter,
+    Option,
+    Reference,
+    Settable,
+)
+from apc.compiler.errors import Mistakes, SourceLocation
+from apc.compiler.language.csv_tables import CsvColumn, NamedFiles, Table, read_table
 from apc.compiler.language.evaluation import evaluate
 from apc.compiler.language.expression import names
 from apc.compiler.language.unit_text import format_dimension
-from apc.compiler.language.values import AlreadyReportedError, Value
+from apc.compiler.language.values import AlreadyReportedError, ScalarValue
 from apc.compiler.language.vectors import SIZES, entries, entry, whole_and_index
-from apc.compiler.scene.instances import Part, SettableNames
+from apc.compiler.scene.instances import PartInstance, SettableNames
 from apc.compiler.scene.named_numbers import NamedNumbers, read_count_by_names
 from apc.compiler.source.nodes import Mapping as MappingNode
 from apc.compiler.source.nodes import Node, Scalar, Sequence
 from apc.compiler.source.reading import (
-    Body,
+    MappingReader,
     among,
     brief,
     fault,
@@ -69,9 +76,9 @@ class GroupBody:
 
     name: str
     count: int
-    body: Body
+    body: MappingReader
     table: Table | None
-    counted: Value | None
+    counted: ScalarValue | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,15 +93,15 @@ class SceneGroup:
 
     name: str
     count: int
-    values: Named[Value]
+    values: Named[ScalarValue]
     words: Named[str]
     columns: Columns
-    place: Place
-    counted: Value | None = None
+    place: SourceLocation
+    counted: ScalarValue | None = None
     types: Named[str] = ()
 
 
-def read_counts(root: Body, files: NamedFiles) -> dict[str, GroupBody]:
+def read_counts(root: MappingReader, files: NamedFiles) -> dict[str, GroupBody]:
     """Read how many peers each group has.
 
     A group says `count`, or has a `table` with a row a peer, or lists in `set` with a value a peer.
@@ -122,7 +129,7 @@ def read_counts(root: Body, files: NamedFiles) -> dict[str, GroupBody]:
                 group = "user" if name == "count" else name  # a number of peers in the place of a group
                 number = value.text if isinstance(value, Scalar) and value.text.isdecimal() else "3"
                 node = mapping_of(value, name, f"{group}: {{count: {number}}}")
-                body = Body(node, GROUP, f"group {name}", root.mistakes)
+                body = MappingReader(node, GROUP, f"group {name}", root.mistakes)
                 table, counted = None, None
                 if text := body.text("table", "table: users.csv"):
                     table = files.read(text, partial(read_table, named_at=body.nodes["table"].place))
@@ -133,7 +140,7 @@ def read_counts(root: Body, files: NamedFiles) -> dict[str, GroupBody]:
     return result
 
 
-def _count(name: str, body: Body, table: Table | None, counted: Value | None) -> int:
+def _count(name: str, body: MappingReader, table: Table | None, counted: ScalarValue | None) -> int:
     """Return how many peers a group has, as its count, its table or its lists say."""
     node, settings = body.nodes.get("count"), body.nodes.get("set")
     if node is None:
@@ -169,15 +176,15 @@ class GroupReader:
     """
 
     settable: SettableNames
-    parts: Collection[Part]
+    parts: Collection[PartInstance]
     redeclared: Mapping[str, Collection[str]]
     clocks: Collection[str]
     numbers: NamedNumbers
-    explain: Callable[[str, Place], None]
+    explain: Callable[[str, SourceLocation], None]
 
     def read(self, group: GroupBody) -> SceneGroup:
         """Read what a group sets, and what follows from it."""
-        values: dict[str, Value] = {}
+        values: dict[str, ScalarValue] = {}
         words: dict[str, str] = {}
         columns: dict[str, NDArray[np.float64]] = {}
         mistakes, table = self.numbers.mistakes, group.table
@@ -205,7 +212,7 @@ class GroupReader:
                     if whole in columns or whole in values:
                         mistakes.add("E702", column.place, f"{whole} is given by set and by the table")
                 columns |= dict.fromkeys(wholes, column.numbers)
-                assert table is not None and isinstance(item, Number | Variable)
+                assert table is not None and isinstance(item, NumberParameter | ComponentVariable)
                 _check_column(column, table.lines, item, mistakes)
         self._add_followers(values, words, columns, group)
         types = {}
@@ -220,15 +227,19 @@ class GroupReader:
         place, own_types = group.body.place, tuple(types.items())
         return SceneGroup(group.name, group.count, *settings, place, group.counted, own_types)
 
-    def _parts_at(self, group: GroupBody) -> list[Part]:
+    def _parts_at(self, group: GroupBody) -> list[PartInstance]:
         """Return the parts that a group's peers have."""
         return [part for part in self.parts if group.name in part.groups]
 
     def _settable(
-        self, name: str, place: Place, group: str, code: str, what: str
+        self, name: str, place: SourceLocation, group: str, code: str, what: str
     ) -> tuple[Settable, list[str]]:
         """Return what a name stands for, with its whole names; in a heading, told by E702, only a number."""
-        kinds = (Number, Variable) if code == "E702" else (Number, Variable, Option, Reference)
+        kinds = (
+            (NumberParameter, ComponentVariable)
+            if code == "E702"
+            else (NumberParameter, ComponentVariable, Option, Reference)
+        )
         item, wholes = self.settable.get(name, (None, []))
         if not isinstance(item, kinds):
             self.explain(name, place)
@@ -255,7 +266,7 @@ class GroupReader:
                 yield key, node
                 continue
             item, _ = self.settable[entry(key.text, 1)]
-            assert isinstance(item, Number | Variable)
+            assert isinstance(item, NumberParameter | ComponentVariable)
             text = f"1 {item.unit.text}".removesuffix(" 1")
             nested = isinstance(node, Sequence) and any(isinstance(item, Sequence) for item in node.items)
             if not nested and group.table is None and "count" not in group.body.nodes:
@@ -283,10 +294,14 @@ class GroupReader:
         )
 
     def _add_followers(
-        self, values: dict[str, Value], words: dict[str, str], columns: Collection[str], group: GroupBody
+        self,
+        values: dict[str, ScalarValue],
+        words: dict[str, str],
+        columns: Collection[str],
+        group: GroupBody,
     ) -> None:
         """Add what follows from a group's settings, inside the parts that they set."""
-        known: dict[str, Value] = {}
+        known: dict[str, ScalarValue] = {}
         place = group.body.place
         for part in self._parts_at(group):
             known |= {f"{part.name}.{name}": value for name, value in (*part.values, *part.starts)}
@@ -307,12 +322,12 @@ class GroupReader:
                 with self.numbers.mistakes:
                     follows = Fraction(evaluate(tree, number, place))
                     values[whole] = replace(value, number=follows, place=place)
-                    if isinstance(item := self.settable[whole][0], Number):
+                    if isinstance(item := self.settable[whole][0], NumberParameter):
                         item.bounds.check(values[whole], whole, self.numbers.mistakes)
 
 
 def _check_column(
-    column: Column, lines: tuple[int, ...], item: Number | Variable, mistakes: Mistakes
+    column: CsvColumn, lines: tuple[int, ...], item: NumberParameter | ComponentVariable, mistakes: Mistakes
 ) -> None:
     """Check a column's unit, and each of its numbers against the parameter's bounds."""
     dimension, due = column.unit.dimension, item.unit.dimension
@@ -323,9 +338,9 @@ def _check_column(
         if dimension.clashes(due):
             hint += f", each {'divided by' if expected == 'Hz' else 'times'} 2*pi"
         raise fault("E702", column.place, f"the heading {column.name}", f"[{expected}]", got, hint)
-    if isinstance(item, Number):
+    if isinstance(item, NumberParameter):
         bounds, rows = item.bounds, zip(lines, map(Fraction, column.numbers.tolist()), strict=True)
         wrong = ((line, number) for line, number in rows if bounds.fault(number))
         for line, number in islice(wrong, MOST_FAULTS):
-            value = Value(number, due, None, Place(column.place.file, line, 1))
+            value = ScalarValue(number, due, None, SourceLocation(column.place.file, line, 1))
             bounds.check(value, column.name, mistakes)

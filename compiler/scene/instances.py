@@ -1,6 +1,6 @@
 """The parts of a peer: entries read, arrays and the parts inside parts written out.
 
-Takes: the entries of parts, the components they are of, and the scope they stand in. Gives: `Part`,
+Takes: the entries of parts, the components they are of, and the scope they stand in. Gives: `PartInstance`,
 `PartReader`, `settable_names`.
 Guarantees: every number of a part has a value within its bounds; its options and references are decided; what
 it is joined to is there.
@@ -16,11 +16,19 @@ from fractions import Fraction
 from functools import partial
 from itertools import product
 
-from apc.compiler.components.component import Component, Inner, Joined, Named, Number, Reference, Settable
-from apc.compiler.components.parts import GROUND, MOST_PARTS, PartEntry, Scope, read_entry
-from apc.compiler.errors import Mistakes, Place
+from apc.compiler.components.component import (
+    Component,
+    Inner,
+    Joined,
+    Named,
+    NumberParameter,
+    Reference,
+    Settable,
+)
+from apc.compiler.components.parts import GROUND, MOST_PARTS, EntryScope, PartEntry, read_entry
+from apc.compiler.errors import Mistakes, SourceLocation
 from apc.compiler.language.recordings import TimeTable, read_time_table
-from apc.compiler.language.values import PEERS, Binding, Value, renamed, settle
+from apc.compiler.language.values import PEERS, ScalarValue, ValueBinding, renamed, settle
 from apc.compiler.language.vectors import entries, whole_and_index
 from apc.compiler.scene.named_numbers import NamedNumbers
 from apc.compiler.source.nodes import Node, Scalar, Sequence
@@ -33,7 +41,7 @@ SettableNames = Mapping[str, tuple[Settable, list[str]]]
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class PartInstance:
     """An instance of a component at every peer of `groups`; parts inside parts are parts of their own.
 
     `values` holds a value for every number the component declares, `options` and `references` a word for
@@ -44,21 +52,21 @@ class Part:
     name: str
     section: str
     component: Component
-    values: Named[Value]
+    values: Named[ScalarValue]
     options: Named[str]
     references: Named[str]
     tables: tuple[TimeTable, ...]
-    starts: Named[Value]
+    starts: Named[ScalarValue]
     connections: Joined
     shared: bool
     groups: tuple[str, ...]
-    place: Place
+    place: SourceLocation
 
     @property
-    def all_starts(self) -> Named[Value]:
+    def all_starts(self) -> Named[ScalarValue]:
         """The start values of all its variables that have one: those given here, else the component's own."""
         own = {
-            variable.name: Value(variable.start, variable.unit.dimension, None, self.place)
+            variable.name: ScalarValue(variable.start, variable.unit.dimension, None, self.place)
             for variable in self.component.variables
             if variable.start is not None
         }
@@ -75,9 +83,9 @@ class Part:
 class PartReader:
     """Reads the entries of parts, one after the other, into `parts`, each before those inside it."""
 
-    scope: Scope
+    scope: EntryScope
     numbers: NamedNumbers
-    parts: list[Part] = field(default_factory=list)
+    parts: list[PartInstance] = field(default_factory=list)
 
     def read(self, entry: PartEntry, redeclared: Mapping[str, PartEntry]) -> None:
         """Read a part's entry, once for each element of an array, and write out the parts inside.
@@ -125,9 +133,9 @@ class PartReader:
             values, starts = (self._settled(pairs, component) for pairs in (read.values, read.starts))
             tables = self._tables(entry, dict(read.described))
             said = values, read.options, read.references, tables, starts, read.connections
-            self._add(Part(element, entry.section, component, *said, shared, groups, entry.place))
+            self._add(PartInstance(element, entry.section, component, *said, shared, groups, entry.place))
 
-    def _add(self, part: Part) -> None:
+    def _add(self, part: PartInstance) -> None:
         """Add a part and those inside it."""
         self.parts.append(part)
         if len(self.parts) <= MOST_PARTS:
@@ -138,13 +146,13 @@ class PartReader:
             hint = "fewer or smaller arrays and components"
             self.numbers.mistakes.add("E216", part.place, what, hint=hint)
 
-    def _settled(self, bindings: Named[Binding], component: Component) -> Named[Value]:
+    def _settled(self, bindings: Named[ValueBinding], component: Component) -> Named[ScalarValue]:
         """Return what named bindings come to, within the bounds of a component's parameters."""
         pairs = []
         for name, binding in bindings:
             with self.numbers.mistakes:
                 pairs.append((name, value := settle(binding, self.numbers.number)))
-                if isinstance(parameter := component.parameter(name), Number):
+                if isinstance(parameter := component.parameter(name), NumberParameter):
                     parameter.bounds.check(value, name, self.numbers.mistakes)
         return tuple(pairs)
 
@@ -198,7 +206,7 @@ def _shared(entry: PartEntry) -> bool:
     return node.value
 
 
-def _inside(part: Part, inner: Inner, peers: int, mistakes: Mistakes) -> Part:
+def _inside(part: PartInstance, inner: Inner, peers: int, mistakes: Mistakes) -> PartInstance:
     """Return a part inside a part; its numbers are expressions over the outer one's, in whole names.
 
     `mistakes` takes those of numbers without a value.
@@ -211,7 +219,7 @@ def _inside(part: Part, inner: Inner, peers: int, mistakes: Mistakes) -> Part:
     def whole(parts: tuple[str, ...]) -> tuple[str, ...]:
         return parts if parts == PEERS else (*part.name.split("."), *parts)
 
-    def settled(bindings: Named[Binding]) -> Named[Value]:
+    def settled(bindings: Named[ValueBinding]) -> Named[ScalarValue]:
         pairs = []
         for name, binding in bindings:
             with mistakes, suppress(KeyError):  # what the outer part has no value for was reported there
@@ -239,7 +247,7 @@ def _inside(part: Part, inner: Inner, peers: int, mistakes: Mistakes) -> Part:
     )
 
 
-def settable_names(parts: Iterable[Part]) -> dict[str, tuple[Settable, list[str]]]:
+def settable_names(parts: Iterable[PartInstance]) -> dict[str, tuple[Settable, list[str]]]:
     """Return what a group can set: by the name a person writes, what it is and its whole names.
 
     The name of an array stands for all its elements: `a[1].b[2]` is one of `a.b[2]`, `a[1].b` and `a.b`.

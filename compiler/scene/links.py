@@ -24,20 +24,20 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import Graph
 from apc.compiler.components.component import Component, Named, Reference
-from apc.compiler.components.component import Number as Parameter
+from apc.compiler.components.component import NumberParameter as Parameter
 from apc.compiler.components.parts import PartEntry
-from apc.compiler.errors import Place
+from apc.compiler.errors import SourceLocation
 from apc.compiler.language.dimensions import DIMENSIONLESS
 from apc.compiler.language.grammar import parse_expression
 from apc.compiler.language.recordings import read_trace
 from apc.compiler.language.units import Unit
-from apc.compiler.language.values import AlreadyReportedError, Value
+from apc.compiler.language.values import AlreadyReportedError, ScalarValue
 from apc.compiler.scene.graphs import COMPLETE, SceneDelay, read_delays, read_graph
-from apc.compiler.scene.instances import Part
+from apc.compiler.scene.instances import PartInstance
 from apc.compiler.scene.named_numbers import NamedNumbers
 from apc.compiler.source.nodes import Mapping as MappingNode
 from apc.compiler.source.nodes import Node, Scalar, Sequence
-from apc.compiler.source.reading import Body, brief, fault, form, text_of
+from apc.compiler.source.reading import MappingReader, brief, fault, form, text_of
 
 OBEYED = ("delay", "jitter", "distribution", "reorder", "on_loss")  # a link's numbers and words
 # Those of netem, in its order.
@@ -60,7 +60,7 @@ PROBABILITY = Parameter(
     divided=False,
     words=(),
     about="",
-    place=Place("probability"),
+    place=SourceLocation("probability"),
 )
 
 # What each word is where a link does not say it, and what it is about: on a link without, it says nothing.
@@ -79,8 +79,8 @@ class SceneChannel:
     `trace` (n,) holds recorded delays in seconds, infinite for a lost packet, or is None.
     """
 
-    loss: Named[Value]
-    jitter: Value | None
+    loss: Named[ScalarValue]
+    jitter: ScalarValue | None
     distribution: str
     reorder: str
     on_loss: str
@@ -112,12 +112,12 @@ class SceneLink:
 
     name: str
     clock: str
-    delay: Value
+    delay: ScalarValue
     within: tuple[Fraction, Fraction] | None
     graph: Graph
     delays: tuple[SceneDelay, ...]
     channel: SceneChannel | None
-    place: Place
+    place: SourceLocation
 
 
 def without_range(entry: PartEntry) -> PartEntry:
@@ -129,7 +129,9 @@ def without_range(entry: PartEntry) -> PartEntry:
     return replace(entry, body=replace(body, entries=rest))
 
 
-def _range(node: Sequence, link: str, component: Component, numbers: NamedNumbers) -> tuple[Value, Value]:
+def _range(
+    node: Sequence, link: str, component: Component, numbers: NamedNumbers
+) -> tuple[ScalarValue, ScalarValue]:
     """Read `[20 ms, 60 ms]`, the ends of a range of delays."""
     declared = component.parameter("delay")
     assert isinstance(declared, Parameter), "a link has a delay"
@@ -147,7 +149,7 @@ def _range(node: Sequence, link: str, component: Component, numbers: NamedNumber
     return low, high
 
 
-def read_link(part: Part, entry: PartEntry, numbers: NamedNumbers) -> SceneLink:
+def read_link(part: PartInstance, entry: PartEntry, numbers: NamedNumbers) -> SceneLink:
     """Read what a link's entry says beyond numbers and words.
 
     Parameters
@@ -190,13 +192,15 @@ def read_link(part: Part, entry: PartEntry, numbers: NamedNumbers) -> SceneLink:
             raise fault("E262", node.place, what)
         ends = _range(node, part.name, component, numbers)
         within = ends[0].number, ends[1].number
-        delay = Value((within[0] + within[1]) / 2, ends[0].dimension, None, node.place)
+        delay = ScalarValue((within[0] + within[1]) / 2, ends[0].dimension, None, node.place)
     if clock is None or delay is None:
         raise AlreadyReportedError
     return SceneLink(part.name, clock, delay, within, graph, delays, channel, part.place)
 
 
-def _read_channel(part: Part, nodes: Mapping[str, Node], numbers: NamedNumbers) -> SceneChannel | None:
+def _read_channel(
+    part: PartInstance, nodes: Mapping[str, Node], numbers: NamedNumbers
+) -> SceneChannel | None:
     """Read what makes a link unreliable; None when its entry says nothing of the kind.
 
     Parameters
@@ -216,7 +220,7 @@ def _read_channel(part: Part, nodes: Mapping[str, Node], numbers: NamedNumbers) 
             mistakes.add("E262", nodes[word].place, what, hint=_EXAMPLES[about[0]])
     if not given:
         return None
-    loss: Named[Value] = ()
+    loss: Named[ScalarValue] = ()
     trace = None
     if "loss" in nodes:
         with mistakes:
@@ -236,16 +240,16 @@ def _read_channel(part: Part, nodes: Mapping[str, Node], numbers: NamedNumbers) 
     return SceneChannel(loss, jitter, distribution, reorder, on_loss, delays)
 
 
-def _loss(link: str, node: Node, numbers: NamedNumbers) -> Named[Value]:
+def _loss(link: str, node: Node, numbers: NamedNumbers) -> Named[ScalarValue]:
     """Read a probability, or a mapping of netem's four; return all by their whole names.
 
     Those that are not given are as netem has them, none is known without p.
     """
     name = name_p = f"{link}.loss"
-    given: dict[str, Value | None] = {}
+    given: dict[str, ScalarValue | None] = {}
     if isinstance(node, MappingNode):
         name_p += ".p"
-        body = Body(node, PROBABILITIES, f"the loss of {link}", numbers.mistakes)
+        body = MappingReader(node, PROBABILITIES, f"the loss of {link}", numbers.mistakes)
         given = {key: body.read(key, partial(_probability, numbers=numbers), None) for key in PROBABILITIES}
         if "p" not in body.nodes:
             raise fault("E201", node.place, f"the loss of {link} has no p", hint=LOSS_EXAMPLE)
@@ -256,13 +260,13 @@ def _loss(link: str, node: Node, numbers: NamedNumbers) -> Named[Value]:
     rest = parse_expression(f"1 - {name_p}", p.place)
     usual = {"r": (1 - p.number, rest), "1-h": (Fraction(1), None), "1-k": (Fraction(0), None)}
     others = (
-        (f"{name}.{key}", given.get(key) or Value(number, DIMENSIONLESS, expression, p.place))
+        (f"{name}.{key}", given.get(key) or ScalarValue(number, DIMENSIONLESS, expression, p.place))
         for key, (number, expression) in usual.items()
     )
     return ((name_p, p), *others)
 
 
-def _probability(node: Node, what: str, numbers: NamedNumbers) -> Value:
+def _probability(node: Node, what: str, numbers: NamedNumbers) -> ScalarValue:
     value = numbers.read(node, what, DIMENSIONLESS, "%")
     if 0 <= value.number <= 1:
         return value

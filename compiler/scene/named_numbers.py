@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 
-from apc.compiler.components.component import RESERVED, Number, Settable, Variable
+from apc.compiler.components.component import RESERVED, ComponentVariable, NumberParameter, Settable
 from apc.compiler.errors import Mistakes
 from apc.compiler.language.csv_tables import NamedFiles
 from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND, Dimension
@@ -23,21 +23,21 @@ from apc.compiler.language.expression import names
 from apc.compiler.language.values import (
     PEERS,
     AlreadyReportedError,
-    Binding,
-    Value,
+    ScalarValue,
+    ValueBinding,
     read_binding,
     read_free,
     resolve_in_order,
     settle,
 )
 from apc.compiler.source.nodes import Node, Scalar
-from apc.compiler.source.reading import Body, brief, fault, name_of
+from apc.compiler.source.reading import MappingReader, brief, fault, name_of
 
 _WORD = re.compile(r"[A-Za-z]\w*", re.ASCII)
 
 
 def read_named_numbers(
-    root: Body, counts: Mapping[str, int], files: NamedFiles, *, complete: bool = True
+    root: MappingReader, counts: Mapping[str, int], files: NamedFiles, *, complete: bool = True
 ) -> NamedNumbers:
     """Read `parameters: {kt: 2000 N/m}`.
 
@@ -52,7 +52,7 @@ def read_named_numbers(
     complete
         Whether every group's count is known; else what follows from `peers` adds no message.
     """
-    waiting: dict[str, Binding] = {}
+    waiting: dict[str, ValueBinding] = {}
     section = root.section("parameters", "{kt: 2000 N/m}")
     others = {key.text for key, _ in section} | {"peers"}
     for key, value in section:
@@ -64,7 +64,7 @@ def read_named_numbers(
     return NamedNumbers(values, faulty, counts, files)
 
 
-def read_count_by_names(node: Scalar, root: Body) -> Value:
+def read_count_by_names(node: Scalar, root: MappingReader) -> ScalarValue:
     """Read how many peers a group has from named numbers, before it is known how many there are in all.
 
     Parameters
@@ -105,7 +105,7 @@ class NamedNumbers:
     each has; `files` reads files that are named, and takes mistakes.
     """
 
-    values: Mapping[str, Value]
+    values: Mapping[str, ScalarValue]
     faulty: Collection[str]
     counts: Mapping[str, int]
     files: NamedFiles
@@ -144,7 +144,7 @@ class NamedNumbers:
         dimension: Dimension,
         unit: str,
         words: Collection[tuple[str, Fraction]] = (),
-    ) -> Value:
+    ) -> ScalarValue:
         """Read a number.
 
         Parameters
@@ -166,16 +166,16 @@ class NamedNumbers:
         binding = read_binding(node, what, dimension, unit, self.dimension, self.names, words)
         return settle(binding, self.number)
 
-    def read_time(self, node: Node, what: str, unit: str = "ms") -> Value:
+    def read_time(self, node: Node, what: str, unit: str = "ms") -> ScalarValue:
         """Read a time, mostly in `unit`; a rate in Hz counts as its reciprocal. Raises ApcError."""
         if not (isinstance(node, Scalar) and node.text.rstrip().endswith("Hz")):
             return self.read(node, what, SECOND, unit)
         rate = self.read(node, what, SECOND.power(-1), "Hz")
         if rate.number <= 0:
             raise fault("E207", node.place, what, "a rate above 0 Hz", brief(node.text))
-        return Value(1 / rate.number, SECOND, None, rate.place)
+        return ScalarValue(1 / rate.number, SECOND, None, rate.place)
 
-    def read_for(self, node: Node, what: str, item: Settable) -> Value:
+    def read_for(self, node: Node, what: str, item: Settable) -> ScalarValue:
         """Read a number for a parameter, within its bounds, or a start value for a variable.
 
         Parameters
@@ -190,9 +190,9 @@ class NamedNumbers:
         ApcError
             What is at fault; a number out of bounds is recorded.
         """
-        assert isinstance(item, Number | Variable)
-        words = item.words if isinstance(item, Number) else ()
+        assert isinstance(item, NumberParameter | ComponentVariable)
+        words = item.words if isinstance(item, NumberParameter) else ()
         value = self.read(node, what, item.unit.dimension, item.unit.text, words)
-        if isinstance(item, Number):
+        if isinstance(item, NumberParameter):
             item.bounds.check(value, what, self.mistakes)
         return value

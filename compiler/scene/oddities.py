@@ -14,18 +14,18 @@ from pathlib import Path
 from scipy.cluster.hierarchy import DisjointSet
 
 from apc.compiler.components.parts import PartEntry
-from apc.compiler.errors import Mistake, Mistakes
+from apc.compiler.errors import Diagnostic, Mistakes
 from apc.compiler.scene.groups import SceneGroup
-from apc.compiler.scene.instances import Part
+from apc.compiler.scene.instances import PartInstance
 from apc.compiler.source.nodes import Sequence as ListNode
 
 
 def oddities(
-    parts: Sequence[Part],
+    parts: Sequence[PartInstance],
     entries: Mapping[str, PartEntry],
     groups: Iterable[SceneGroup],
     replaced: Mapping[str, Path],
-) -> tuple[Mistake, ...]:
+) -> tuple[Diagnostic, ...]:
     """Return the warnings about a scene, in the order of its file.
 
     Parameters
@@ -92,7 +92,7 @@ def oddities(
     return warnings.found
 
 
-def _joined(parts: Sequence[Part]) -> DisjointSet:
+def _joined(parts: Sequence[PartInstance]) -> DisjointSet:
     """Return the parts of one group as sets of what is joined, directly or not; the ground joins nothing."""
     result = DisjointSet(part.name for part in parts)
     for part in parts:
@@ -102,7 +102,7 @@ def _joined(parts: Sequence[Part]) -> DisjointSet:
     return result
 
 
-def warning_texts(warnings: Collection[Mistake]) -> tuple[str, ...]:
+def warning_texts(warnings: Collection[Diagnostic]) -> tuple[str, ...]:
     """Return warnings as texts, each with its place in the topology, whose folder is left out."""
     return tuple(
         f"{replace(mistake.place, file=Path(mistake.place.file).name)}: {mistake.code} {mistake.sentence}"

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 from apc.compiler.components.component import Component
-from apc.compiler.components.parts import PART_KEYS, PartEntry, Parts, component_named
+from apc.compiler.components.parts import PART_KEYS, PartEntries, PartEntry, component_named
 from apc.compiler.scene.groups import GroupBody
 from apc.compiler.source.nodes import Mapping as MappingNode
 from apc.compiler.source.nodes import Node, Scalar, Sequence
@@ -22,7 +22,7 @@ from apc.compiler.words import enumerated
 TYPE = ".type"
 
 
-def redeclared(groups: Iterable[GroupBody], parts: Parts) -> dict[str, dict[str, PartEntry]]:
+def redeclared(groups: Iterable[GroupBody], parts: PartEntries) -> dict[str, dict[str, PartEntry]]:
     """Return the entries of parts whose type a group sets, by the part's name and the group's.
 
     Parameters
@@ -51,7 +51,7 @@ def _settings(group: GroupBody) -> Iterator[tuple[Scalar, Node]]:
 
 
 def _entry(
-    entry: PartEntry, key: Scalar, node: Node, settings: list[tuple[Scalar, Node]], parts: Parts
+    entry: PartEntry, key: Scalar, node: Node, settings: list[tuple[Scalar, Node]], parts: PartEntries
 ) -> PartEntry:
     """Return a part's entry with the type that a group sets. Raises ApcError for one that doesn't fit."""
     old, hint = entry.component, f"{key.text}: {entry.component.name}"

@@ -1,6 +1,6 @@
 """A topology file to a scene: typed, every quantity in SI, every name resolved.
 
-Takes: the YAML source of a topology and a library. Gives: `Scene`.
+Takes: the YAML source of a topology and a library. Gives: `Topology`.
 Guarantees: parts, clocks, links, parameters and connections that are named exist; quantities have the unit
 their parameter wants and lie within its bounds; parts inside parts and arrays are written out; all mistakes
 of the file are reported together.
@@ -19,13 +19,13 @@ from apc.compiler.cache import SUFFIX
 from apc.compiler.compiled import Axis, Experiment
 from apc.compiler.components.component import Named
 from apc.compiler.components.component_library import Library, definition_of
-from apc.compiler.components.parts import Parts, Scope
-from apc.compiler.errors import Mistake, Mistakes, Place, visible
+from apc.compiler.components.parts import EntryScope, PartEntries
+from apc.compiler.errors import Diagnostic, Mistakes, SourceLocation, visible
 from apc.compiler.files import RefusedError, files_below
 from apc.compiler.language.csv_tables import NamedFiles
-from apc.compiler.language.values import AlreadyReportedError, Value
+from apc.compiler.language.values import AlreadyReportedError, ScalarValue
 from apc.compiler.scene.groups import GroupReader, SceneGroup, read_counts
-from apc.compiler.scene.instances import Part, PartReader, settable_names
+from apc.compiler.scene.instances import PartInstance, PartReader, settable_names
 from apc.compiler.scene.links import PROBABILITY, SceneLink, read_link, without_range
 from apc.compiler.scene.named_numbers import read_named_numbers
 from apc.compiler.scene.oddities import oddities
@@ -33,7 +33,7 @@ from apc.compiler.scene.redeclarations import redeclared
 from apc.compiler.scene.studies import read_experiment, read_studies
 from apc.compiler.scene.timebase import SceneClock, read_clocks
 from apc.compiler.source.nodes import Mapping, Sequence
-from apc.compiler.source.reading import Body, brief, fault, mapping_of, text_of
+from apc.compiler.source.reading import MappingReader, brief, fault, mapping_of, text_of
 from apc.compiler.source.source import Source
 
 SECTIONS = ("masses", "couplers", "links", "hands")  # those of parts
@@ -61,22 +61,22 @@ REQUIRED = {
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class Topology:
     """A topology, whole. `texts` are the files it names; `warnings` are no mistakes."""
 
     name: str
     about: str
     clocks: tuple[SceneClock, ...]
-    parameters: Named[Value]
+    parameters: Named[ScalarValue]
     groups: tuple[SceneGroup, ...]
-    parts: tuple[Part, ...]
+    parts: tuple[PartInstance, ...]
     links: tuple[SceneLink, ...]
     experiment: Experiment
     region: tuple[Axis, ...]
     tune: tuple[tuple[str, str], ...]
     texts: tuple[str, ...]
-    place: Place
-    warnings: tuple[Mistake, ...]
+    place: SourceLocation
+    warnings: tuple[Diagnostic, ...]
 
     @property
     def peers(self) -> int:
@@ -88,7 +88,7 @@ class Scene:
         """The names of its groups and parts."""
         return (*(group.name for group in self.groups), *(part.name for part in self.parts))
 
-    def part(self, name: str) -> Part:
+    def part(self, name: str) -> PartInstance:
         """Return the part of this name."""
         return next(part for part in self.parts if part.name == name)
 
@@ -106,7 +106,7 @@ def library_folders(source: Source) -> tuple[Path, ...]:
     return tuple(paths)
 
 
-def readable_library(folder: Path, text: str, place: Place, hint: str = "library: ./parts") -> Path:
+def readable_library(folder: Path, text: str, place: SourceLocation, hint: str = "library: ./parts") -> Path:
     """Return a folder of components. Raises ApcError (E214), at a place, for one that can't be read."""
     try:
         files_below(folder, SUFFIX)
@@ -126,7 +126,7 @@ def _folder_of(source: Source) -> Path:
     return source.path.parent if source.path is not None else Path()
 
 
-def build_scene(source: Source, library: Library) -> Scene:
+def build_scene(source: Source, library: Library) -> Topology:
     """Read a topology, those sections first that others refer to. Raises ApcError with all its mistakes."""
     mistakes = Mistakes()
     files = NamedFiles(_folder_of(source), mistakes)
@@ -135,7 +135,7 @@ def build_scene(source: Source, library: Library) -> Scene:
     if kind:
         what = f"{name} is a {kind}; a topology has parts of its type, and names the folder it is in"
         raise fault("E201", node.place, what, hint="library: ./parts")
-    root = Body(node, TOPOLOGY, "a topology", mistakes)
+    root = MappingReader(node, TOPOLOGY, "a topology", mistakes)
     for key, example in REQUIRED.items():
         if key not in root.nodes:
             what = "the topology has no name" if key == "topology" else f"the topology has no {key} section"
@@ -147,12 +147,14 @@ def build_scene(source: Source, library: Library) -> Scene:
     mistakes.names = tuple(counts)
     numbers = read_named_numbers(root, counts, files, complete=complete)
     clocks = read_clocks(root, numbers, {*numbers.values, *counts})
-    sections = Parts(library, mistakes, {*numbers.values, *counts, *clocks})
+    sections = PartEntries(library, mistakes, {*numbers.values, *counts, *clocks})
     for section in SECTIONS:
         sections.read(section, root)
     names = _Names(root, sections, clocks, tuple(counts))
     entries = sections.entries
-    scope = Scope(numbers.dimension, numbers.names, names.of_role, sections, "this topology", names.complete)
+    scope = EntryScope(
+        numbers.dimension, numbers.names, names.of_role, sections, "this topology", names.complete
+    )
     reader = PartReader(scope, numbers)
     others_at = redeclared(bodies.values(), sections)
     for entry in entries.values():
@@ -175,7 +177,7 @@ def build_scene(source: Source, library: Library) -> Scene:
     region, tune = read_studies(root, settable, numbers, names.is_reported)
     name, about = (visible(root.text(key)) for key in ("topology", "about"))
     mistakes.raise_if_any()  # before warnings, which would tell a second time what is missing for a mistake
-    return Scene(
+    return Topology(
         name,
         about,
         tuple(clocks.values()),
@@ -196,8 +198,8 @@ def build_scene(source: Source, library: Library) -> Scene:
 class _Names:
     """What the names in a topology stand for, and whether it was said why one stands for nothing."""
 
-    root: Body
-    sections: Parts
+    root: MappingReader
+    sections: PartEntries
     clocks: Collection[str]
     groups: tuple[str, ...]
 
@@ -230,7 +232,7 @@ class _Names:
         part = re.split(r"[.\[]", name)[0]
         return part in self.sections.faulty or (not self.complete and part not in self.sections.entries)
 
-    def explain(self, name: str, place: Place) -> None:
+    def explain(self, name: str, place: SourceLocation) -> None:
         """Raise why a group can't set `part.parameter`, if that is known or was reported."""
         link, _, parameter = name.partition(".")
         if link in self.links:

@@ -11,14 +11,14 @@ from collections.abc import Callable
 from fractions import Fraction
 
 from apc.compiler.compiled import Axis, Experiment
-from apc.compiler.components.component import Number
+from apc.compiler.components.component import NumberParameter
 from apc.compiler.language.unit_text import format_dimension
-from apc.compiler.language.values import AlreadyReportedError, Value
+from apc.compiler.language.values import AlreadyReportedError, ScalarValue
 from apc.compiler.scene.instances import SettableNames
 from apc.compiler.scene.named_numbers import NamedNumbers
 from apc.compiler.source.nodes import Mapping, Node, Scalar, Sequence
 from apc.compiler.source.reading import (
-    Body,
+    MappingReader,
     brief,
     fault,
     form,
@@ -33,7 +33,7 @@ AXES = ("x", "y")
 TUNED = ("free", "maximize", "minimize", "subject", "over", "hands")
 
 
-def read_experiment(root: Body, numbers: NamedNumbers) -> Experiment:
+def read_experiment(root: MappingReader, numbers: NamedNumbers) -> Experiment:
     """Read `experiment: {duration: 3 s, seed: 1}`; `numbers` reads the duration, in seconds."""
 
     def duration(node: Node, what: str) -> Fraction:
@@ -52,14 +52,14 @@ def read_experiment(root: Body, numbers: NamedNumbers) -> Experiment:
     return Experiment(section.read("duration", duration, None), section.read("seed", seed, 0))
 
 
-def _section(around: Body, key: str, keys: tuple[str, ...], hint: str) -> Body:
+def _section(around: MappingReader, key: str, keys: tuple[str, ...], hint: str) -> MappingReader:
     """Return what stands in a section, which may be missing."""
     node = around.read(key, lambda node, _: mapping_of(node, key, f"{key}: {hint}"), None)
-    return Body(node or Mapping((), around.place), keys, key, around.mistakes)
+    return MappingReader(node or Mapping((), around.place), keys, key, around.mistakes)
 
 
 def read_studies(
-    root: Body, settable: SettableNames, numbers: NamedNumbers, is_reported: Callable[[str], bool]
+    root: MappingReader, settable: SettableNames, numbers: NamedNumbers, is_reported: Callable[[str], bool]
 ) -> tuple[tuple[Axis, ...], tuple[tuple[str, str], ...]]:
     """Read `studies: {region: {x: {contact.stiffness: [0 N/m, 5000 N/m]}, y: …}, tune: {free: …}}`.
 
@@ -79,13 +79,13 @@ def read_studies(
     tuple of Axis
         The axes of the region.
     tuple of (str, str)
-        What is to be tuned, as `CompiledSystem.tune` has it.
+        What is to be tuned, as `Model.tune` has it.
     """
 
-    def values(key: str, name: Scalar, span: Node, hint: str) -> tuple[Value, Value]:
+    def values(key: str, name: Scalar, span: Node, hint: str) -> tuple[ScalarValue, ScalarValue]:
         if not (isinstance(span, Sequence) and len(span.items) == 2):
             raise fault("E203", span.place, name.text, "a list of two values", form(span), hint)
-        known = {known: item for known, (item, _) in settable.items() if isinstance(item, Number)}
+        known = {known: item for known, (item, _) in settable.items() if isinstance(item, NumberParameter)}
         if name.text not in known:
             if is_reported(name.text):
                 raise AlreadyReportedError

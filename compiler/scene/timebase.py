@@ -15,10 +15,10 @@ from fractions import Fraction
 from apc.compiler.components.component import RESERVED
 from apc.compiler.digits import plain_float
 from apc.compiler.language.dimensions import SECOND
-from apc.compiler.language.values import AlreadyReportedError, Value
+from apc.compiler.language.values import AlreadyReportedError, ScalarValue
 from apc.compiler.scene.named_numbers import NamedNumbers
 from apc.compiler.source.nodes import Mapping, Node, Scalar
-from apc.compiler.source.reading import Body, brief, fault, name_of
+from apc.compiler.source.reading import MappingReader, brief, fault, name_of
 
 CLOCK = ("period", "phase")
 LIKE_A_RATE = 30  # a larger number without a unit is rather a rate in Hz than a period in ms
@@ -29,11 +29,11 @@ class SceneClock:
     """Ticks at `phase + k*period`, in seconds."""
 
     name: str
-    period: Value
-    phase: Value
+    period: ScalarValue
+    phase: ScalarValue
 
 
-def read_clocks(root: Body, numbers: NamedNumbers, taken: Container[str]) -> dict[str, SceneClock]:
+def read_clocks(root: MappingReader, numbers: NamedNumbers, taken: Container[str]) -> dict[str, SceneClock]:
     """Read `clocks: {haptic: 1 ms, network: {period: 8 ms, phase: 2 ms}}`.
 
     Parameters
@@ -53,11 +53,11 @@ def read_clocks(root: Body, numbers: NamedNumbers, taken: Container[str]) -> dic
     return result
 
 
-def _read_clock(name: str, node: Node, numbers: NamedNumbers, root: Body) -> SceneClock:
+def _read_clock(name: str, node: Node, numbers: NamedNumbers, root: MappingReader) -> SceneClock:
     """Read a period, or a mapping of a period and a phase."""
-    phase = Value(Fraction(0), SECOND, None, node.place)
+    phase = ScalarValue(Fraction(0), SECOND, None, node.place)
     if isinstance(node, Mapping):
-        body = Body(node, CLOCK, f"clock {name}", root.mistakes)
+        body = MappingReader(node, CLOCK, f"clock {name}", root.mistakes)
         if "period" not in body.nodes:
             raise fault("E201", node.place, f"clock {name} has no period", hint="period: 1 ms")
         given = body.read("period", numbers.read_time, None)

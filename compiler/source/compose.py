@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 
 import yaml
 
-from apc.compiler.errors import ApcError, Mistakes, Place, nearest
+from apc.compiler.errors import ApcError, Mistakes, SourceLocation, nearest
 from apc.compiler.source.nodes import Lines, Mapping, Node, Scalar, Sequence
 from apc.compiler.source.reading import either_comma, fault
 from apc.compiler.source.yaml_faults import NO_COLON, not_yaml, with_colon
@@ -70,10 +70,10 @@ def compose(text: str, lines: Lines) -> Node:
     except yaml.MarkedYAMLError as error:
         composer.mistakes.take(ApcError(not_yaml(error, lines)))
     except yaml.YAMLError as error:
-        composer.mistakes.add("E109", Place(lines.file), f"this is not YAML: {error}")
+        composer.mistakes.add("E109", SourceLocation(lines.file), f"this is not YAML: {error}")
     composer.mistakes.raise_if_any()
     if root is None or (isinstance(root, Scalar) and root.plain and not root.text):
-        raise fault("E108", Place(lines.file), "this file is empty")
+        raise fault("E108", SourceLocation(lines.file), "this file is empty")
     return root
 
 
@@ -82,7 +82,7 @@ class _Tree:
     """A node, where it or the alias of it stands, how many nodes it holds, and how many levels."""
 
     node: Node
-    place: Place
+    place: SourceLocation
     size: int = 1
     height: int = 1
 
@@ -114,12 +114,12 @@ class _Composer:
             self.anchors[event.anchor] = tree
         return tree
 
-    def count(self, nodes: int, place: Place) -> None:
+    def count(self, nodes: int, place: SourceLocation) -> None:
         self.nodes += nodes
         if self.nodes > MAX_NODES:
             self.give_up("E117", place, f"this file has more than {MAX_NODES} nodes, aliases written out")
 
-    def collection(self, event: Any, place: Place, depth: int) -> _Tree:
+    def collection(self, event: Any, place: SourceLocation, depth: int) -> _Tree:
         is_mapping = isinstance(event, yaml.MappingStartEvent)
         if event.tag not in (None, "!", _CORE + ("map" if is_mapping else "seq")):
             self.refuse_tag(event.tag, place)
@@ -127,7 +127,7 @@ class _Composer:
         if event.anchor is not None:
             self.anchors[event.anchor] = None
         trees: list[_Tree] = []  # of a mapping: key, value, key, value, …
-        seen: dict[str, Place] = {}
+        seen: dict[str, SourceLocation] = {}
         while not isinstance(event := next(self.events), yaml.CollectionEndEvent):
             tree = self.tree(event, depth + 1)
             if is_mapping and len(trees) % 2 == 0:
@@ -143,7 +143,7 @@ class _Composer:
         size = 1 + sum(tree.size for tree in trees)
         return _Tree(node, place, size, 1 + max((tree.height for tree in trees), default=0))
 
-    def check_depth(self, depth: int, place: Place) -> None:
+    def check_depth(self, depth: int, place: SourceLocation) -> None:
         if depth > MAX_DEPTH:
             self.give_up("E115", place, f"this is nested deeper than {MAX_DEPTH} levels")
 
@@ -161,7 +161,7 @@ class _Composer:
                     self.mistakes.add("E109", key.place, NO_COLON, hint=line)
             before = key, node
 
-    def alias(self, name: str, place: Place, depth: int) -> _Tree:
+    def alias(self, name: str, place: SourceLocation, depth: int) -> _Tree:
         if name not in self.anchors:
             close = nearest(name, self.anchors)
             self.give_up("E114", place, f"*{name} has no &{name} before it", f"*{close}" if close else "")
@@ -171,7 +171,7 @@ class _Composer:
         self.check_depth(depth + tree.height - 2, place)
         return _Tree(tree.node, place, tree.size, tree.height)
 
-    def check_key(self, key: Node, seen: dict[str, Place], place: Place) -> None:
+    def check_key(self, key: Node, seen: dict[str, SourceLocation], place: SourceLocation) -> None:
         if not isinstance(key, Scalar) or not key.text:
             got = "nothing" if isinstance(key, Scalar) else "a list"
             got = "a mapping" if isinstance(key, Mapping) else got
@@ -185,7 +185,7 @@ class _Composer:
         else:
             seen[key.text] = place
 
-    def value(self, event: Any, place: Place) -> bool | int | float | str | None:
+    def value(self, event: Any, place: SourceLocation) -> bool | int | float | str | None:
         tag = event.tag
         if tag in (None, "!", _CORE + "str"):
             # "!" and !!str say: text, whatever it looks like.
@@ -200,11 +200,11 @@ class _Composer:
             self.mistakes.add("E113", place, f"!!{name}", expected="such a value", got=got)
         return float(value) if name == "float" and type(value) is int else value
 
-    def refuse_tag(self, tag: str, place: Place) -> None:
+    def refuse_tag(self, tag: str, place: SourceLocation) -> None:
         shown = "!!" + tag.removeprefix(_CORE) if tag.startswith(_CORE) else tag
         self.mistakes.add("E113", place, f"the tag {cut(shown)!r} is not part of this language")
 
-    def give_up(self, code: str, place: Place, what: str, hint: str = "") -> NoReturn:
+    def give_up(self, code: str, place: SourceLocation, what: str, hint: str = "") -> NoReturn:
         """Raise at once, with what was found before: reading on would mislead, or not end."""
         self.mistakes.add(code, place, what, hint=hint)
         self.mistakes.raise_if_any()

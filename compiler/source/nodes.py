@@ -11,7 +11,7 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
-from apc.compiler.errors import Place
+from apc.compiler.errors import SourceLocation
 
 MAX_BYTES = 1 << 20  # 1 MiB; the largest scene we know of is a hundredth of it
 
@@ -23,7 +23,7 @@ class Scalar:
     text: str
     value: bool | int | float | str | None
     plain: bool
-    place: Place
+    place: SourceLocation
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ class Sequence:
     """A list of nodes."""
 
     items: tuple[Node, ...]
-    place: Place
+    place: SourceLocation
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class Mapping:
     """Keys and nodes in the order of the text; no two keys have the same text."""
 
     entries: tuple[tuple[Scalar, Node], ...]
-    place: Place
+    place: SourceLocation
 
     def get(self, key: str) -> Node | None:
         """Return the node of a key, or None when the key is not there."""
@@ -54,17 +54,17 @@ Node = Scalar | Sequence | Mapping
 
 
 class Lines:
-    """The lines of a text, each kept once: every `Place` on a line shares its string."""
+    """The lines of a text, each kept once: every `SourceLocation` on a line shares its string."""
 
     def __init__(self, file: str, text: str) -> None:
         self.file = file
         self.lines = re.split(r"\r\n|\n|\r", text)
 
-    def place(self, line: int, column: int) -> Place:
+    def place(self, line: int, column: int) -> SourceLocation:
         """Return a place; `line` and `column` count from 0, as YAML's marks do."""
         source_line = self.lines[line] if line < len(self.lines) else ""
-        return Place(self.file, line + 1, column + 1, source_line)
+        return SourceLocation(self.file, line + 1, column + 1, source_line)
 
-    def of(self, mark: Any) -> Place:
+    def of(self, mark: Any) -> SourceLocation:
         """Return the place of a YAML mark."""
         return self.place(mark.line, mark.column)

@@ -1,7 +1,7 @@
 """Reads typed values out of YAML nodes; a node that is not what it should be raises what to write instead.
 
-Takes: nodes of the stage `source`. Gives: texts, names, numbers and lists of nodes; `Body`, a mapping that is
-read key by key.
+Takes: nodes of the stage `source`. Gives: texts, names, numbers and lists of nodes; `MappingReader`, a
+mapping that is read key by key.
 Guarantees: a node of the wrong form is one mistake, an `ApcError` that `with mistakes:` records, so that
 reading goes on behind it.
 Does not: know any section, component or unit.
@@ -13,7 +13,7 @@ import re
 from collections.abc import Callable, Collection, Container
 from typing import TypeVar
 
-from apc.compiler.errors import ApcError, Mistake, Mistakes, Place, nearest, visible
+from apc.compiler.errors import ApcError, Diagnostic, Mistakes, SourceLocation, nearest, visible
 from apc.compiler.source.nodes import Mapping, Node, Scalar, Sequence
 
 T = TypeVar("T")
@@ -46,9 +46,11 @@ def brief(text: str) -> str:
     return visible(flat if len(flat) <= 60 else flat[:57] + "...")
 
 
-def fault(code: str, place: Place, what: str, expected: str = "", got: str = "", hint: str = "") -> ApcError:
-    """Return one mistake to raise, its parts as `Mistake` has them."""
-    return ApcError(Mistake(code, place, what, expected, got, hint))
+def fault(
+    code: str, place: SourceLocation, what: str, expected: str = "", got: str = "", hint: str = ""
+) -> ApcError:
+    """Return one mistake to raise, its parts as `Diagnostic` has them."""
+    return ApcError(Diagnostic(code, place, what, expected, got, hint))
 
 
 def mapping_of(node: Node, what: str, hint: str = "") -> Mapping:
@@ -125,7 +127,7 @@ def name_of(
     return name
 
 
-class Body:
+class MappingReader:
     """A mapping that is read key by key; a value at fault is recorded and reads as one that isn't there.
 
     A key that isn't allowed is recorded, with the nearest allowed one, and reads as the one it was meant to
@@ -170,7 +172,7 @@ class Body:
         return result
 
 
-def unknown(code: str, place: Place, what: str, name: str, texts: Collection[str]) -> ApcError:
+def unknown(code: str, place: SourceLocation, what: str, name: str, texts: Collection[str]) -> ApcError:
     """Return the mistake of an unknown name, with the nearest known one or, failing that, a list of them.
 
     Parameters
@@ -189,7 +191,7 @@ def unknown(code: str, place: Place, what: str, name: str, texts: Collection[str
     return fault(code, place, f"{what}; there are: {listed}" if listed else f"{what}; there is none")
 
 
-def among(name: str, texts: Collection[str], place: Place, what: str, code: str = "E206") -> str:
+def among(name: str, texts: Collection[str], place: SourceLocation, what: str, code: str = "E206") -> str:
     """Return a name that is known.
 
     Parameters

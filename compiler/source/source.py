@@ -12,7 +12,7 @@ import unicodedata
 from dataclasses import dataclass
 from pathlib import Path
 
-from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
 from apc.compiler.files import RefusedError, read_file
 from apc.compiler.source.compose import compose
 from apc.compiler.source.nodes import MAX_BYTES, Lines, Node
@@ -48,25 +48,25 @@ def read_source(path: Path, *, shown: str | None = None) -> Source:
     try:
         data = read_file(path, MAX_BYTES)
     except RefusedError as refused:
-        raise ApcError(_not_read(path, Place(file), refused)) from None
+        raise ApcError(_not_read(path, SourceLocation(file), refused)) from None
     return parse_source(data, file=file, path=path)
 
 
-def _not_read(path: Path, place: Place, refused: RefusedError) -> Mistake:
+def _not_read(path: Path, place: SourceLocation, refused: RefusedError) -> Diagnostic:
     match refused.why:
         case "missing":
-            return Mistake("E101", place, _missing(path))
+            return Diagnostic("E101", place, _missing(path))
         case "folder" | "special":
             code = "E102" if refused.why == "folder" else "E104"
-            return Mistake(code, place, "this", "a YAML file", refused.words.removeprefix("is "))
+            return Diagnostic(code, place, "this", "a YAML file", refused.words.removeprefix("is "))
         case "large":
             return _too_large(place)
-    return Mistake("E103", place, f"this file {refused.words}")
+    return Diagnostic("E103", place, f"this file {refused.words}")
 
 
-def _too_large(place: Place) -> Mistake:
+def _too_large(place: SourceLocation) -> Diagnostic:
     what = f"this file is larger than {MAX_BYTES} bytes, the most a YAML file may have here"
-    return Mistake("E105", place, what)
+    return Diagnostic("E105", place, what)
 
 
 def parse_source(data: bytes, *, file: str, path: Path | None = None) -> Source:
@@ -90,7 +90,7 @@ def parse_source(data: bytes, *, file: str, path: Path | None = None) -> Source:
         E117 too many nodes.
     """
     if len(data) > MAX_BYTES:
-        raise ApcError(_too_large(Place(file)))
+        raise ApcError(_too_large(SourceLocation(file)))
     text = _decode(data, file)
     lines = Lines(file, text)
     _refuse_control_characters(text, lines)
@@ -121,7 +121,9 @@ def _decode(data: bytes, file: str) -> str:
         before = re.split(rb"\r\n|\n|\r", data[:start])
         line, column = len(before), len(before[-1].decode("utf-8-sig", "replace")) + 1
         got = f"byte 0x{data[start]:02x} at offset {start}"
-        raise ApcError(Mistake("E106", Place(file, line, column), "a YAML file", "UTF-8 text", got)) from None
+        raise ApcError(
+            Diagnostic("E106", SourceLocation(file, line, column), "a YAML file", "UTF-8 text", got)
+        ) from None
 
 
 # YAML's line breaks beyond LF and CR (U+0085, U+2028, U+2029) show in few editors: refused with the rest.
@@ -137,4 +139,4 @@ def _refuse_control_characters(text: str, lines: Lines) -> None:
     name = unicodedata.name(character, "a control character")
     got = f"U+{ord(character):04X} ({name})" + (", as in a binary file" if character == "\0" else "")
     place = lines.place(len(before) - 1, len(before[-1]))
-    raise ApcError(Mistake("E107", place, "a YAML file", "visible text", got))
+    raise ApcError(Diagnostic("E107", place, "a YAML file", "visible text", got))

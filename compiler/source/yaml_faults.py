@@ -1,6 +1,6 @@
 """What PyYAML complains of, in our words: one sentence at the place that has to change.
 
-Takes: an error of either of PyYAML's parsers, and the lines of the text. Gives: `not_yaml`, a `Mistake`.
+Takes: an error of either of PyYAML's parsers, and the lines of the text. Gives: `not_yaml`, a `Diagnostic`.
 Guarantees: E109, whatever the error; the text of PyYAML where we have no better one.
 Does not: read YAML.
 """
@@ -11,7 +11,7 @@ import re
 
 import yaml
 
-from apc.compiler.errors import Mistake, Place
+from apc.compiler.errors import Diagnostic, SourceLocation
 from apc.compiler.source.nodes import Lines
 
 NO_COLON = "a key stands here without its colon and a space"
@@ -72,7 +72,7 @@ def _line_above(line: int, lines: Lines) -> int:
     return above
 
 
-def _without_colon(line: int, lines: Lines) -> Mistake | None:
+def _without_colon(line: int, lines: Lines) -> Diagnostic | None:
     """Return the mistake of a line whose key has no colon; None if it has one."""
     text, place = _code(line, lines)
     match = _KEY_ONLY.fullmatch(text)
@@ -80,31 +80,31 @@ def _without_colon(line: int, lines: Lines) -> Mistake | None:
         text = f"{bracket[1]} {text[bracket.end() - 1 :]}"
     elif match is None or ": " in text or text.endswith(":") or text.startswith("- "):
         return None
-    return Mistake("E109", place, NO_COLON, hint=with_colon(text) or f"{text}:")
+    return Diagnostic("E109", place, NO_COLON, hint=with_colon(text) or f"{text}:")
 
 
-def _item_among_keys(line: int, lines: Lines) -> Mistake | None:
+def _item_among_keys(line: int, lines: Lines) -> Diagnostic | None:
     """Return the mistake of a line that is an item where keys stand around it; None if it is none."""
     text, place = _code(line, lines)
-    return Mistake("E109", place, AMONG_KEYS, hint=text[2:].strip()) if text.startswith("- ") else None
+    return Diagnostic("E109", place, AMONG_KEYS, hint=text[2:].strip()) if text.startswith("- ") else None
 
 
-def _indented_further(line: int, lines: Lines) -> Mistake | None:
+def _indented_further(line: int, lines: Lines) -> Diagnostic | None:
     """Return the mistake of a line that is indented further than the one above, whose key has a value."""
     (text, place), (above, at) = (_code(number, lines) for number in (line, _line_above(line, lines)))
     if not (_KEY_AND_VALUE.match(text) and _KEY_AND_VALUE.match(above)) or place.column <= at.column:
         return None
     what = f"this line is indented by {place.column - 1} spaces, the one above it by {at.column - 1}"
-    return Mistake("E109", place, what, hint=f"{' ' * (at.column - 1)}{text}")
+    return Diagnostic("E109", place, what, hint=f"{' ' * (at.column - 1)}{text}")
 
 
-def _code(line: int, lines: Lines) -> tuple[str, Place]:
+def _code(line: int, lines: Lines) -> tuple[str, SourceLocation]:
     """Return a line without its indent and comment, and where it starts; an empty text where none is."""
     text = lines.lines[line].partition(" #")[0] if 0 <= line < len(lines.lines) else ""
     return text.strip(), lines.place(line, len(text) - len(text.lstrip()))
 
 
-def not_yaml(error: yaml.MarkedYAMLError, lines: Lines) -> Mistake:
+def not_yaml(error: yaml.MarkedYAMLError, lines: Lines) -> Diagnostic:
     """Rewrite PyYAML's error as one sentence at the place that has to change."""
     mark = error.problem_mark or error.context_mark
     assert mark is not None, error
@@ -112,17 +112,19 @@ def not_yaml(error: yaml.MarkedYAMLError, lines: Lines) -> Mistake:
     rest = place.source_line[place.column - 1 :]
     indent = place.source_line[: len(place.source_line) - len(place.source_line.lstrip())]
     if "\t" in indent or rest.startswith("\t"):
-        return Mistake("E109", place, "a tab indents this line, and YAML allows spaces only", hint="spaces")
+        return Diagnostic(
+            "E109", place, "a tab indents this line, and YAML allows spaces only", hint="spaces"
+        )
     if "cannot start any token" in (error.problem or ""):
         quoted = f"'{rest.strip()[:40]}'"
-        return Mistake("E109", place, f"a text starting with {rest[:1]} needs quotes", hint=quoted)
+        return Diagnostic("E109", place, f"a text starting with {rest[:1]} needs quotes", hint=quoted)
     problem = f"{error.problem}; {error.context}"
     before = _TEXT.search(place.source_line[: place.column - 1])
     bracket = _BRACKET.match(rest)
     if before and bracket and "expected ','" in problem:  # x[1], {1, 0} or chain[1:2] between { and }
         text = before[0] + bracket[0].rstrip()
         where = place.shifted(-len(before[0]))
-        return Mistake("E109", where, f"a text with {rest[0]} in it needs quotes here", hint=f'"{text}"')
+        return Diagnostic("E109", where, f"a text with {rest[0]} in it needs quotes here", hint=f'"{text}"')
     opening, above = (error.context_mark or mark).line, _line_above(mark.line, lines)
     slips = {
         "mapping values": (
@@ -140,5 +142,5 @@ def not_yaml(error: yaml.MarkedYAMLError, lines: Lines) -> Mistake:
         if part in problem:
             if error.context_mark and sentence.startswith("this ") and "indented" not in sentence:
                 place = lines.of(error.context_mark)
-            return Mistake("E109", place, sentence, hint=hint)
-    return Mistake("E109", place, f"this is not YAML: {error.problem}")
+            return Diagnostic("E109", place, sentence, hint=hint)
+    return Diagnostic("E109", place, f"this is not YAML: {error.problem}")

@@ -1,6 +1,6 @@
 """The library as a person looks through it: its components and scenes, a line each, and one component whole.
 
-Takes: a `Library`, a name.
+Takes: a `LoadedLibrary`, a name.
 Gives: `library_lines` and `library_document`; `component_text` and `component_document` of a component or
 connector; `scenes`, `scene_lines`, `scene_named`, `tables_of` of the topologies that come with the
 program.
@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any
 
 from apc.compiler.cache import SUFFIX, builtin_files
-from apc.compiler.components.component import Component, Connector, Number, Option, Parameter
+from apc.compiler.components.component import Component, Connector, NumberParameter, Option, Parameter
 from apc.compiler.components.component_library import Library
-from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
 from apc.compiler.language.vectors import by_vector
 from apc.compiler.pipeline import run_stages
-from apc.compiler.scene.scene import Scene
+from apc.compiler.scene.scene import Topology
 from apc.compiler.source.nodes import Mapping, Scalar
 from apc.compiler.source.source import Source, read_source
 from apc.compiler.view.schema import in_unit, is_required, limits_of
@@ -61,7 +61,9 @@ def _found(library: Library, name: str) -> Component | Connector:
         names = {name.lower(): name for name in library.names}
         near = names.get(nearest(name.lower(), names), "")
         what = f"the library has no {name[:80] or 'nameless component'}"
-        raise ApcError(Mistake("E206", Place("apc library"), what, hint=f"apc library {near}".rstrip()))
+        raise ApcError(
+            Diagnostic("E206", SourceLocation("apc library"), what, hint=f"apc library {near}".rstrip())
+        )
     return result
 
 
@@ -95,7 +97,7 @@ def component_document(library: Library, name: str) -> dict[str, Any]:
     result = _found(library, name)
     kind, whole = "component", result
     if isinstance(whole, Connector):  # it has no parts of its own to tell of
-        kind, whole = "connector", Component(name, result.about, "", Place(""))
+        kind, whole = "connector", Component(name, result.about, "", SourceLocation(""))
     vectors = by_vector(whole.parameters)
     return {
         "name": name,
@@ -115,7 +117,7 @@ def _parameter(name: str, entries: list[Parameter]) -> dict[str, str]:
     entry, unit, value, limits = entries[0], "", "needed" if is_required(entries[0]) else "", ""
     if isinstance(entry, Option):
         value, limits = entry.default or "needed", ", ".join(entry.words)
-    elif not isinstance(entry, Number):
+    elif not isinstance(entry, NumberParameter):
         limits = f"a {entry.role}"
     else:
         unit, limits = entry.unit.text, ", ".join([*limits_of(entry), *(word for word, _ in entry.words)])
@@ -162,12 +164,12 @@ def scene_named(name: str) -> Path:
         near = nearest(name, known)
         what = f"the library has no scene {name[:80]}"
         hint = f"apc new --like {near}" if near else "apc new --list"
-        raise ApcError(Mistake("E206", Place("--like"), what, hint=hint))
+        raise ApcError(Diagnostic("E206", SourceLocation("--like"), what, hint=hint))
     return known[name]
 
 
 def tables_of(scene: Path) -> tuple[Path, ...]:
     """Return the files that a topology names from its folder."""
     built = run_stages(scene, until="scene")
-    assert isinstance(built, Scene)
+    assert isinstance(built, Topology)
     return tuple(scene.parent / name for name in built.texts)

@@ -1,7 +1,7 @@
 """A scene as a graph: parts joined within a peer, peers joined over links; as text for Graphviz and Mermaid.
 
-Takes: `Scene`. Gives: `Diagram` of `Box` and `Edge`, `build_diagram`; `draw_dot`, `draw_mermaid`; `one_of`,
-`shape_of`, `seconds`.
+Takes: `Topology`. Gives: `Diagram` of `Box` and `DiagramEdge`, `build_diagram`; `draw_dot`, `draw_mermaid`;
+`one_of`, `shape_of`, `seconds`.
 Guarantees: every part of the topology is in it, a long array as one box; the same scene gives the same text.
 Does not: place anything on a page: `present.graph` does, or Graphviz, or Mermaid.
 """
@@ -15,15 +15,15 @@ from fractions import Fraction
 from html import escape
 from operator import itemgetter
 
-from apc.compiler.components.component import Number, Reference, Variable
+from apc.compiler.components.component import ComponentVariable, NumberParameter, Reference
 from apc.compiler.components.parts import DEFAULT_TYPES, GROUND
 from apc.compiler.language.dimensions import SECOND
 from apc.compiler.language.expression import format_expression
-from apc.compiler.language.values import Value
+from apc.compiler.language.values import ScalarValue
 from apc.compiler.language.vectors import by_vector, whole_and_index
-from apc.compiler.scene.instances import Part
+from apc.compiler.scene.instances import PartInstance
 from apc.compiler.scene.links import SceneLink
-from apc.compiler.scene.scene import Scene
+from apc.compiler.scene.scene import Topology
 from apc.compiler.words import counted
 
 ROLES = {"masses": "mass", "couplers": "coupler", "hands": "hand"}
@@ -47,7 +47,7 @@ class Box:
 
 
 @dataclass(frozen=True, slots=True)
-class Edge:
+class DiagramEdge:
     """What joins two boxes, by their keys; `sent` if it is a link that does."""
 
     one: str
@@ -59,19 +59,19 @@ class Edge:
 class Diagram:
     """What is drawn of a scene: one peer's parts, the links, and of many groups the first."""
 
-    scene: Scene
+    scene: Topology
     boxes: tuple[Box, ...]
-    edges: tuple[Edge, ...]
+    edges: tuple[DiagramEdge, ...]
 
 
-def build_diagram(scene: Scene) -> Diagram:
+def build_diagram(scene: Topology) -> Diagram:
     """Return the graph of a scene."""
     by_name = {part.name: part for part in scene.parts if "." not in part.name}  # the last: as it usually is
     parts = [*by_name.values()]
     sizes = Counter(_array(part.name) for part in parts)
     boxes: dict[str, Box] = {}
-    joined: dict[Edge, None] = {}
-    sent: list[Edge] = []
+    joined: dict[DiagramEdge, None] = {}
+    sent: list[DiagramEdge] = []
 
     def shown(name: str) -> str:
         return _array(name) if sizes[_array(name)] > LONGEST_ARRAY else name
@@ -88,7 +88,7 @@ def build_diagram(scene: Scene) -> Diagram:
             lines = _part_lines(scene, part, sizes[name] if name != part.name else 1)
             boxes[name] = Box(name, ROLES[part.section], (name, *lines), clock)
             heard = dict.fromkeys(word for role, word in named if role == "link")
-            sent += [Edge(name, f"link {link}", sent=True) for link in heard]
+            sent += [DiagramEdge(name, f"link {link}", sent=True) for link in heard]
     for part in parts:
         for _, other, _ in part.connections:
             text, two = shown(part.name), shown(other.partition(".")[0])
@@ -99,11 +99,11 @@ def build_diagram(scene: Scene) -> Diagram:
                 # Parts of one role are joined rigidly, at a point of its own: the graph has two sides.
                 middle = f"{text} and {two}"
                 boxes[middle] = Box(middle, "joint", (middle,))
-                joined[Edge(middle, text, sent=False)] = None
+                joined[DiagramEdge(middle, text, sent=False)] = None
                 text = middle
-            joined[Edge(two, text, sent=False)] = None
+            joined[DiagramEdge(two, text, sent=False)] = None
     links, groups = [*map(_link_box, scene.links)], [*_group_boxes(scene)]
-    sent += [Edge(link.key, group.key, sent=True) for link in links for group in groups]
+    sent += [DiagramEdge(link.key, group.key, sent=True) for link in links for group in groups]
     return Diagram(scene, (*boxes.values(), *links, *groups), (*joined, *sent))
 
 
@@ -111,7 +111,7 @@ def _array(name: str) -> str:
     return name.partition("[")[0]
 
 
-def _part_lines(scene: Scene, part: Part, count: int) -> Iterator[str]:
+def _part_lines(scene: Topology, part: PartInstance, count: int) -> Iterator[str]:
     """Yield what is told of a part, or of an array of so many: its type, then its numbers."""
     component = part.component
     if count > 1:
@@ -133,7 +133,7 @@ def _part_lines(scene: Scene, part: Part, count: int) -> Iterator[str]:
     yield from numbers
 
 
-def _numbers(scene: Scene, part: Part) -> Iterator[str]:
+def _numbers(scene: Topology, part: PartInstance) -> Iterator[str]:
     """Yield a part's numbers, those that are zero left out, and its words that are no default."""
     for name, entries in by_vector(part.values, itemgetter(0)).items():
         if any(value.number for _, value in entries):
@@ -150,7 +150,7 @@ def _numbers(scene: Scene, part: Part) -> Iterator[str]:
     yield from (f"{table.name}: a table of {len(table.times)} rows" for table in part.tables)
 
 
-def _quantities(part: Part, entries: list[tuple[str, Value]]) -> str:
+def _quantities(part: PartInstance, entries: list[tuple[str, ScalarValue]]) -> str:
     """Return a number with its unit and its expression, or the numbers of a vector's entries."""
     first, *more = (_quantity(part, name, value) for name, value in entries)
     if more:
@@ -160,11 +160,11 @@ def _quantities(part: Part, entries: list[tuple[str, Value]]) -> str:
     return first + text if len(text) <= LONGEST_EXPRESSION else first
 
 
-def _quantity(part: Part, name: str, value: Value) -> str:
+def _quantity(part: PartInstance, name: str, value: ScalarValue) -> str:
     """Return a number as the scene or its component writes it, or the word that stands for it."""
     declared = part.component.parameter(name) or part.component.variable(name)
-    assert isinstance(declared, Number | Variable)
-    for word, number in declared.words if isinstance(declared, Number) else ():
+    assert isinstance(declared, NumberParameter | ComponentVariable)
+    for word, number in declared.words if isinstance(declared, NumberParameter) else ():
         if number == value.number:
             return word
     if value.dimension == SECOND:
@@ -185,7 +185,7 @@ def _link_box(link: SceneLink) -> Box:
     return Box(f"link {link.name}", "link", (*lines, *delays, *remarks), link.clock)
 
 
-def _group_boxes(scene: Scene) -> Iterator[Box]:
+def _group_boxes(scene: Topology) -> Iterator[Box]:
     for group in scene.groups[:MOST_GROUPS]:
         lines = [f"{name}.type {word}" for name, word in group.types]
         for name, value in group.values:
@@ -199,7 +199,7 @@ def _group_boxes(scene: Scene) -> Iterator[Box]:
         yield Box("groups", "group", (f"and {more} more groups",))
 
 
-def one_of(scene: Scene) -> str:
+def one_of(scene: Topology) -> str:
     """Return what the peer drawn is, in words."""
     return "the only peer" if scene.peers == 1 else f"one of {scene.peers} peers"
 

@@ -17,16 +17,16 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.equations.clocks import ClockedKind
-from apc.compiler.equations.flatten import FlatKind
+from apc.compiler.compiled import Model
+from apc.compiler.equations.clocks import ClockedPeerType
+from apc.compiler.equations.flatten import FlatPeerType
 from apc.compiler.equations.solution import Assignment, ImplicitBlock
-from apc.compiler.equations.structure import SortedKind
+from apc.compiler.equations.structure import SortedPeerType
 from apc.compiler.equations.terms import text_of
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.multiples import common_multiple
 from apc.compiler.pipeline import each_stage, run_stages
-from apc.compiler.scene.scene import Scene
+from apc.compiler.scene.scene import Topology
 from apc.compiler.view.diagram import Diagram, build_diagram, one_of, seconds, shape_of
 from apc.compiler.view.stages import describe
 from apc.compiler.words import wrapped
@@ -37,7 +37,7 @@ PAIRWISE = ("max", "min")
 def show_text(path: Path) -> str:
     """Return graph, equations and schedule of a topology as text."""
     stages: dict[str, Any] = dict(each_stage(path))
-    scene: Scene = stages["scene"]
+    scene: Topology = stages["scene"]
     lines = [scene.name, *wrapped(scene.about)]
     lines += ["", f"GRAPH of {one_of(scene)}", *_graph_lines(build_diagram(scene))]
     for title, stage in (("EQUATIONS", "flat"), ("COMPUTED", "sorted")):
@@ -73,7 +73,7 @@ def show_document(path: Path) -> dict[str, Any]:
     }
 
 
-def _kind_document(flat: FlatKind, clocked: ClockedKind, ordered: SortedKind) -> dict[str, Any]:
+def _kind_document(flat: FlatPeerType, clocked: ClockedPeerType, ordered: SortedPeerType) -> dict[str, Any]:
     """Return the equations of the peers of one structure, as they are written and as they are computed."""
     return {
         "name": flat.name,
@@ -107,7 +107,7 @@ def _computed(values: Iterable[Assignment]) -> list[dict[str, str]]:
 def diagram_of(path: Path) -> Diagram:
     """Return the graph of a topology."""
     scene = run_stages(path, until="scene")
-    assert isinstance(scene, Scene)
+    assert isinstance(scene, Topology)
     return build_diagram(scene)
 
 
@@ -126,7 +126,7 @@ def _graph_lines(diagram: Diagram) -> Iterator[str]:
 # ---- the schedule ----
 
 
-def schedule(system: CompiledSystem) -> dict[str, Any]:
+def schedule(system: Model) -> dict[str, Any]:
     """Return what happens in one frame: clocks, holds, links, and what is heard; times in seconds.
 
     `on_the_way` is the largest number of a sender's packets that have left and not arrived; the newest one

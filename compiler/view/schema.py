@@ -1,7 +1,7 @@
 """The language of topologies as a JSON Schema, so that an editor completes and checks while one types.
 
-Takes: a `Library`. Gives: `topology_schema`, a JSON Schema document (draft 2020-12); `limits_of`, `in_unit`,
-`is_required` of a declared parameter.
+Takes: a `LoadedLibrary`. Gives: `topology_schema`, a JSON Schema document (draft 2020-12); `limits_of`,
+`in_unit`, `is_required` of a declared parameter.
 Guarantees: what the compiler accepts fits it; the same library gives the same document.
 Does not: catch everything: names that refer to each other, and bounds in other units, stay the compiler's.
 
@@ -18,16 +18,16 @@ import yaml
 
 from apc.compiler.components.component import (
     Component,
-    Number,
+    ComponentVariable,
+    NumberParameter,
     Option,
     Parameter,
     Reference,
     Settable,
-    Variable,
 )
 from apc.compiler.components.component_library import Library
 from apc.compiler.components.parts import PART_KEYS
-from apc.compiler.errors import Place
+from apc.compiler.errors import SourceLocation
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.units import Unit, parse_unit
 from apc.compiler.language.vectors import by_vector, whole_and_index
@@ -49,8 +49,8 @@ def topology_schema(library: Library) -> Schema:
     base: Schema = yaml.safe_load(BASE.read_text(encoding="utf-8"))
     components = [c for name in library.component_names if (c := library.component(name)) is not None]
     quantities: dict[str, Schema] = {}
-    _quantity(parse_unit("s", Place("schema")), quantities)
-    _quantity(parse_unit("s", Place("schema")), quantities, or_rate=True)
+    _quantity(parse_unit("s", SourceLocation("schema")), quantities)
+    _quantity(parse_unit("s", SourceLocation("schema")), quantities, or_rate=True)
     parts = {component.name: _part(component, quantities) for component in components}
     joined = {
         # A connector that another part names may be left out, but hardly all of them.
@@ -90,7 +90,7 @@ def _quantity(unit: Unit, quantities: dict[str, Schema], *, or_rate: bool = Fals
         about = "a number without a unit, or an expression"
         quantities[name] = {"type": ["number", "string"], "description": about}
     elif name not in quantities:
-        dimensions = {text: parse_unit(text, Place("schema")).dimension for text in EVERYDAY_UNITS}
+        dimensions = {text: parse_unit(text, SourceLocation("schema")).dimension for text in EVERYDAY_UNITS}
         fits = {unit.dimension, unit.dimension.power(-1)} if or_rate else {unit.dimension}
         wrong = "|".join(re.escape(text) for text, d in dimensions.items() if d not in fits)
         right = [text for text, dimension in dimensions.items() if dimension in fits] or [unit.text]
@@ -137,7 +137,7 @@ def _part(component: Component, quantities: dict[str, Schema]) -> Schema:
 
 def _settable(name: str, parameter: Settable, quantities: dict[str, Schema]) -> Schema:
     """Return the schema of a parameter or a start value; `name` is that of the vector it is an entry of."""
-    if isinstance(parameter, Variable):
+    if isinstance(parameter, ComponentVariable):
         about = f"start value of the {parameter.about or name}"
         return _quantity(parameter.unit, quantities) | {"description": about}
     if isinstance(parameter, Option):
@@ -154,14 +154,14 @@ def _settable(name: str, parameter: Settable, quantities: dict[str, Schema]) -> 
     return {**schema, "description": ", ".join(limits)}
 
 
-def limits_of(parameter: Number) -> list[str]:
+def limits_of(parameter: NumberParameter) -> list[str]:
     """Return where a parameter's values must lie, in its unit."""
     low, high = parameter.minimum, parameter.maximum
     limits = [] if low is None else [f"{'>' if parameter.open_minimum else '≥'} {in_unit(parameter, low)}"]
     return limits if high is None else [*limits, f"≤ {in_unit(parameter, high)}"]
 
 
-def in_unit(parameter: Number, number: Any) -> str:
+def in_unit(parameter: NumberParameter, number: Any) -> str:
     """Return a number in SI as text, in the unit that a parameter declares."""
     return f"{float(number / parameter.unit.scale):.12g}"
 

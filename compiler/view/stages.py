@@ -16,18 +16,18 @@ from apc.compiler.equations.structure import SortedSystem
 from apc.compiler.equations.terms import text_of
 from apc.compiler.language.expression import format_expression
 from apc.compiler.language.unit_text import format_dimension
-from apc.compiler.scene.scene import Scene
+from apc.compiler.scene.scene import Topology
 from apc.compiler.source.nodes import Mapping, Node, Scalar
 from apc.compiler.source.source import Source
 from apc.compiler.view.diagram import build_diagram
 
 
-def describe(value: Source | Scene | FlatSystem | ClockedSystem | SortedSystem) -> str:
+def describe(value: Source | Topology | FlatSystem | ClockedSystem | SortedSystem) -> str:
     """Return the value of a stage as text."""
     match value:
         case Source():
             lines = _nodes(value.root, "")
-        case Scene():
+        case Topology():
             lines = _scene(value)
         case FlatSystem():
             lines = _flat(value)
@@ -52,7 +52,7 @@ def _nodes(node: Node, indent: str) -> Iterator[str]:
             yield from _nodes(item, indent + "  ")
 
 
-def _scene(scene: Scene) -> Iterator[str]:
+def _scene(scene: Topology) -> Iterator[str]:
     yield f"topology {scene.name}: {scene.about}"
     yield from (f"clock {c.name}: every {c.period}, first at {c.phase}" for c in scene.clocks)
     for name, value in scene.parameters:

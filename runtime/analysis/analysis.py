@@ -1,6 +1,6 @@
 """Is it stable, and by how much: the whole road from a compiled system to its spectrum.
 
-Takes: a `CompiledSystem`.
+Takes: a `Model`.
 Gives: `Analysis`, `analyze`; `prepare_at_start` for many analyses of one system; `lifted_groups`;
 `near_start`.
 Guarantees: the cost grows with the number of different peers, not of peers, and not with the length of a
@@ -21,14 +21,14 @@ import numpy as np
 from apc.analysis.elements import replaced_elements
 from apc.analysis.plan import cannot_serve, make_plan, refuse_varying
 from apc.analysis.sides import Side, SideVerdict, sides, worst_side
-from apc.compiler.compiled import LENGTH, CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import LENGTH, Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.timings import part
-from apc.eigen.closing import Loop, close_loop
+from apc.eigen.closing import ModalSystem, close_loop
 from apc.eigen.modes import arrange
-from apc.eigen.peers import MOST_STATES, PeerGroup, peer_groups, representatives, states_of, used_ways
+from apc.eigen.peers import MOST_STATES, PeerClass, peer_groups, representatives, states_of, used_ways
 from apc.eigen.rest import unrest
-from apc.eigen.rigid import Standing, what_stands
+from apc.eigen.rigid import NeutralModes, what_stands
 from apc.eigen.spectrum import (
     DRIFTS,
     STABLE_TRANSLATING,
@@ -40,12 +40,12 @@ from apc.eigen.spectrum import (
 )
 from apc.frame.ages import linear_sites
 from apc.frame.discretize import TOO_LARGE
-from apc.frame.exchange import Exchange
+from apc.frame.exchange import CommunicationGraph
 from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Instance, Prepared, instance, prepare, starting
-from apc.frame.names import Free
+from apc.frame.names import ParameterRef
 from apc.network.nominal import left_out, unreliable
-from apc.result import Look, Result
+from apc.result import PlotStyle, Result
 from apc.threads import single_threaded
 
 NOT_LINEAR = (
@@ -93,7 +93,7 @@ class Analysis(Result):
     beyond: tuple[float, float] | None = None
     sides: tuple[SideVerdict, ...] = ()
 
-    def plot(self, ax: Any = None, **look: Unpack[Look]) -> Any:
+    def plot(self, ax: Any = None, **look: Unpack[PlotStyle]) -> Any:
         """Draw the eigenvalues over the unit circle into a matplotlib Axes, or a figure's, as `look` says."""
         return self._drawn(ax, look=look)
 
@@ -111,7 +111,7 @@ class Analysis(Result):
 
 
 def prepare_at_start(
-    system: CompiledSystem, prepared: Prepared, varied: Sequence[Free] = ()
+    system: Model, prepared: Prepared, varied: Sequence[ParameterRef] = ()
 ) -> Prepared | None:
     """Return what was prepared with every kind linearized where it starts, as its parameters say.
 
@@ -138,7 +138,7 @@ def prepare_at_start(
     return starting(system, prepared, varied)
 
 
-def near_start(system: CompiledSystem, prepared: Prepared | None = None) -> tuple[str, ...]:
+def near_start(system: Model, prepared: Prepared | None = None) -> tuple[str, ...]:
     """Return what an answer says of a scene that it linearizes: what is not at rest where it starts, and that
     it holds there only; nothing of a linear scene.
 
@@ -169,14 +169,14 @@ def _of_sides(names: Sequence[str]) -> tuple[str, ...]:
     return (f"the start is at a kink ({shown}): the worst side decides",)
 
 
-def _near_start(groups: Sequence[PeerGroup]) -> tuple[str, ...]:
+def _near_start(groups: Sequence[PeerClass]) -> tuple[str, ...]:
     moves = unrest(groups)
     return (*([f"{moves}; what happens is played: apc simulate"] if moves else []), NOT_LINEAR)
 
 
 @part("analysis")
 def analyze(
-    system: CompiledSystem,
+    system: Model,
     *,
     method: str = "auto",
     prepared: Prepared | None = None,
@@ -210,7 +210,7 @@ def analyze(
 
 
 def analyze_sides(
-    system: CompiledSystem, *, method: str, prepared: Prepared | None, certify: bool
+    system: Model, *, method: str, prepared: Prepared | None, certify: bool
 ) -> tuple[Analysis, Side]:
     """Return the analysis of the worst side, and that side.
 
@@ -232,7 +232,7 @@ def analyze_sides(
     return replace(each[worst], sides=verdicts, left_out=limitations), listed[worst]
 
 
-def _analyze(system: CompiledSystem, *, method: str, prepared: Prepared, certify: bool) -> Analysis:
+def _analyze(system: Model, *, method: str, prepared: Prepared, certify: bool) -> Analysis:
     """Analyze a system without kinks."""
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         scene = instance(system, prepared)
@@ -290,7 +290,9 @@ def _analyze(system: CompiledSystem, *, method: str, prepared: Prepared, certify
     )
 
 
-def _what_stands(spectrum: Spectrum, loops: Sequence[Loop], population: Sequence[PeerGroup]) -> Standing:
+def _what_stands(
+    spectrum: Spectrum, loops: Sequence[ModalSystem], population: Sequence[PeerClass]
+) -> NeutralModes:
     """Return what neither grows nor dies out.
 
     Where the loops are not at hand, of a large population, what is not felt is that of peers by themselves,
@@ -299,18 +301,18 @@ def _what_stands(spectrum: Spectrum, loops: Sequence[Loop], population: Sequence
     if not spectrum.rigid_modes or not any(
         map(_remembers, (*population, *(g for loop in loops for g in loop.sites)))
     ):
-        return Standing(spectrum.rigid_modes, 0, spectrum.drifts, 0, ())
-    listed: Sequence[tuple[Loop, int]] = [(loop, loop.multiplicity) for loop in loops]
+        return NeutralModes(spectrum.rigid_modes, 0, spectrum.drifts, 0, ())
+    listed: Sequence[tuple[ModalSystem, int]] = [(loop, loop.multiplicity) for loop in loops]
     for group in population:
         anyhow = {way: ((Fraction(-1, 3),),) for way in used_ways([group.schedule])}
-        listed = [*listed, (Loop(group.name, 1, (group,), anyhow), group.count)]
+        listed = [*listed, (ModalSystem(group.name, 1, (group,), anyhow), group.count)]
     with_drifts = bool(spectrum.drifts and loops)
     pairs = [(what_stands(loop, with_drifts=with_drifts), many) for loop, many in listed]
     names = tuple(dict.fromkeys(name for standing, _ in pairs for name in standing.names))
     unfelt = sum(standing.unfelt * many for standing, many in pairs)
     if not loops:
-        return Standing(spectrum.rigid_modes - unfelt, 0, spectrum.drifts, unfelt, names)
-    return Standing(
+        return NeutralModes(spectrum.rigid_modes - unfelt, 0, spectrum.drifts, unfelt, names)
+    return NeutralModes(
         translations=sum(standing.translations * many for standing, many in pairs),
         rotations=sum(standing.rotations * many for standing, many in pairs),
         drifts=sum(standing.drifts * many for standing, many in pairs),
@@ -319,7 +321,7 @@ def _what_stands(spectrum: Spectrum, loops: Sequence[Loop], population: Sequence
     )
 
 
-def _remembers(group: PeerGroup) -> bool:
+def _remembers(group: PeerClass) -> bool:
     """Say whether peers keep more than lengths with their rates."""
     kind = group.jacobians.kind
     return any(clock.memories for clock in kind.clocks) or any(
@@ -327,18 +329,18 @@ def _remembers(group: PeerGroup) -> bool:
     )
 
 
-def _solve_closed(system: CompiledSystem, loops: Sequence[Loop], *, certify: bool) -> Spectrum:
+def _solve_closed(system: Model, loops: Sequence[ModalSystem], *, certify: bool) -> Spectrum:
     """Solve loops by their matrices."""
     closed = tuple(close_loop(loop) for loop in loops)
     if not all(
         np.isfinite(closed_system.matrix).all() and np.isfinite(closed_system.error).all()
         for closed_system in closed
     ):
-        raise ApcError(Mistake("E806", Place(system.origin.topology), TOO_LARGE))
+        raise ApcError(Diagnostic("E806", SourceLocation(system.origin.topology), TOO_LARGE))
     return solve_spectrum(closed, certify=certify)
 
 
-def _solve_determinant(loops: Sequence[Loop]) -> Spectrum:
+def _solve_determinant(loops: Sequence[ModalSystem]) -> Spectrum:
     """Solve loops by the zeros of their characteristic functions."""
     # What serves large scenes is imported when one comes: all of it would cost every scene 30 ms.
     from apc.large.determinant_spectrum import solve_loops
@@ -360,8 +362,8 @@ def _solve_populations(scene: Instance) -> tuple[Spectrum, tuple[str, ...]]:
 
 
 def lifted_groups(
-    system: CompiledSystem, *, prepared: Prepared | None = None
-) -> tuple[tuple[PeerGroup, ...], Exchange]:
+    system: Model, *, prepared: Prepared | None = None
+) -> tuple[tuple[PeerClass, ...], CommunicationGraph]:
     """Return the peers of a system in groups of equal dynamics, lifted, and the exchange between them.
 
     Raises

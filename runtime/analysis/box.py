@@ -1,7 +1,7 @@
 """Which parameters a box leaves open, and how far: `contact.stiffness=±1%`.
 
-Takes: a `CompiledSystem` and ranges as text.
-Gives: `parse_range`; `open_systems`; `OpenSites`, `open_sites`.
+Takes: a `Model` and ranges as text.
+Gives: `parse_range`; `open_systems`; `ParametricSubsystems`, `open_sites`.
 Guarantees: a site's matrices are exact quotients of polynomials in the open parameters, and what depends on
 these by an expression follows.
 Does not: prove anything (see `box_proof`).
@@ -15,27 +15,27 @@ from fractions import Fraction
 from typing import Any
 
 from apc.analysis.analysis import lifted_groups
-from apc.compiler.compiled import CompiledSystem, Formula, Group, Parameter
+from apc.compiler.compiled import Formula, Group, Model, Parameter
 from apc.compiler.digits import plain_float
-from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
-from apc.compiler.language.evaluation import FaultError, exactly
+from apc.compiler.errors import ApcError, Diagnostic, Mistakes, SourceLocation
+from apc.compiler.language.evaluation import EvaluationError, exactly
 from apc.compiler.plain import RULES
 from apc.compiler.words import with_unit
-from apc.eigen.closing import ClosedSystem
+from apc.eigen.closing import ClosedLoop
 from apc.eigen.modes import split
-from apc.eigen.peers import PeerGroup
+from apc.eigen.peers import PeerClass
 from apc.eigen.ratios import NotRational, Ratio, Ratios, open_site
-from apc.frame.display_units import Unit
-from apc.frame.exchange import Exchange
+from apc.frame.display_units import DisplayUnit
+from apc.frame.exchange import CommunicationGraph
 from apc.frame.instance import Prepared
-from apc.frame.names import Free, Range, find, overlap, times_of
+from apc.frame.names import ParameterRef, Range, find, overlap, times_of
 from apc.frame.overrides import Override, apply, check_bounds
 from apc.frame.parameters import exact_numbers, scope_of
-from apc.frame.site import LinearSite
+from apc.frame.site import LinearSubsystem
 from apc.network.nominal import refuse_channel_number
 from apc.option_value import option_values
 
-_PLACE = Place("box")
+_PLACE = SourceLocation("box")
 
 # Where in the box the peers are sorted into groups: a place that no two given values share, so that peers are
 # alike there only if they are alike all over the box: of each range another power of it, as two groups may
@@ -43,7 +43,7 @@ _PLACE = Place("box")
 GENERIC = Fraction(6180339887, 10**10)
 
 
-def parse_range(system: CompiledSystem, text: str) -> Range:
+def parse_range(system: Model, text: str) -> Range:
     """Read `NAME=±P%` or `NAME=LOW UNIT:HIGH UNIT`.
 
     Parameters
@@ -70,7 +70,7 @@ def parse_range(system: CompiledSystem, text: str) -> Range:
         spread = abs(middle) * share
         if not spread:
             what = f"{name} is 0, and any share of it is 0 as well"
-            raise ApcError(Mistake("E833", _PLACE, what, hint=f"{name}=LOW:HIGH"))
+            raise ApcError(Diagnostic("E833", _PLACE, what, hint=f"{name}=LOW:HIGH"))
         low, high = middle - spread, middle + spread
     else:
         first, colon, last = (part.strip() for part in value.partition(":"))
@@ -78,12 +78,12 @@ def parse_range(system: CompiledSystem, text: str) -> Range:
             raise _malformed(text)
         low, high = option_values(name, parameter.unit, (first, last), _PLACE)
     _check_limits(parameter, low, high, name)
-    return Range(free, Unit.of(parameter), low, high)
+    return Range(free, DisplayUnit.of(parameter), low, high)
 
 
 def _malformed(text: str) -> ApcError:
     form = "NAME=±PERCENT% or NAME=LOW:HIGH"
-    return ApcError(Mistake("E830", _PLACE, "a box", form, text[:80], "contact.stiffness=±1%"))
+    return ApcError(Diagnostic("E830", _PLACE, "a box", form, text[:80], "contact.stiffness=±1%"))
 
 
 def _percentage(text: str, whole: str) -> Fraction:
@@ -96,11 +96,11 @@ def _percentage(text: str, whole: str) -> Fraction:
     except (ValueError, ZeroDivisionError):
         raise _malformed(whole) from None
     if share <= 0:
-        raise ApcError(Mistake("E833", _PLACE, "a box", "more than 0 %", number[:80]))
+        raise ApcError(Diagnostic("E833", _PLACE, "a box", "more than 0 %", number[:80]))
     return share
 
 
-def _parameter(system: CompiledSystem, free: Free) -> Parameter:
+def _parameter(system: Model, free: ParameterRef) -> Parameter:
     """Return the parameter a box is about; refuse times and values that differ from peer to peer."""
     name, group = free.name, free.group
     common = {parameter.name: parameter for parameter in system.parameters}
@@ -111,17 +111,17 @@ def _parameter(system: CompiledSystem, free: Free) -> Parameter:
     if times_of(system, name) or name in scope_of(system).needed([*times]) or name not in common:
         what = f"{name} is a time, or sets one: what happens in a frame changes with it by jumps"
         rhythm = any(name in (clock.period, clock.phase) for clock in system.clocks)
-        raise ApcError(Mistake("E831", _PLACE, what, hint="" if rhythm else f"apc critical {name}"))
+        raise ApcError(Diagnostic("E831", _PLACE, what, hint="" if rhythm else f"apc critical {name}"))
     for item in system.groups:
         own = {value.name: value for value in item.values}
         columns = {column.name for column in item.columns}
         if group == item.name:
             if name in columns:
-                raise ApcError(Mistake("E831", _PLACE, f"{name} differs from peer to peer of {group}"))
+                raise ApcError(Diagnostic("E831", _PLACE, f"{name} differs from peer to peer of {group}"))
             return own.get(name, common[name])
         if group is None and (name in own or name in columns):
             what = f"{name} is not the same for all: {item.name} has its own"
-            raise ApcError(Mistake("E831", _PLACE, what, hint=f"{item.name}.{name}=±1%"))
+            raise ApcError(Diagnostic("E831", _PLACE, what, hint=f"{item.name}.{name}=±1%"))
     return common[name]
 
 
@@ -149,8 +149,8 @@ def _check_limits(parameter: Parameter, low: Fraction, high: Fraction, name: str
 
 
 def open_systems(
-    system: CompiledSystem, ranges: Sequence[Range], prepared: Prepared
-) -> list[tuple[ClosedSystem, tuple[LinearSite, ...]]]:
+    system: Model, ranges: Sequence[Range], prepared: Prepared
+) -> list[tuple[ClosedLoop, tuple[LinearSubsystem, ...]]]:
     """Return the closed systems of a scene with parameters left open, at some point of the box.
 
     With each come the matrices of its sites, over `Fraction` and `Ratio` in the order of `ranges`.
@@ -168,7 +168,7 @@ def open_systems(
         E896 a number of an unreliable link; those of `open_sites`.
     """
     if not ranges:
-        raise ApcError(Mistake("E830", _PLACE, "no parameter is left open", hint="contact.stiffness=±1%"))
+        raise ApcError(Diagnostic("E830", _PLACE, "no parameter is left open", hint="contact.stiffness=±1%"))
     for interval in ranges:
         refuse_channel_number(system, interval.free, _PLACE)
     sites = open_sites(system, ranges, prepared, lambda changed: lifted_groups(changed, prepared=prepared))
@@ -180,24 +180,24 @@ def open_systems(
 
 
 @dataclass(frozen=True, slots=True)
-class OpenSites:
+class ParametricSubsystems:
     """A scene's peers where they are alike only if they are alike all over a box.
 
     `at` is the scene there, `sites` the matrices of each group by its name, over `Fraction` and `Ratio`.
     """
 
-    at: CompiledSystem
-    groups: tuple[PeerGroup, ...]
-    exchange: Exchange
-    sites: Mapping[str, LinearSite]
+    at: Model
+    groups: tuple[PeerClass, ...]
+    exchange: CommunicationGraph
+    sites: Mapping[str, LinearSubsystem]
 
 
 def open_sites(
-    system: CompiledSystem,
+    system: Model,
     ranges: Sequence[Range],
     prepared: Prepared,
-    lifted: Callable[[CompiledSystem], tuple[tuple[PeerGroup, ...], Exchange]],
-) -> OpenSites:
+    lifted: Callable[[Model], tuple[tuple[PeerClass, ...], CommunicationGraph]],
+) -> ParametricSubsystems:
     """Leave parameters of a scene's peers open.
 
     Parameters
@@ -216,10 +216,10 @@ def open_sites(
     """
     for place, interval in enumerate(ranges):
         if any(overlap(system, other.free, interval.free) for other in ranges[:place]):
-            raise ApcError(Mistake("E831", _PLACE, f"{interval.free.label} has two ranges in one box"))
+            raise ApcError(Diagnostic("E831", _PLACE, f"{interval.free.label} has two ranges in one box"))
     if not all(site.parameters_suffice for site in prepared.jacobians):
         what = f"{system.name} is not linear: where it is linearized may move with the parameters"
-        raise ApcError(Mistake("E832", Place(system.origin.topology), what))
+        raise ApcError(Diagnostic("E832", SourceLocation(system.origin.topology), what))
     field = Ratios.of(len(ranges))
     opened = [_opened(system, group, ranges, field) for group in system.groups]
     point = [
@@ -232,10 +232,10 @@ def open_sites(
         group.name: _open_site(group, opened[exchange.group_of(group.peers.first)], system)
         for group in groups
     }
-    return OpenSites(at, groups, exchange, sites)
+    return ParametricSubsystems(at, groups, exchange, sites)
 
 
-def _opened(system: CompiledSystem, group: Group, ranges: Sequence[Range], field: Ratios) -> dict[str, Ratio]:
+def _opened(system: Model, group: Group, ranges: Sequence[Range], field: Ratios) -> dict[str, Ratio]:
     """Return those parameters of a group's kind that the open ones reach."""
     columns = {column.name for column in group.columns}
     scope = scope_of(system, group.values, fixed=columns)
@@ -250,13 +250,13 @@ def _opened(system: CompiledSystem, group: Group, ranges: Sequence[Range], field
         own = [name for name in formula.names if name in varying]
         if own:
             what = f"{name} depends on {own[0]}, which differs from peer to peer of {group.name}"
-            raise ApcError(Mistake("E832", _PLACE, what))
+            raise ApcError(Diagnostic("E832", _PLACE, what))
         try:
             return exactly(formula, values, _quotients)
-        except FaultError as fault:
+        except EvaluationError as fault:
             reason = fault.cause if isinstance(fault.cause, NotRational) else fault.words
             what = f"{name} = {formula.text[:60]} {reason}"
-            raise ApcError(Mistake("E832", _PLACE, what)) from None
+            raise ApcError(Diagnostic("E832", _PLACE, what)) from None
 
     wanted = system.kinds[group.kind].parameters
     result = scope.follow(given, compute, lambda name: Fraction(scope.holder[name].value), wanted)
@@ -285,7 +285,7 @@ _RULES: dict[str, Callable[..., Any]] = {
 }
 
 
-def _open_site(group: PeerGroup, opened: Mapping[str, Ratio], system: CompiledSystem) -> LinearSite:
+def _open_site(group: PeerClass, opened: Mapping[str, Ratio], system: Model) -> LinearSubsystem:
     """Return a site's matrices, some of its parameters open."""
     kind = group.jacobians.kind
     numbers = exact_numbers(kind, group.parameters)
@@ -294,4 +294,4 @@ def _open_site(group: PeerGroup, opened: Mapping[str, Ratio], system: CompiledSy
         return open_site(group.jacobians, vector)
     except NotRational as reason:
         what = f"the equations of {group.name} {reason}"
-        raise ApcError(Mistake("E832", Place(system.origin.topology), what)) from None
+        raise ApcError(Diagnostic("E832", SourceLocation(system.origin.topology), what)) from None

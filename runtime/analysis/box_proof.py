@@ -1,8 +1,8 @@
 """Proof that a scene is stable for every value of some parameters in a box.
 
-Takes: a `CompiledSystem` and ranges.
-Gives: `BoxProof`, `ChangingDelay`, `prove_box`; `search_box`, `Look`, `Looked`, `middle`; `Opened`,
-`open_questions`; `TOGETHER`, `UNDECIDED`.
+Takes: a `Model` and ranges.
+Gives: `RobustStability`, `ChangingDelay`, `prove_box`; `search_box`, `CellTest`, `CellVerdict`, `middle`;
+`BoxProblem`, `open_questions`; `TOGETHER`, `UNDECIDED`.
 Guarantees: stable means proved for every point of the box, unstable proved at the point that is named.
 Does not: find the boundary (see the share that is left open).
 
@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import analyze
 from apc.analysis.box import open_systems
-from apc.analysis.cells import Cell, OpenSystem, contracted, matrices_over, open_system
-from apc.compiler.compiled import CompiledSystem
+from apc.analysis.cells import Cell, ParametricClosedLoop, contracted, matrices_over, open_system
+from apc.compiler.compiled import Model
 from apc.compiler.timings import part
 from apc.eigen.rigid import find_rigid_modes, stays_rigid, what_stands
 from apc.eigen.spectrum import UNSTABLE, up_to
@@ -63,7 +63,7 @@ class ChangingDelay:
 
 
 @dataclass(frozen=True, slots=True)
-class BoxProof(Result):
+class RobustStability(Result):
     """What was proved of a box; `stable` is None when neither was.
 
     `cells` were looked at; `open_share` of the box's volume is left open. `point`, SI values in the order of
@@ -86,7 +86,7 @@ class BoxProof(Result):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Looked:
+class CellVerdict:
     """What came out for a cell: nothing where it is proved, or else how much each parameter matters in it.
 
     `unstable` says that it is so, proved, at the cell's middle; `work` is what it took, in analyses of a
@@ -99,13 +99,13 @@ class Looked:
 
 
 # Looks at cells, one after the other; nobody asks on after one that is unstable.
-Look = Callable[[Sequence[Cell]], Iterator[Looked]]
+CellTest = Callable[[Sequence[Cell]], Iterator[CellVerdict]]
 
 
 @part("box")
 def prove_box(
-    system: CompiledSystem, ranges: Sequence[Range], *, cells: int | None = None, inside: float = 1.0
-) -> BoxProof:
+    system: Model, ranges: Sequence[Range], *, cells: int | None = None, inside: float = 1.0
+) -> RobustStability:
     """Prove a scene stable in a whole box, or find a point of it where it is unstable.
 
     Parameters
@@ -151,21 +151,19 @@ def prove_box(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Opened:
+class BoxProblem:
     """The closed systems of a scene over a box, without their rigid motions, and how many these are.
 
     `notes` say of which systems nothing can be proved for a whole box; those are not among the `questions`.
     """
 
-    questions: tuple[OpenSystem, ...]
+    questions: tuple[ParametricClosedLoop, ...]
     translations: int
     rotations: int
     notes: tuple[str, ...]
 
 
-def open_questions(
-    system: CompiledSystem, ranges: Sequence[Range], prepared: Prepared, inside: float
-) -> Opened:
+def open_questions(system: Model, ranges: Sequence[Range], prepared: Prepared, inside: float) -> BoxProblem:
     """Return what is to be proved of a scene all over a box.
 
     Parameters
@@ -175,7 +173,7 @@ def open_questions(
     prepared
         From `instance.prepare`.
     """
-    questions: list[OpenSystem] = []
+    questions: list[ParametricClosedLoop] = []
     notes: list[str] = []
     translations = rotations = 0
     for closed, sites in open_systems(system, ranges, prepared):
@@ -189,19 +187,19 @@ def open_questions(
             translations += standing.translations
             rotations += standing.rotations
         questions.append(open_system(closed, sites, free, inside))
-    return Opened(tuple(questions), translations, rotations, tuple(notes))
+    return BoxProblem(tuple(questions), translations, rotations, tuple(notes))
 
 
 def search_box(
     name: str,
     ranges: Sequence[Range],
-    looks: Look,
+    looks: CellTest,
     is_unstable: Callable[[tuple[Fraction, ...]], bool],
     *,
     stable: str,
     unstable: str,
     cells: int | None = None,
-) -> BoxProof:
+) -> RobustStability:
     """Look at the middle and the corners of a box, then prove it cell by cell, the larger before the smaller.
 
     Parameters
@@ -220,10 +218,10 @@ def search_box(
     whole: Cell = tuple((interval.low, interval.high) for interval in ranges)
     looked, work = 0, 0.0
 
-    def answer(verdict: str, left: float, point: Sequence[Fraction]) -> BoxProof:
+    def answer(verdict: str, left: float, point: Sequence[Fraction]) -> RobustStability:
         known = {stable: True, unstable: False}.get(verdict)
         where = tuple(map(float, point))
-        return BoxProof(name, tuple(ranges), verdict, known, max(looked, 1), left, where, ())
+        return RobustStability(name, tuple(ranges), verdict, known, max(looked, 1), left, where, ())
 
     def enough() -> bool:
         return work >= MOST_CELLS if cells is None else looked >= cells
@@ -262,10 +260,10 @@ def _volume(cell: Cell) -> Fraction:
 
 
 def _looked(
-    questions: Sequence[OpenSystem],
+    questions: Sequence[ParametricClosedLoop],
     is_unstable: Callable[[tuple[Fraction, ...]], bool],
     cells: Sequence[Cell],
-) -> Iterator[Looked]:
+) -> Iterator[CellVerdict]:
     """Look at cells in floats, many at a time; at the middle alone where these don't prove it stable.
 
     A parameter matters as much as it does in that closed system, of those not proved, where it matters most.
@@ -290,6 +288,6 @@ def _looked(
             proved &= contraction.proved
         for cell, is_proved, is_sound, matters in zip(some, proved, inside, reach, strict=True):
             if is_proved or is_sound:
-                yield Looked(None if is_proved else matters, work=LIGHT)
+                yield CellVerdict(None if is_proved else matters, work=LIGHT)
             else:
-                yield Looked(matters, unstable=is_unstable(middle(cell)))
+                yield CellVerdict(matters, unstable=is_unstable(middle(cell)))

@@ -1,8 +1,8 @@
 """A closed system over many cells of some parameters at once, and which of them a norm proves stable.
 
-Takes: a `ClosedSystem`, its sites over `Fraction` and `Ratio`, its rigid motions; cells.
-Gives: `OpenFrames`, `open_frames`, `frames_over`; `OpenSystem`, `open_system`, `matrices_over`; `Cell`;
-`Contraction`, `contracted`.
+Takes: a `ClosedLoop`, its sites over `Fraction` and `Ratio`, its rigid motions; cells.
+Gives: `ParametricFrames`, `open_frames`, `frames_over`; `ParametricClosedLoop`, `open_system`,
+`matrices_over`; `Cell`; `Contraction`, `contracted`.
 Guarantees: a cell that is said to be stable is proved so, at every point of it; rounding is charged.
 Does not: divide cells, or decide what floats leave open (see `box_proof`).
 
@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.closing import ClosedSystem, Feedback, bounded_weight, close, feedback_of
+from apc.eigen.closing import ClosedLoop, InterconnectionMatrices, bounded_weight, close, feedback_of
 from apc.eigen.matrix_norms import balance, norms
 from apc.eigen.ratios import Ratio
 from apc.eigen.relative import Relative, relative, relative_coordinates, with_doubt
@@ -33,7 +33,7 @@ from apc.frame.discretize import exponential
 from apc.frame.lift import FrameMap, compose, step_durations
 from apc.frame.radius import UNIT, Arithmetic, radius_of, value_of
 from apc.frame.schedule import Schedule
-from apc.frame.site import LinearSite, every_matrix
+from apc.frame.site import LinearSubsystem, every_matrix
 from apc.frame.taylor import reciprocal, taylor, within
 
 Floats = NDArray[np.float64]
@@ -58,29 +58,29 @@ Quotient = tuple[Polynomial, Polynomial | None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class OpenFrames:
+class ParametricFrames:
     """Sites over the open parameters of a box, ready to be lifted over cells.
 
     `quotients` are their entries that depend on these, by their texts, `texts` those of each by its `id`.
     """
 
-    sites: tuple[LinearSite, ...]
+    sites: tuple[LinearSubsystem, ...]
     schedules: tuple[Schedule, ...]
     texts: Mapping[int, str]
     quotients: Mapping[str, Quotient]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class OpenSystem:
+class ParametricClosedLoop:
     """A closed system over a box: its sites over the open parameters, and who hears whom.
 
     Its relative coordinates serve all over the box. Eigenvalues are wanted inside a circle, of radius
     `inside`.
     """
 
-    system: ClosedSystem
-    frames: OpenFrames
-    feedback: tuple[Feedback, ...]
+    system: ClosedLoop
+    frames: ParametricFrames
+    feedback: tuple[InterconnectionMatrices, ...]
     relative: Relative
     inside: float
 
@@ -98,8 +98,8 @@ class Contraction:
 
 
 def open_system(
-    system: ClosedSystem, sites: Sequence[LinearSite], rigid: RigidModes, inside: float = 1.0
-) -> OpenSystem:
+    system: ClosedLoop, sites: Sequence[LinearSubsystem], rigid: RigidModes, inside: float = 1.0
+) -> ParametricClosedLoop:
     """Make a closed system ready to be looked at over cells.
 
     Parameters
@@ -113,7 +113,7 @@ def open_system(
     inside
         The radius of the circle that eigenvalues are wanted in.
     """
-    return OpenSystem(
+    return ParametricClosedLoop(
         system,
         open_frames(sites, [group.schedule for group in system.sites]),
         tuple(feedback_of(system, system.layout)),
@@ -122,7 +122,7 @@ def open_system(
     )
 
 
-def open_frames(sites: Sequence[LinearSite], schedules: Sequence[Schedule]) -> OpenFrames:
+def open_frames(sites: Sequence[LinearSubsystem], schedules: Sequence[Schedule]) -> ParametricFrames:
     """Make sites ready to be lifted over cells.
 
     Parameters
@@ -141,7 +141,7 @@ def open_frames(sites: Sequence[LinearSite], schedules: Sequence[Schedule]) -> O
     texts = {id(ratio): f"{ratio.top}/{ratio.bottom}" for ratio in ratios}
     different = {texts[id(ratio)]: ratio for ratio in ratios}
     quotients = {text: _quotient(ratio) for text, ratio in different.items()}
-    return OpenFrames(tuple(sites), tuple(schedules), texts, quotients)
+    return ParametricFrames(tuple(sites), tuple(schedules), texts, quotients)
 
 
 def contracted(matrix: Matrix) -> Contraction:
@@ -245,7 +245,7 @@ def _change_of_basis(matrix: Floats) -> Floats:
     return values
 
 
-def matrices_over(asked: OpenSystem, cells: Sequence[Cell]) -> Matrix:
+def matrices_over(asked: ParametricClosedLoop, cells: Sequence[Cell]) -> Matrix:
     """Return the matrices in relative coordinates over cells (k, 2 + m, n, n), or of points (k, 2, n, n).
 
     Parameters
@@ -258,7 +258,8 @@ def matrices_over(asked: OpenSystem, cells: Sequence[Cell]) -> Matrix:
     maps = frames_over(asked.frames, cells)
     count = maps[0].p.shape[-3] - 2
     heard = [
-        Feedback(within(feedback.now, count), within(feedback.before, count)) for feedback in asked.feedback
+        InterconnectionMatrices(within(feedback.now, count), within(feedback.before, count))
+        for feedback in asked.feedback
     ]
     closed = close(maps, heard, asked.system.layout, numbers=taylor(count)).matrix
     closed = np.broadcast_to(closed, (len(cells), *closed.shape[-3:]))
@@ -271,7 +272,7 @@ def matrices_over(asked: OpenSystem, cells: Sequence[Cell]) -> Matrix:
     return larger
 
 
-def frames_over(asked: OpenFrames, cells: Sequence[Cell]) -> list[FrameMap]:
+def frames_over(asked: ParametricFrames, cells: Sequence[Cell]) -> list[FrameMap]:
     """Return each site's frame over cells (k, 2 + m, …), k being 1 of what stays.
 
     Parameters

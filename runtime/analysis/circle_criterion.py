@@ -23,10 +23,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.opened import Matrix, OpenLoop
+from apc.analysis.opened import LurePlant, Matrix
 from apc.eigen.dissipation import least_real, proves_positive
 from apc.frame.radius import RADII, UNIT, radius_of, value_of
-from apc.unserved import UnservedError
+from apc.unserved import NotSupportedError
 
 Floats = NDArray[np.float64]
 
@@ -34,7 +34,7 @@ Floats = NDArray[np.float64]
 Weights = Mapping[tuple[str, str, int], tuple[float, float]]
 
 
-def weights_of(loops: Sequence[OpenLoop]) -> Weights:
+def weights_of(loops: Sequence[LurePlant]) -> Weights:
     """Return the weights that are free of what drifts.
 
     Parameters
@@ -44,13 +44,13 @@ def weights_of(loops: Sequence[OpenLoop]) -> Weights:
 
     Raises
     ------
-    UnservedError
+    NotSupportedError
         Why there are none.
     """
     drifting = [loop for loop in loops if loop.seen]
     if len(drifting) > 1:
         names = " and ".join(open_loop.name for open_loop in drifting)
-        raise UnservedError(f"with all contacts open, what may drift is of several modes: {names}")
+        raise NotSupportedError(f"with all contacts open, what may drift is of several modes: {names}")
     weights: dict[tuple[str, str, int], tuple[float, float]] = {}
     for open_loop in drifting:
         moved, off = value_of(open_loop.moved)[0], radius_of(open_loop.moved)[0]
@@ -58,16 +58,16 @@ def weights_of(loops: Sequence[OpenLoop]) -> Weights:
             open_loop.ports, open_loop.seen, open_loop.counts, moved, off, strict=True
         ):
             if not share:
-                raise UnservedError(f"{port[1]} does not hold what may drift with all contacts open")
+                raise NotSupportedError(f"{port[1]} does not hold what may drift with all contacts open")
             by = -1 / (float(share) * count)
             weight, radius = by * m, abs(by) * (doubt + 8 * UNIT * abs(m))
             if not weight > radius:
-                raise UnservedError(f"{port[1]} drives away what may drift with all contacts open")
+                raise NotSupportedError(f"{port[1]} drives away what may drift with all contacts open")
             weights[port] = weight, radius
     return weights
 
 
-def least_of(open_loop: OpenLoop, weights: Weights) -> float:
+def least_of(open_loop: LurePlant, weights: Weights) -> float:
     """Return the least real part of a loop, weighted, at any frequency, less 1: above −1 it takes energy out.
 
     Parameters
@@ -81,7 +81,7 @@ def least_of(open_loop: OpenLoop, weights: Weights) -> float:
     return least_real(a, *scaled, weight / np.outer(root, root) - np.eye(len(root)))[0]
 
 
-def is_proved(open_loop: OpenLoop, weights: Weights) -> bool:
+def is_proved(open_loop: LurePlant, weights: Weights) -> bool:
     """Say whether a loop, weighted, is proved to take energy out at all frequencies.
 
     Parameters
@@ -92,7 +92,7 @@ def is_proved(open_loop: OpenLoop, weights: Weights) -> bool:
     return proves_positive(*_posed(open_loop, weights))
 
 
-def _posed(open_loop: OpenLoop, weights: Weights) -> tuple[Matrix, Matrix, Matrix, Matrix, Matrix]:
+def _posed(open_loop: LurePlant, weights: Weights) -> tuple[Matrix, Matrix, Matrix, Matrix, Matrix]:
     """Return A, B, C, D and W of a loop whose He(C (e^{jθ} − A)⁻¹ B + D) + W is to be positive."""
     weigh = _weigh(open_loop, weights)
     half = RADII.multiply(np.swapaxes(open_loop.moved / 2, -1, -2), open_loop.moved)
@@ -101,7 +101,7 @@ def _posed(open_loop: OpenLoop, weights: Weights) -> tuple[Matrix, Matrix, Matri
     return open_loop.a, open_loop.b, c, d, weight
 
 
-def _weigh(open_loop: OpenLoop, weights: Weights) -> Matrix:
+def _weigh(open_loop: LurePlant, weights: Weights) -> Matrix:
     """Return the weights of a loop's ticks, of all their peers, on a diagonal with their radii."""
     values = np.zeros((2, len(open_loop.ports), len(open_loop.ports)))
     for k, (port, count) in enumerate(zip(open_loop.ports, open_loop.counts.tolist(), strict=True)):

@@ -1,6 +1,6 @@
 """Which contact makes it unstable: the analysis of a scene in each of its modes.
 
-Takes: a `CompiledSystem` whose peers have parts that switch (see `switches`).
+Takes: a `Model` whose peers have parts that switch (see `switches`).
 Gives: `ContactMode`, `ContactModes`, `contact_modes`.
 Guarantees: in each mode every such part is wholly on or wholly off, and the rest is as in the scene; where a
 piece is linear, so is the answer, wherever the motion is.
@@ -19,15 +19,15 @@ import numpy as np
 
 from apc.analysis.analysis import analyze
 from apc.analysis.switches import SwitchingPart, bind, switching_parts
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.compiler.timings import part
 from apc.eigen.spectrum import UNSTABLE
-from apc.frame.decisions import SwitchedKind, find_switches
+from apc.frame.decisions import SwitchedPeerType, find_switches
 from apc.frame.instance import Prepared, prepare
-from apc.frame.jacobians import SiteJacobians
+from apc.frame.jacobians import SubsystemJacobians
 from apc.frame.linearize import linearize
-from apc.frame.parameters import Numbers, resolve
+from apc.frame.parameters import ResolvedNumbers, resolve
 from apc.result import Result
 
 EVERYONE = "on at every peer"
@@ -96,7 +96,7 @@ class ContactModes(Result):
 
 
 @part("contact modes")
-def contact_modes(system: CompiledSystem, *, prepared: Prepared | None = None) -> ContactModes:
+def contact_modes(system: Model, *, prepared: Prepared | None = None) -> ContactModes:
     """Analyse a scene in each mode of its contacts, walls and limits.
 
     Parameters
@@ -122,7 +122,7 @@ def contact_modes(system: CompiledSystem, *, prepared: Prepared | None = None) -
     names = tuple(dict.fromkeys(part.name for listed in parts for part in listed))
     has = [frozenset(part.name for part in parts[group.kind]) for group in system.groups]
 
-    def site(kind: int, on: frozenset[str]) -> SiteJacobians:
+    def site(kind: int, on: frozenset[str]) -> SubsystemJacobians:
         """Return the Jacobians of a kind with these parts on and all others off."""
         if not switched[kind].decisions:
             return prepared.jacobians[kind]
@@ -169,7 +169,7 @@ def contact_modes(system: CompiledSystem, *, prepared: Prepared | None = None) -
 
 
 def parts_of_kinds(
-    system: CompiledSystem, switched: Sequence[SwitchedKind], numbers: Numbers
+    system: Model, switched: Sequence[SwitchedPeerType], numbers: ResolvedNumbers
 ) -> list[tuple[SwitchingPart, ...]]:
     """Return the switching parts of each kind, as they are of the first of its peers.
 
@@ -194,9 +194,7 @@ def settings(parts: Iterable[SwitchingPart], *, on: bool) -> dict[int, bool]:
     }
 
 
-def _settings(
-    system: CompiledSystem, names: Sequence[str], has: Sequence[frozenset[str]]
-) -> dict[_Setting, str]:
+def _settings(system: Model, names: Sequence[str], has: Sequence[frozenset[str]]) -> dict[_Setting, str]:
     """Return the modes of a scene with their names, each once; none where nothing switches."""
     nothing: frozenset[str] = frozenset()
     result = {tuple(has): EVERYONE, tuple(nothing for _ in has): NOBODY} if names else {}
@@ -208,7 +206,7 @@ def _settings(
     return result
 
 
-def _no_slope(system: CompiledSystem, sites: Sequence[SiteJacobians]) -> str:
+def _no_slope(system: Model, sites: Sequence[SubsystemJacobians]) -> str:
     """Say which peers' pieces have no slopes at the start values, "" if all have."""
     numbers = resolve(system)
     for group, rows in zip(system.groups, numbers.parameters, strict=True):

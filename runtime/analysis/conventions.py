@@ -1,7 +1,7 @@
 """Does the verdict hang on a convention: every order of coincident events, and both readings of the start.
 
-Takes: a `CompiledSystem`.
-Gives: `Outcome`, `Conventions`, `conventions`.
+Takes: a `Model`.
+Gives: `Outcome`, `EventOrder`, `conventions`.
 Guarantees: every order of `schedule.ORDER` is covered; orders that mean the same frame are analysed once.
 Does not: leave anything out silently: what is not repeated says why.
 
@@ -24,15 +24,15 @@ import casadi
 import numpy as np
 
 from apc.analysis.analysis import Analysis, analyze
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.compiler.timings import part
 from apc.frame.ages import at_timings
 from apc.frame.instance import Prepared, prepare
-from apc.frame.jacobians import SiteJacobians
-from apc.frame.schedule import ORDER, Act, Propagate, Schedule, Send, Tick, Value
+from apc.frame.jacobians import SubsystemJacobians
+from apc.frame.schedule import ORDER, ClockedValue, HoldUpdate, Propagate, Schedule, SendEvent, Tick
 from apc.frame.scheduling import build_schedules
-from apc.frame.site import LinearSite
+from apc.frame.site import LinearSubsystem
 from apc.result import Result
 
 Order = tuple[str, ...]
@@ -87,7 +87,7 @@ class Outcome:
 
 
 @dataclass(frozen=True, slots=True)
-class Conventions(Result):
+class EventOrder(Result):
     """The outcomes, the default one first; `repeated` says whether there are others to compare it with.
 
     `not_repeated` says why not. `start_matters` says whether the linearization depends on what is heard.
@@ -123,12 +123,12 @@ class Conventions(Result):
 
 @part("conventions")
 def conventions(
-    system: CompiledSystem,
+    system: Model,
     *,
     prepared: Prepared | None = None,
     default: Analysis | None = None,
     quick: bool = False,
-) -> Conventions:
+) -> EventOrder:
     """Repeat an analysis under every convention of time.
 
     Parameters
@@ -170,9 +170,9 @@ def conventions(
         answer = analysis.verdict, analysis.stable, radius, error, analysis.frame_s
         return Outcome(tuple(orders), departures, start, *answer, refusal="", beyond=analysis.beyond)
 
-    def only(why: str) -> Conventions:
+    def only(why: str) -> EventOrder:
         first = replace(outcome([ORDER], readings[0], default, default.frame_s), departures=())
-        return Conventions(system.name, (first,), matters, why)
+        return EventOrder(system.name, (first,), matters, why)
 
     if quick and (why := _too_much(prepared, default, 1)):
         return only(why)
@@ -196,19 +196,19 @@ def conventions(
             except ApcError as refused:
                 result = refused
         outcomes.append(outcome(orders, start, result, default.frame_s))
-    return Conventions(system.name, tuple(outcomes), matters, "")
+    return EventOrder(system.name, tuple(outcomes), matters, "")
 
 
-def _prepared(system: CompiledSystem, prepared: Prepared, order: Order, *, silent: bool) -> Prepared:
+def _prepared(system: Model, prepared: Prepared, order: Order, *, silent: bool) -> Prepared:
     """Return what was prepared for another order of events, `silent` with nothing heard at the start."""
     sites = at_timings(system, prepared.jacobians, prepared.timings, order)
     schedules = build_schedules(system, prepared.timings, [site.pattern for site in sites], order=order)
     return Prepared(tuple(map(_silent, sites)) if silent else sites, schedules, prepared.timings, order)
 
 
-def _meaning(schedule: Schedule, pattern: LinearSite) -> Hashable:
+def _meaning(schedule: Schedule, pattern: LinearSubsystem) -> Hashable:
     """Return what a schedule does, whatever the order of events at one instant that commute."""
-    acting: list[Value | None] = list(schedule.acting)
+    acting: list[ClockedValue | None] = list(schedule.acting)
     by_motion = _holds(pattern.b)
     by_sends = [_holds(send.u) for send in pattern.sends]
     by_ticks = [_holds(tick.u) for tick in pattern.ticks]
@@ -223,9 +223,9 @@ def _meaning(schedule: Schedule, pattern: LinearSite) -> Hashable:
             case Propagate(duration):
                 course += [frozenset(instant), duration, reads(by_motion)]
                 instant = set()
-            case Act(hold, value):
+            case HoldUpdate(hold, value):
                 acting[hold] = value
-            case Send(partition, rows):
+            case SendEvent(partition, rows):
                 sent = tuple((channel, schedule.sent[row]) for channel, row in rows)
                 instant.add(("send", partition, sent, reads(by_sends[partition])))
             case Tick(partition, index, heard):
@@ -240,7 +240,7 @@ def _holds(reading: Any) -> list[int]:
     return numbers
 
 
-def _hearing_matters(site: SiteJacobians) -> bool:
+def _hearing_matters(site: SubsystemJacobians) -> bool:
     """Say whether a site's linearization depends on what it hears."""
     if site.affine:
         return False
@@ -250,7 +250,7 @@ def _hearing_matters(site: SiteJacobians) -> bool:
     return bool(heard.numel() and casadi.depends_on(site.function(*site.function.sx_in()), heard))
 
 
-def _silent(site: SiteJacobians) -> SiteJacobians:
+def _silent(site: SubsystemJacobians) -> SubsystemJacobians:
     """Return a site whose start value of everything it sends is zero; how it sends is not changed."""
     sends = []
     for sending in site.kind.sends:

@@ -1,6 +1,6 @@
 """The buzz of one-sided contacts, predicted: their describing function in the linear loop.
 
-Takes: a `CompiledSystem` whose peers have one-sided contacts.
+Takes: a `Model` whose peers have one-sided contacts.
 Gives: `Predicted`, `predict`; `gain_of`, `load_of`.
 Guarantees: the gain at which the loop is marginal is found to rounding.
 Does not: see a second frequency, or that contacts share a motion otherwise than their loads; say whether the
@@ -24,15 +24,15 @@ from fractions import Fraction
 from scipy.optimize import brentq
 
 from apc.analysis.opened import with_gain
-from apc.analysis.pushes import Push
-from apc.compiler.compiled import CompiledSystem
+from apc.analysis.pushes import SectorNonlinearity
+from apc.compiler.compiled import Model
 from apc.eigen.closing import close_loop
 from apc.eigen.modes import arrange
-from apc.eigen.peers import PeerGroup
+from apc.eigen.peers import PeerClass
 from apc.eigen.spectrum import Spectrum, solve_spectrum
-from apc.frame.exchange import Exchange, build_exchange
+from apc.frame.exchange import CommunicationGraph, build_exchange
 from apc.frame.parameters import resolve
-from apc.unserved import UnservedError
+from apc.unserved import NotSupportedError
 
 # Gains tried between 0 and 1 on the way from 1 down, and how near the root of an equation is to be had.
 CELLS, NEAR = 32, 1e-15
@@ -72,7 +72,7 @@ def load_of(bias: float) -> float:
     return (math.sqrt(1 - bias * bias) + bias * (math.pi / 2 + math.asin(bias))) / math.pi
 
 
-def predict(system: CompiledSystem, groups: list[tuple[PeerGroup, tuple[Push, ...]]]) -> Predicted:
+def predict(system: Model, groups: list[tuple[PeerClass, tuple[SectorNonlinearity, ...]]]) -> Predicted:
     """Predict the buzz of a scene.
 
     Parameters
@@ -84,7 +84,7 @@ def predict(system: CompiledSystem, groups: list[tuple[PeerGroup, tuple[Push, ..
 
     Raises
     ------
-    UnservedError
+    NotSupportedError
         Why there is none to predict.
     """
     exchange = build_exchange(system, resolve(system).timings)
@@ -100,7 +100,7 @@ def predict(system: CompiledSystem, groups: list[tuple[PeerGroup, tuple[Push, ..
     below = next((gain for gain in gains if (excess(gain) > 0) != unstable), None)
     if below is None:
         word = "unstable" if unstable else "stable"
-        raise UnservedError(f"no buzz: with contacts of any part of their stiffness it is {word}")
+        raise NotSupportedError(f"no buzz: with contacts of any part of their stiffness it is {word}")
     gain = brentq(excess, below, below + 1 / CELLS, xtol=NEAR)
     spectrum = at(gain)
     frequency = max(
@@ -108,12 +108,14 @@ def predict(system: CompiledSystem, groups: list[tuple[PeerGroup, tuple[Push, ..
     )
     if not frequency:
         what = f"with contacts of {gain:.6g} of their stiffness it drifts away without swinging"
-        raise UnservedError(f"no buzz: {what}")
+        raise NotSupportedError(f"no buzz: {what}")
     bias = brentq(lambda item: gain_of(item) - gain, -1, 1, xtol=NEAR)
     return Predicted(frequency, gain, bias, 0.5 + math.asin(bias) / math.pi, unstable)
 
 
-def _spectrum(groups: list[tuple[PeerGroup, tuple[Push, ...]]], exchange: Exchange, gain: float) -> Spectrum:
+def _spectrum(
+    groups: list[tuple[PeerClass, tuple[SectorNonlinearity, ...]]], exchange: CommunicationGraph, gain: float
+) -> Spectrum:
     """Solve the scene with linear contacts of a part of their stiffness."""
     weaker = [with_gain(group, pushes, Fraction(gain)) for group, pushes in groups]
     return solve_spectrum([close_loop(loop) for loop in arrange(weaker, exchange).loops])

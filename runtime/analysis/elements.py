@@ -1,6 +1,6 @@
 """The elements of a topology that a linear analysis does not see as they are.
 
-Takes: a `CompiledSystem`.
+Takes: a `Model`.
 Gives: `replaced_elements`, `is_linear`.
 Guarantees: each part that other equations represent in a linear analysis is named with them, and each
 equation that is constant between jumps.
@@ -14,7 +14,7 @@ from collections.abc import Iterator
 
 import casadi
 
-from apc.compiler.compiled import CompiledSystem, Kind
+from apc.compiler.compiled import Model, PeerType
 from apc.frame.decisions import functions_of
 from apc.frame.instance import Prepared
 from apc.frame.jacobians import nodes_of
@@ -25,7 +25,7 @@ FLAT = {casadi.OP_FLOOR, casadi.OP_CEIL, casadi.OP_SIGN}
 OF_ALL = "apc simulate covers smaller motions"
 
 
-def replaced_elements(system: CompiledSystem) -> tuple[str, ...]:
+def replaced_elements(system: Model) -> tuple[str, ...]:
     """Return a line for each element that is replaced, or flat, in a linear analysis.
 
     Parameters
@@ -38,7 +38,7 @@ def replaced_elements(system: CompiledSystem) -> tuple[str, ...]:
     return tuple(dict.fromkeys(lines))
 
 
-def is_linear(system: CompiledSystem, prepared: Prepared) -> bool:
+def is_linear(system: Model, prepared: Prepared) -> bool:
     """Return whether the equations are linear as written, with no element replaced.
 
     Parameters
@@ -52,14 +52,14 @@ def is_linear(system: CompiledSystem, prepared: Prepared) -> bool:
     )
 
 
-def _replaced(kind: Kind) -> Iterator[str]:
+def _replaced(kind: PeerType) -> Iterator[str]:
     for element in kind.replaced:
         valid = f", valid for {element.valid}" if element.valid else ""
         yield f"{element.part} is replaced by {'; '.join(element.equations)}{valid}: {OF_ALL}"
 
 
 @functools.lru_cache(maxsize=64)
-def _flat(kind: Kind) -> tuple[str, ...]:
+def _flat(kind: PeerType) -> tuple[str, ...]:
     """Return a line for each equation with a floor, ceil or sign of a motion: its slope is zero."""
     result: dict[str, None] = {}
     for _, function, arguments, rows in functions_of(kind):

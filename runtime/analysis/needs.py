@@ -1,6 +1,6 @@
 """What a scene needs: the states, delays and packets its analysis keeps, and nothing else.
 
-Takes: a `CompiledSystem`. Gives: `Needs`.
+Takes: a `Model`. Gives: `ModelSize`.
 Guarantees: the counts are those of the systems that are analysed; none of them is built.
 Does not: analyse.
 """
@@ -13,7 +13,7 @@ from fractions import Fraction
 import numpy as np
 
 from apc.analysis.plan import make_plan
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.frame.ages import linear_sites, of_one_delay
 from apc.frame.finite_equations import finite_equations
@@ -23,7 +23,7 @@ from apc.result import Result
 
 
 @dataclass(frozen=True, slots=True)
-class SiteNeeds:
+class SubsystemSize:
     """What one peer of a kind keeps from frame to frame."""
 
     name: str
@@ -38,7 +38,7 @@ class SiteNeeds:
 
 
 @dataclass(frozen=True, slots=True)
-class Needs(Result):
+class ModelSize(Result):
     """What a scene keeps: `sites` one a kind, `ticks` of each clock in a frame.
 
     It is analysed by `method` as `systems`, (count, size); `refused` says why there are none, where there are
@@ -49,7 +49,7 @@ class Needs(Result):
 
     peers: int
     frame: Fraction  # s
-    sites: tuple[SiteNeeds, ...]
+    sites: tuple[SubsystemSize, ...]
     ticks: tuple[tuple[str, int], ...]
     method: str
     systems: tuple[tuple[int, int], ...]
@@ -57,13 +57,13 @@ class Needs(Result):
     pairs: tuple[str, ...]
 
 
-def needs(system: CompiledSystem) -> Needs:
+def needs(system: Model) -> ModelSize:
     """Count what a scene keeps from frame to frame."""
     with finite_equations(system.origin.topology):
         return _needs(system)
 
 
-def _needs(system: CompiledSystem) -> Needs:
+def _needs(system: Model) -> ModelSize:
     refused = ""
     try:
         prepared = prepare(system)
@@ -75,7 +75,7 @@ def _needs(system: CompiledSystem) -> Needs:
         for group, schedule in reversed(list(zip(system.groups, prepared.schedules, strict=True)))
     }
     sites = tuple(
-        SiteNeeds(
+        SubsystemSize(
             kind.name, len(kind.states), len(schedule_of[place].carried), sum(schedule_of[place].depths)
         )
         for place, kind in enumerate(system.kinds)
@@ -90,7 +90,7 @@ def _needs(system: CompiledSystem) -> Needs:
     except ApcError as error:  # a scene that can't be analysed may still be run
         refused = error.mistakes[0].sentence
     frame = prepared.schedules[0].frame_s
-    return Needs(
+    return ModelSize(
         system.peers,
         frame,
         sites,

@@ -1,7 +1,7 @@
 """A scene with its contacts cut open: from the forces of a frame's ticks to what each follows.
 
-Takes: a `CompiledSystem` whose peers have parts that switch.
-Gives: `contact_groups`, `with_gain`; `Opened`, `OpenLoop`, `open_loops`; `negated`.
+Takes: a `Model` whose peers have parts that switch.
+Gives: `contact_groups`, `with_gain`; `CutPeers`, `LurePlant`, `open_loops`; `negated`.
 Guarantees: every matrix comes with its radii; what may drift with all contacts open is taken out, exactly.
 The cost grows with the different peers, not with their number.
 Does not: judge anything (see `switching`).
@@ -26,12 +26,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.contact_modes import parts_of_kinds, settings
-from apc.analysis.pushes import Push, push_of
+from apc.analysis.pushes import SectorNonlinearity, push_of
 from apc.analysis.switches import bind
-from apc.compiler.compiled import CompiledSystem
-from apc.eigen.closing import Loop, close_loop, close_outside, lay_out
+from apc.compiler.compiled import Model
+from apc.eigen.closing import ModalSystem, close_loop, close_outside, lay_out
 from apc.eigen.modes import loops_at_right_angles
-from apc.eigen.peers import PeerGroup, peer_groups
+from apc.eigen.peers import PeerClass, peer_groups
 from apc.eigen.relative import relative_coordinates, relative_rows, with_doubt
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.decisions import find_switches
@@ -43,8 +43,8 @@ from apc.frame.parameters import resolve
 from apc.frame.ports import with_cuts
 from apc.frame.radius import RADII, radius_of, rounded, solve, value_of, with_radius
 from apc.frame.schedule import Tick
-from apc.frame.site import LinearSite
-from apc.unserved import UnservedError
+from apc.frame.site import LinearSubsystem
+from apc.unserved import NotSupportedError
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
@@ -57,14 +57,14 @@ _APART = "with all contacts open, several things may drift apart, and one is mov
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Opened:
+class CutPeers:
     """Peers with their contacts cut open: `map` over [z, y of each tick] and [r, f of each tick].
 
     `states` are those of z; `ticks` names each y and f by its part and tick, `slopes` are those of each y
     over the continuous states, exactly; `plain` says that it follows nothing else. `jumps` is as of a loop.
     """
 
-    group: PeerGroup
+    group: PeerClass
     map: FrameMap
     states: int
     ticks: tuple[tuple[str, int], ...]
@@ -74,7 +74,7 @@ class Opened:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class OpenLoop:
+class LurePlant:
     """A loop with its contacts cut open; A, B, C and D are `a` to `d`, `seen` is s and `moved` is m.
 
     `ports` name each f by its site, part and tick, `counts` how many peers have it. `seen` is exact, its
@@ -94,7 +94,9 @@ class OpenLoop:
     jumps: str
 
 
-def contact_groups(system: CompiledSystem, prepared: Prepared) -> list[tuple[PeerGroup, tuple[Push, ...]]]:
+def contact_groups(
+    system: Model, prepared: Prepared
+) -> list[tuple[PeerClass, tuple[SectorNonlinearity, ...]]]:
     """Return the groups of equal peers with all contacts on, and what pushes at each.
 
     Parameters
@@ -106,13 +108,13 @@ def contact_groups(system: CompiledSystem, prepared: Prepared) -> list[tuple[Pee
     ------
     ApcError
         E863 a part that takes too many decisions.
-    UnservedError
+    NotSupportedError
         Why that can't be.
     """
     numbers = resolve(system)
     kinds_now = [site.kind for site in prepared.jacobians]
     if any(partition.variants for kind in kinds_now for partition in kind.clocks):
-        raise UnservedError("what is computed of what is heard changes with its age, from tick to tick")
+        raise NotSupportedError("what is computed of what is heard changes with its age, from tick to tick")
     switched = [find_switches(kind) for kind in kinds_now]
     parts = parts_of_kinds(system, switched, numbers)
     on = tuple(
@@ -124,7 +126,7 @@ def contact_groups(system: CompiledSystem, prepared: Prepared) -> list[tuple[Pee
         for part in parts[group.kind]:
             push_of(switched[group.kind], part, prepared.jacobians[group.kind], vector)
         if not on[group.kind].parameters_suffice:
-            raise UnservedError(
+            raise NotSupportedError(
                 f"some force at {group.name} is not linear, or looks at each of the others by itself"
             )
     scene = instance(system, replace(prepared, jacobians=on))
@@ -141,7 +143,7 @@ def contact_groups(system: CompiledSystem, prepared: Prepared) -> list[tuple[Pee
     return pairs
 
 
-def with_gain(group: PeerGroup, pushes: Sequence[Push], gain: Fraction) -> PeerGroup:
+def with_gain(group: PeerClass, pushes: Sequence[SectorNonlinearity], gain: Fraction) -> PeerClass:
     """Return peers whose contacts, always on, push so many times as hard.
 
     Parameters
@@ -155,7 +157,7 @@ def with_gain(group: PeerGroup, pushes: Sequence[Push], gain: Fraction) -> PeerG
     return group.with_site(site, exact, group.schedule)
 
 
-def _pushing(site: LinearSite, pushes: Sequence[Push], gain: Fraction) -> LinearSite:
+def _pushing(site: LinearSubsystem, pushes: Sequence[SectorNonlinearity], gain: Fraction) -> LinearSubsystem:
     """Return a site whose contacts push so many times as hard, of floats or rationals."""
     ticks = list(site.ticks)
     for push in pushes:
@@ -168,13 +170,13 @@ def _pushing(site: LinearSite, pushes: Sequence[Push], gain: Fraction) -> Linear
     return replace(site, ticks=tuple(ticks))
 
 
-def open_loops(system: CompiledSystem, prepared: Prepared) -> list[OpenLoop]:
-    """Cut all contacts open; UnservedError says why that can't be."""
-    opened: list[Opened] = []
+def open_loops(system: Model, prepared: Prepared) -> list[LurePlant]:
+    """Cut all contacts open; NotSupportedError says why that can't be."""
+    opened: list[CutPeers] = []
     for group, pushes in contact_groups(system, prepared):
         for push in pushes:
             if push.sector and not push.shares:
-                raise UnservedError(push.sector)
+                raise NotSupportedError(push.sector)
         opened.append(_cut_open(group, pushes))
     of_site = {id(item.group.lifting): item for item in opened}
     exchange = build_exchange(system, resolve(system).timings)
@@ -184,14 +186,14 @@ def open_loops(system: CompiledSystem, prepared: Prepared) -> list[OpenLoop]:
         cut_groups = [of_site[id(site.lifting)] for site in loop.sites]
         size = loop.states + sum(len(opened.ticks) for opened in cut_groups)
         if size > MOST_STATES:
-            raise UnservedError(
+            raise NotSupportedError(
                 f"{size:,} states and ticks of contacts move together, and {MOST_STATES} are the most"
             )
         result.append(_open_loop(loop, cut_groups))
     return result
 
 
-def _cut_open(group: PeerGroup, pushes: Sequence[Push]) -> Opened:
+def _cut_open(group: PeerClass, pushes: Sequence[SectorNonlinearity]) -> CutPeers:
     """Cut the contacts of some peers open: their forces come from outside, and what they follow goes out."""
     schedule, bare = group.schedule, with_gain(group, pushes, Fraction(0))
     steps = step_durations(schedule)
@@ -207,14 +209,14 @@ def _cut_open(group: PeerGroup, pushes: Sequence[Push]) -> Opened:
     followed = np.array(slopes, dtype=object).reshape(len(ticks), len(bare.exact.a))
     plain = not any(push.slopes[push.states :].any() for push in pushes)
     jumps = next((push.part for push in pushes if push.sector), "")
-    return Opened(bare, wide_map, len(bare.z_names), tuple(ticks), followed, plain, jumps)
+    return CutPeers(bare, wide_map, len(bare.z_names), tuple(ticks), followed, plain, jumps)
 
 
-def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop:
-    """Close a loop whose contacts are cut open; UnservedError says why that can't be judged."""
+def _open_loop(loop: ModalSystem, opened: Sequence[CutPeers]) -> LurePlant:
+    """Close a loop whose contacts are cut open; NotSupportedError says why that can't be judged."""
     free = find_rigid_modes(close_loop(loop))
     if free.drifts:
-        raise UnservedError("with all contacts open, something drifts ever farther")
+        raise NotSupportedError("with all contacts open, something drifts ever farther")
     names = [(*item.group.z_names, *(f"{part}[{tick}]" for part, tick in item.ticks)) for item in opened]
     layout = lay_out(names, [site.schedule for site in loop.sites])
     closed = close_outside(
@@ -232,11 +234,11 @@ def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop:
     shares, moved = np.zeros(0, dtype=object), np.zeros((2, 1, len(ports)))
     if free.exact:
         if not all(item.plain for item in opened):
-            raise UnservedError(_MORE)
+            raise NotSupportedError(_MORE)
         motions = np.array(free.exact, dtype=object).T
         left = _left_vectors(a, motions, at.held)
         if left is None:
-            raise UnservedError("what moves with all contacts open can't be told from what drifts")
+            raise NotSupportedError("what moves with all contacts open can't be told from what drifts")
         rows = [(opened.slopes, np.searchsorted(own, offset)) for _, opened, offset in listed]
         followed = np.concatenate(
             [slopes @ motions[start : start + slopes.shape[1]] for slopes, start in rows], axis=0
@@ -248,10 +250,10 @@ def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop:
             pivot = int((first != 0).argmax())
             shares = followed[:, pivot] / first[pivot]
             if (followed != np.outer(shares, first)).any():
-                raise UnservedError(_APART)
+                raise NotSupportedError(_APART)
             drift = rounded(first[None].astype(np.float64))
             moved = RADII.multiply(drift, RADII.multiply(left, b))
-    return OpenLoop(
+    return LurePlant(
         name=loop.name,
         a=relative_rows(a[..., at.rest], at, RADII),
         b=relative_rows(b, at, RADII),

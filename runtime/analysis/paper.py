@@ -1,8 +1,8 @@
 """The analysis as the paper writes it: cut at every force, lifted over a frame, delayed, closed again.
 
-Takes: a `CompiledSystem` of the paper's form: linear, at rest or translating, with one clock of forces and
+Takes: a `Model` of the paper's form: linear, at rest or translating, with one clock of forces and
 one network clock at a whole multiple of its period.
-Gives: `NamedMatrix`, `PaperRoute`, `paper_route`, `analyze_paper`.
+Gives: `NamedMatrix`, `PaperMethod`, `paper_route`, `analyze_paper`.
 Guarantees: every matrix names its rows and columns; the nonzero eigenvalues are those of the direct route. A
 scene of another form is refused with what it lacks.
 Does not: split equal peers into modes, so it costs (4nR)³ for n peers at ratio R.
@@ -38,11 +38,11 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Analysis, lifted_groups
 from apc.analysis.methods import PAPER
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
-from apc.eigen.closing import ClosedSystem, Feedback, StateLayout, close
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
+from apc.eigen.closing import ClosedLoop, InterconnectionMatrices, StateLayout, close
 from apc.eigen.modes import dense
-from apc.eigen.peers import PeerGroup
+from apc.eigen.peers import PeerClass
 from apc.eigen.relative import relative_bounded, relative_coordinates, relative_places
 from apc.eigen.rigid import RigidModes, find_rigid_modes, what_stands
 from apc.eigen.spectrum import STABLE, Spectrum, solve_spectrum, up_to
@@ -50,7 +50,7 @@ from apc.frame.discretize import discretize
 from apc.frame.finite_equations import finite_equations
 from apc.frame.lift import FrameMap
 from apc.frame.radius import RADII, radius_of, rounded, value_of, with_radius
-from apc.frame.schedule import Way
+from apc.frame.schedule import CouplingTerm
 from apc.network.nominal import left_out
 from apc.result import Result
 from apc.threads import load_pool, single_threaded
@@ -82,7 +82,7 @@ class NamedMatrix(Result):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PaperRoute(Result):
+class PaperMethod(Result):
     """Every matrix of the paper's section III, for n peers at ratio R.
 
     `a`, `b`, `c` are eq. (18); `a_d`, `b_d`, `c_d`, `d_d` eq. (19), without delays; `a_aug` … `d_aug` the
@@ -110,7 +110,7 @@ class PaperRoute(Result):
     eigenvalues: NDArray[np.complex128]
 
 
-def paper_route(system: CompiledSystem) -> PaperRoute:
+def paper_route(system: Model) -> PaperMethod:
     """Return the matrices of the paper's route.
 
     Parameters
@@ -128,7 +128,7 @@ def paper_route(system: CompiledSystem) -> PaperRoute:
         return _named(_open_loop(system, dense(*lifted_groups(system))))
 
 
-def analyze_paper(system: CompiledSystem) -> Analysis:
+def analyze_paper(system: Model) -> Analysis:
     """Analyse a system by the paper's route.
 
     The rigid motions are removed by their known directions, so the modes' participation is in relative
@@ -235,7 +235,7 @@ def _floats(signals: Sequence[_Signal], width: int) -> Floats:
     return _weights(signals, width).astype(np.float64)
 
 
-def _open_loop(system: CompiledSystem, whole: ClosedSystem) -> _OpenLoop:
+def _open_loop(system: Model, whole: ClosedLoop) -> _OpenLoop:
     """Cut the loop of all peers at every force."""
     sites = whole.sites
     period, frame = _periods(system, sites)
@@ -248,7 +248,7 @@ def _open_loop(system: CompiledSystem, whole: ClosedSystem) -> _OpenLoop:
             f"the paper's matrices for {len(sites)} peers at {ratio} force ticks a frame have more than "
             f"{MOST_ROWS:,} rows"
         )
-        raise ApcError(Mistake("E862", Place(system.origin.topology), what, hint=_INSTEAD))
+        raise ApcError(Diagnostic("E862", SourceLocation(system.origin.topology), what, hint=_INSTEAD))
     sent = [
         {
             (sending.link, channel): row
@@ -257,7 +257,7 @@ def _open_loop(system: CompiledSystem, whole: ClosedSystem) -> _OpenLoop:
         }
         for group in sites
     ]
-    heard: dict[tuple[int, Way, str], _Signal] = {}
+    heard: dict[tuple[int, CouplingTerm, str], _Signal] = {}
     for i, group in enumerate(sites):
         several = len({heard.way.delay for heard in group.schedule.heard}) > 1
         places = (
@@ -371,11 +371,11 @@ def _feedback(loop: _OpenLoop) -> Floats:
 def _close(delayed: FrameMap, f: Floats) -> Matrix:
     """Return A_cl of eq. (20) with its radii."""
     size = delayed.p.shape[-1]
-    feedback = Feedback(rounded(f), np.zeros((2, len(f), size)))
+    feedback = InterconnectionMatrices(rounded(f), np.zeros((2, len(f), size)))
     return close([delayed], [feedback], StateLayout((0,), ("",) * size, {}), numbers=RADII).matrix
 
 
-def _named(loop: _OpenLoop) -> PaperRoute:
+def _named(loop: _OpenLoop) -> PaperMethod:
     """Return every matrix with the names of its rows and columns."""
     n, ratio = len(loop.states), loop.ratio
     fast, slow = (tuple(replace(signal, delay=0) for signal in signals) for signals in (loop.fast, loop.slow))
@@ -391,7 +391,7 @@ def _named(loop: _OpenLoop) -> PaperRoute:
     values = np.zeros(len(closed), dtype=np.complex128)
     alive = slice((ratio - 1) * n, None)  # the columns before are zero, and so are as many eigenvalues
     values[alive] = np.linalg.eigvals(closed[alive, alive])
-    return PaperRoute(
+    return PaperMethod(
         ratio=ratio,
         frame_s=loop.frame_s,
         a=NamedMatrix(loop.ab[:, :n], loop.states, loop.states),
@@ -408,7 +408,7 @@ def _named(loop: _OpenLoop) -> PaperRoute:
 def _blocks(
     suffix: str, lifted: FrameMap, states: tuple[str, ...], inputs: tuple[str, ...], outputs: tuple[str, ...]
 ) -> dict[str, NamedMatrix]:
-    """Return A, B, C and D of a lifted system by their names in `PaperRoute`."""
+    """Return A, B, C and D of a lifted system by their names in `PaperMethod`."""
     shapes = ((states, states), (states, inputs), (outputs, states), (outputs, inputs))
     return {
         f"{letter}_{suffix}": NamedMatrix(value_of(block), *shape)
@@ -435,7 +435,7 @@ def _waiting_names(loop: _OpenLoop) -> tuple[str, ...]:
 # ---- the analysis: rigid motions out, then eigenvalues ----
 
 
-def _without_rigid(loop: _OpenLoop, whole: ClosedSystem, rigid: RigidModes) -> ClosedSystem:
+def _without_rigid(loop: _OpenLoop, whole: ClosedLoop, rigid: RigidModes) -> ClosedLoop:
     """Return A_cl in relative coordinates, without its zero columns.
 
     As many positions are given up as there are rigid motions. Where x stands, so does all that is a form in
@@ -455,7 +455,7 @@ def _without_rigid(loop: _OpenLoop, whole: ClosedSystem, rigid: RigidModes) -> C
     at = relative_coordinates(basis, (held, rest))
     matrix, error = relative_bounded(value_of(closed), radius_of(closed), at)
     names = (*loop.states, *_waiting_names(loop))
-    return ClosedSystem(
+    return ClosedLoop(
         name=PAPER,
         multiplicity=1,
         sites=(),  # a matrix by itself, its rigid motions already out
@@ -489,7 +489,7 @@ def _with_turns(spectrum: Spectrum, whole: Spectrum) -> Spectrum:
 # ---- the paper's form ----
 
 
-def _periods(system: CompiledSystem, sites: Sequence[PeerGroup]) -> tuple[Fraction, Fraction]:
+def _periods(system: Model, sites: Sequence[PeerClass]) -> tuple[Fraction, Fraction]:
     """Return T_c and T_n, or say everything that keeps a scene from having the paper's form."""
     timings = {timing.name: timing.value for timing in system.timings}
     link_clock = {link.name: link.clock for link in system.links}
@@ -530,7 +530,7 @@ def _periods(system: CompiledSystem, sites: Sequence[PeerGroup]) -> tuple[Fracti
     return period, frame
 
 
-def _misfits(group: PeerGroup) -> Iterator[str]:
+def _misfits(group: PeerClass) -> Iterator[str]:
     """Yield what a peer's own equations lack."""
     kind, pattern = group.jacobians.kind, group.jacobians.pattern
     if not group.site.affine:
@@ -549,8 +549,8 @@ def _misfits(group: PeerGroup) -> Iterator[str]:
         yield "packets of the motion alone (a held force is sent)"
 
 
-def _not_of_the_form(system: CompiledSystem, missing: Iterable[str]) -> ApcError:
+def _not_of_the_form(system: Model, missing: Iterable[str]) -> ApcError:
     what = "the paper's route is written for another form of scene; missing: " + "; ".join(
         dict.fromkeys(missing)
     )
-    return ApcError(Mistake("E861", Place(system.origin.topology), what, hint=_INSTEAD))
+    return ApcError(Diagnostic("E861", SourceLocation(system.origin.topology), what, hint=_INSTEAD))

@@ -1,7 +1,7 @@
 """How a system is going to be analysed: by which method, as which systems.
 
 Takes: an `Instance` of a scene.
-Gives: `Plan`, `make_plan`; `refuse_varying`, `is_large_ring`, `not_populations`.
+Gives: `AnalysisPlan`, `make_plan`; `refuse_varying`, `is_large_ring`, `not_populations`.
 Guarantees: nothing is solved, and no matrix of a whole system is built.
 Does not: analyse (see `analysis`).
 """
@@ -14,15 +14,15 @@ from dataclasses import dataclass
 
 from apc.analysis.methods import METHODS, PAPER
 from apc.analysis.switches import varying_slopes
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
-from apc.eigen.closing import Loop
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
+from apc.eigen.closing import ModalSystem
 from apc.eigen.graph_loops import common_graph
 from apc.eigen.modes import arrange, dense_loop, refuse_dense
-from apc.eigen.peers import MOST_STATES, PeerGroup, more_differ, peer_groups, too_large, used_ways
-from apc.frame.exchange import Exchange
+from apc.eigen.peers import MOST_STATES, PeerClass, more_differ, peer_groups, too_large, used_ways
+from apc.frame.exchange import CommunicationGraph
 from apc.frame.instance import Instance
-from apc.frame.jacobians import SiteJacobians
+from apc.frame.jacobians import SubsystemJacobians
 from apc.frame.schedule import Schedule
 from apc.memory import refuse_beyond
 
@@ -48,20 +48,20 @@ KEPT_OF_SITE, SITE_AT_WORK = 200, 6000
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class AnalysisPlan:
     """The method, and the groups of equal peers with their loops; of peers by the thousand neither.
 
     `systems` are (how many, how large): states, or rows of a determinant.
     """
 
     method: str
-    groups: tuple[PeerGroup, ...]
-    loops: tuple[Loop, ...]
+    groups: tuple[PeerClass, ...]
+    loops: tuple[ModalSystem, ...]
     systems: tuple[tuple[int, int], ...]
     notes: tuple[str, ...]
 
 
-def refuse_varying(system: CompiledSystem, jacobians: Sequence[SiteJacobians]) -> None:
+def refuse_varying(system: Model, jacobians: Sequence[SubsystemJacobians]) -> None:
     """Refuse equations whose slopes change with time: frozen at a moment, they'd answer for another scene.
 
     Parameters
@@ -80,11 +80,11 @@ def refuse_varying(system: CompiledSystem, jacobians: Sequence[SiteJacobians]) -
         if names := varying_slopes(site):
             what = f"the equation of {names[0]} multiplies what moves by what changes with time"
             why = "no one frame stands for all others, so that no verdict can be had; a simulation plays it"
-            place = Place(system.origin.topology)
-            raise ApcError(Mistake("E810", place, f"{what}: {why}", hint="apc simulate"))
+            place = SourceLocation(system.origin.topology)
+            raise ApcError(Diagnostic("E810", place, f"{what}: {why}", hint="apc simulate"))
 
 
-def make_plan(instance: Instance, method: str = "auto") -> Plan:
+def make_plan(instance: Instance, method: str = "auto") -> AnalysisPlan:
     """Choose the method that serves a system, or see that one serves it that is asked for.
 
     Parameters
@@ -116,10 +116,12 @@ def make_plan(instance: Instance, method: str = "auto") -> Plan:
     groups = peer_groups(instance)
     if is_large_ring(groups, exchange):
         what = f"a ring of {exchange.peers:,} peers is as many systems, up to {LARGEST_RING:,} are solved"
-        raise ApcError(Mistake("E804", Place(exchange.scene), what, hint=f"count: {LARGEST_RING}"))
+        raise ApcError(
+            Diagnostic("E804", SourceLocation(exchange.scene), what, hint=f"count: {LARGEST_RING}")
+        )
     if method == "dense":
         refuse_dense(groups, exchange)
-        loops: tuple[Loop, ...] = (dense_loop(groups, exchange),)
+        loops: tuple[ModalSystem, ...] = (dense_loop(groups, exchange),)
         text, notes = "dense", tuple[str, ...]()
     else:
         arranged = arrange(groups, exchange)
@@ -149,8 +151,10 @@ def make_plan(instance: Instance, method: str = "auto") -> Plan:
         needed = sum(_determinant_bytes(loop) for loop in loops)
         sites = sum(len(loop.sites) for loop in loops)
         what = f"{len(loops):,} determinants of {sites:,} peers that differ"
-    refuse_beyond(needed, "E804", Place(exchange.scene), what, "fewer peers that differ, or fewer states")
-    return Plan(text, groups, loops, _sizes(loops, text), notes)
+    refuse_beyond(
+        needed, "E804", SourceLocation(exchange.scene), what, "fewer peers that differ, or fewer states"
+    )
+    return AnalysisPlan(text, groups, loops, _sizes(loops, text), notes)
 
 
 def _long_lines(schedule: Schedule) -> bool:
@@ -159,7 +163,7 @@ def _long_lines(schedule: Schedule) -> bool:
     return packets > max(LONG_LINES, MANY_FRAMES * len(schedule.sent))
 
 
-def is_large_ring(groups: Sequence[PeerGroup], exchange: Exchange) -> bool:
+def is_large_ring(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> bool:
     """Say whether all peers are equal, on one ring of too many for a system each."""
     ways = used_ways(group.schedule for group in groups)
     shapes = {exchange.links[way.link].graph.shape for way in ways}
@@ -168,13 +172,13 @@ def is_large_ring(groups: Sequence[PeerGroup], exchange: Exchange) -> bool:
     return not common_graph(ways, exchange)
 
 
-def cannot_serve(system: CompiledSystem, method: str, reason: str) -> ApcError:
+def cannot_serve(system: Model, method: str, reason: str) -> ApcError:
     """Return the refusal of a method that can't serve a scene."""
     what = f"method {method} can't serve this scene: {reason}"
-    return ApcError(Mistake("E850", Place(system.origin.topology), what, hint="--method auto"))
+    return ApcError(Diagnostic("E850", SourceLocation(system.origin.topology), what, hint="--method auto"))
 
 
-def _sizes(loops: Sequence[Loop], method: str) -> tuple[tuple[int, int], ...]:
+def _sizes(loops: Sequence[ModalSystem], method: str) -> tuple[tuple[int, int], ...]:
     """Return how many loops there are of which size."""
     sizes = Counter(
         sum(len(group.schedule.sent) for group in loop.sites) if method == "determinant" else loop.states
@@ -183,7 +187,7 @@ def _sizes(loops: Sequence[Loop], method: str) -> tuple[tuple[int, int], ...]:
     return tuple((count, size) for size, count in sizes.items())
 
 
-def _determinant_bytes(loop: Loop) -> int:
+def _determinant_bytes(loop: ModalSystem) -> int:
     """Return what the sites of a loop take, each known by what all send and hear."""
     entries = sum(len(site.schedule.sent) for site in loop.sites) * sum(
         len(site.schedule.heard) for site in loop.sites
@@ -191,7 +195,7 @@ def _determinant_bytes(loop: Loop) -> int:
     return (KEPT_OF_SITE * len(loop.sites) + SITE_AT_WORK) * entries
 
 
-def not_populations(system: CompiledSystem, jacobians: Sequence[SiteJacobians]) -> str:
+def not_populations(system: Model, jacobians: Sequence[SubsystemJacobians]) -> str:
     """Say why peers can't be taken by the thousand, "" if they can."""
     for kind, site in zip(system.kinds, jacobians, strict=True):
         if site.edges:
@@ -209,7 +213,7 @@ def _prompt(instance: Instance) -> bool:
     return complete and short and sum(map(len, instance.numbers.parameters)) > 1
 
 
-def _plan_populations(instance: Instance) -> Plan:
+def _plan_populations(instance: Instance) -> AnalysisPlan:
     """Plan for peers by the thousand that all hear all others."""
     rows = {
         (instance.exchange.role(place), sent)
@@ -217,4 +221,4 @@ def _plan_populations(instance: Instance) -> Plan:
         for sent in schedule.sent
     }
     note = "peers of different numbers, by one determinant of what is sent in a frame"
-    return Plan("determinant", (), (), ((1, len(rows)),), (note,))
+    return AnalysisPlan("determinant", (), (), ((1, len(rows)),), (note,))

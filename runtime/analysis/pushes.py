@@ -1,7 +1,7 @@
 """What a switching part makes of the motion: the number it follows, and whether its force is in a sector.
 
-Takes: a `SwitchedKind`, a `SwitchingPart` of it, a parameter vector.
-Gives: `Push`, `push_of`.
+Takes: a `SwitchedPeerType`, a `SwitchingPart` of it, a parameter vector.
+Gives: `SectorNonlinearity`, `push_of`.
 Guarantees: what is called a sector is one between any two points: f = φ(y) with 0 ≤ Δφ ≤ Δy, y a linear
 combination of states, holds and memories at a tick; found in the equations, whatever the part is called.
 What is called shares is f = g y in each of its pieces, 0 ≤ g ≤ 1, whatever decides which piece it is.
@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 
 from apc.analysis.switches import SwitchingPart
 from apc.compiler.interpolation import jacobian
-from apc.frame.decisions import SwitchedKind
-from apc.frame.jacobians import SiteJacobians
+from apc.frame.decisions import SwitchedPeerType
+from apc.frame.jacobians import SubsystemJacobians
 from apc.frame.linearize import start_values
-from apc.unserved import UnservedError
+from apc.unserved import NotSupportedError
 
 Floats = NDArray[np.float64]
 
@@ -39,7 +39,7 @@ NEAR_AND_FAR = (-FAR, -1.0, -0.5, -0.1, 0.1, 0.5, 1.0, FAR)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Push:
+class SectorNonlinearity:
     """A part's force: output `output` of clock partition `partition`, y where it is on.
 
     y = `slopes` · (x, u, m) + `offset`; the first `states` slopes are those of x. `sector` is "" where the
@@ -59,8 +59,8 @@ class Push:
 
 
 def push_of(
-    switched: SwitchedKind, part: SwitchingPart, site: SiteJacobians, parameters: Floats
-) -> Push | None:
+    switched: SwitchedPeerType, part: SwitchingPart, site: SubsystemJacobians, parameters: Floats
+) -> SectorNonlinearity | None:
     """Return a part's force where it is on; None where it is 0 whatever moves, as of no stiffness.
 
     Parameters
@@ -74,7 +74,7 @@ def push_of(
 
     Raises
     ------
-    UnservedError
+    NotSupportedError
         Why it is no linear force that is computed from tick to tick.
     """
     symbols = [switched.decisions[place].symbol for place in part.decisions]
@@ -85,26 +85,26 @@ def push_of(
         if any(casadi.depends_on(function.output[row], symbol) for symbol in symbols)
     ]
     if any(item.where[0] == "derivative" for item, _ in touched):
-        raise UnservedError(f"{part.name} acts at every moment, not from tick to tick")
+        raise NotSupportedError(f"{part.name} acts at every moment, not from tick to tick")
     if any(item.where[0] != "tick" for item, _ in touched):
-        raise UnservedError(f"{part.name} depends on each of the others by itself")
+        raise NotSupportedError(f"{part.name} depends on each of the others by itself")
     if len(touched) > 1:
-        raise UnservedError(f"{part.name} is more than one force")
+        raise NotSupportedError(f"{part.name} is more than one force")
     (opened, row), partition = touched[0], touched[0][0].where[1]
     *inputs, heard, p, t = opened.inputs
     moving = casadi.vertcat(*inputs)
     guards = [switched.decisions[place].guard for place in part.decisions]
     everything = casadi.vertcat(opened.output[row], *guards)
     if casadi.depends_on(everything, heard) or casadi.depends_on(everything, t):
-        raise UnservedError(f"{part.name} depends on what is heard or on time")
+        raise NotSupportedError(f"{part.name} depends on what is heard or on time")
     slopes = jacobian(everything, moving)
     if casadi.depends_on(slopes, moving):
-        raise UnservedError(f"{part.name} is not linear where it pushes")
+        raise NotSupportedError(f"{part.name} is not linear where it pushes")
     others = [
         decision.symbol for place, decision in enumerate(switched.decisions) if place not in part.decisions
     ]
     if any(casadi.depends_on(everything, other) for other in others):
-        raise UnservedError(f"{part.name} depends on what another part decides")
+        raise NotSupportedError(f"{part.name} depends on what another part decides")
     decided = casadi.vertcat(*symbols)
     pieces = casadi.Function("pieces", [moving, p, decided], [everything, casadi.densify(slopes)])
     x, u, m = start_values(site, parameters.tolist())
@@ -147,7 +147,7 @@ def push_of(
     if alone and breaks:
         sector = _sector(force_at, sorted(breaks), size)
     off = [abs(force_at(by * size) - max(by, 0) * size) for by in NEAR_AND_FAR]
-    return Push(
+    return SectorNonlinearity(
         *(part.name, partition, row, line, offset, sizes[0]),
         sector=sector and f"{part.name} {sector}",
         shares=shares,

@@ -1,6 +1,6 @@
 """The one-sided linear models of a topology whose peers start at a kink.
 
-Takes: a `CompiledSystem`.
+Takes: a `Model`.
 Gives: `Side`, `SideVerdict`, `sides`, `worst_side`, `severity`.
 Guarantees: every combination of the pieces that meet at the start values, up to MOST_SIDES; where nothing has
 a kink there, the topology itself and nothing is computed twice.
@@ -20,17 +20,17 @@ from typing import Any
 import casadi
 import numpy as np
 
-from apc.compiler.compiled import Column, CompiledSystem, Group
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Group, Model, PeerColumn
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.eigen.peers import start_classes
-from apc.frame.decisions import SwitchedKind, find_switches
+from apc.frame.decisions import SwitchedPeerType, find_switches
 from apc.frame.finite_equations import at_its_part, finite_equations
 from apc.frame.instance import Instance, Prepared, instance
-from apc.frame.jacobians import DECIDING, SiteJacobians, with_equations
+from apc.frame.jacobians import DECIDING, SubsystemJacobians, with_equations
 from apc.frame.kinks import (
     EQUAL,
+    LinearPiece,
     Moving,
-    Piece,
     Point,
     at_a_kink,
     equal,
@@ -59,7 +59,7 @@ class Side:
     """
 
     name: str
-    system: CompiledSystem
+    system: Model
     prepared: Prepared
 
 
@@ -92,7 +92,7 @@ def severity(stable: bool | None, measure: float) -> tuple[int, float]:
     return {False: 2, None: 1, True: 0}[stable], math.inf if math.isnan(measure) else measure
 
 
-def sides(system: CompiledSystem, prepared: Prepared) -> tuple[Side, ...]:
+def sides(system: Model, prepared: Prepared) -> tuple[Side, ...]:
     """Return the one-sided models at the start values; the topology itself where nothing has a kink.
 
     Parameters
@@ -165,14 +165,14 @@ def _parts(groups: Sequence[Group], origins: Sequence[int]) -> tuple[Group, ...]
             result.append(group)
             continue
         row = slice(before[place], before[place] + 1)
-        columns = tuple(Column(column.name, column.values[row]) for column in group.columns)
+        columns = tuple(PeerColumn(column.name, column.values[row]) for column in group.columns)
         result.append(replace(group, count=1, columns=columns))
         before[place] += 1
     return tuple(result)
 
 
 def _interchangeable(
-    scene: Instance, origins: Sequence[int], pieces: Sequence[tuple[Piece, ...]]
+    scene: Instance, origins: Sequence[int], pieces: Sequence[tuple[LinearPiece, ...]]
 ) -> list[list[int]]:
     """Return the groups, by index, in classes whose members may exchange their sides."""
     complete = all(map(scene.exchange.is_complete, scene.exchange.links))
@@ -184,7 +184,7 @@ def _interchangeable(
     return list(classes.values())
 
 
-def _named(scene: Instance, pieces: Sequence[tuple[Piece, ...]], texts: Sequence[str]) -> str:
+def _named(scene: Instance, pieces: Sequence[tuple[LinearPiece, ...]], texts: Sequence[str]) -> str:
     """Return the name of a combination: its sides, and whose they are where several peers have some."""
     groups, starts = scene.system.groups, scene.exchange.starts
     totals: Counter[str] = Counter()
@@ -202,19 +202,19 @@ def _named(scene: Instance, pieces: Sequence[tuple[Piece, ...]], texts: Sequence
     return "; ".join(result)
 
 
-def _smooth(site: SiteJacobians) -> bool:
+def _smooth(site: SubsystemJacobians) -> bool:
     """Return whether no decision changes a slope of a kind, whatever the point."""
     if site.affine and not site.edges:
         return True
     return not site.edges and site.walkable and tie_indicators(site.equations) is None
 
 
-def _pieces_of_groups(scene: Instance, near: Sequence[bool]) -> list[tuple[Piece, ...]]:
+def _pieces_of_groups(scene: Instance, near: Sequence[bool]) -> list[tuple[LinearPiece, ...]]:
     """Return the pieces at the start of each group; `near` is False for groups that have no kink."""
-    smooth = (Piece((), (), np.zeros(0), np.zeros((0, 0))),)
+    smooth = (LinearPiece((), (), np.zeros(0), np.zeros((0, 0))),)
     classes = start_classes(scene)
     starting = StartClasses(scene, classes)
-    found: list[list[tuple[Piece, ...]]] = [[] for _ in near]
+    found: list[list[tuple[LinearPiece, ...]]] = [[] for _ in near]
     for g, peers in enumerate(classes):
         # A class of equal start values may contain peers of several groups.
         groups = {scene.exchange.group_of(run.start) for run in peers.runs}
@@ -272,7 +272,7 @@ def _points(starting: StartClasses, g: int) -> Iterable[Point]:
 
 
 def _refuse_several_senders(
-    switched: SwitchedKind, starting: StartClasses, g: int, pieces: Sequence[Piece]
+    switched: SwitchedPeerType, starting: StartClasses, g: int, pieces: Sequence[LinearPiece]
 ) -> None:
     """Refuse a kink in what a peer makes of each sender where it receives from several: one may be on each
     side.
@@ -295,7 +295,7 @@ def _refuse_several_senders(
             raise at_a_kink(switched.kind.name, what)
 
 
-def _refuse_hidden_kink(site: SiteJacobians, starting: StartClasses, g: int) -> None:
+def _refuse_hidden_kink(site: SubsystemJacobians, starting: StartClasses, g: int) -> None:
     """Refuse a kink inside a nonlinear loop, where no decision can be set.
 
     Slopes a little to either side are compared: at a kink they differ however small the step.
@@ -325,7 +325,7 @@ def _refuse_hidden_kink(site: SiteJacobians, starting: StartClasses, g: int) -> 
             raise at_a_kink(site.kind.name, "a nonlinear loop has a kink")
 
 
-def _decides(site: SiteJacobians) -> bool:
+def _decides(site: SubsystemJacobians) -> bool:
     """Return whether a function inside a nonlinear loop compares, or takes a max, min, abs or sign."""
     kind = site.equations
     outer = [kind.derivative, *(clock.tick for clock in kind.clocks), *(send.send for send in kind.sends)]
@@ -346,13 +346,13 @@ def _floats(values: Iterable[object]) -> list[float]:
     return [float(value) for value in values]  # type: ignore[arg-type] # Fraction and float
 
 
-def _joined(listed: Sequence[tuple[Piece, ...]]) -> tuple[Piece, ...]:
+def _joined(listed: Sequence[tuple[LinearPiece, ...]]) -> tuple[LinearPiece, ...]:
     """Return the pieces of one kind that hold at several points: those that agree on common decisions."""
-    different: dict[tuple[_Taken, ...], tuple[Piece, ...]] = {}
+    different: dict[tuple[_Taken, ...], tuple[LinearPiece, ...]] = {}
     for pieces in listed:
         different.setdefault(tuple(piece.taken for piece in pieces), pieces)
-    kept: list[list[Piece]] = []
-    result: dict[_Taken, Piece] = {}
+    kept: list[list[LinearPiece]] = []
+    result: dict[_Taken, LinearPiece] = {}
     for chosen in itertools.product(*different.values()):
         taken: dict[int, bool] = {}
         for piece in chosen:
@@ -377,7 +377,7 @@ def _joined(listed: Sequence[tuple[Piece, ...]]) -> tuple[Piece, ...]:
     return tuple(result.values())
 
 
-def _names(switched: SwitchedKind, pieces: Sequence[Piece]) -> list[str]:
+def _names(switched: SwitchedPeerType, pieces: Sequence[LinearPiece]) -> list[str]:
     """Return a name for each piece, such as "wall.push on": on is the steeper side of a kink."""
     decided: dict[tuple[str, ...], list[int]] = {}
     for place in dict.fromkeys(place for piece in pieces for place, _ in piece.taken):
@@ -403,12 +403,12 @@ def _names(switched: SwitchedKind, pieces: Sequence[Piece]) -> list[str]:
 
 
 def _side(
-    scene: Instance, prepared: Prepared, origins: Sequence[int], chosen: Sequence[Piece], name: str
+    scene: Instance, prepared: Prepared, origins: Sequence[int], chosen: Sequence[LinearPiece], name: str
 ) -> Side:
     """Return the model with a piece for each peer or group; neighbours on one side are one group again."""
     system = scene.system
     numbers: dict[tuple[int, _Taken, Moving], int] = {}
-    built: list[SiteJacobians] = []
+    built: list[SubsystemJacobians] = []
     groups: list[Group] = []
     schedules = []
     before: tuple[int, int] | None = None
@@ -423,7 +423,7 @@ def _side(
         if before == (origin, kind):
             last = groups[-1]
             columns = tuple(
-                Column(first.name, np.concatenate([first.values, second.values]))
+                PeerColumn(first.name, np.concatenate([first.values, second.values]))
                 for first, second in zip(last.columns, group.columns, strict=True)
             )
             groups[-1] = replace(last, count=last.count + group.count, columns=columns)
@@ -437,13 +437,13 @@ def _side(
 
 
 @functools.lru_cache(maxsize=MOST_SIDES * 4)
-def _one_sided(site: SiteJacobians, taken: _Taken, moving: Moving) -> SiteJacobians:
+def _one_sided(site: SubsystemJacobians, taken: _Taken, moving: Moving) -> SubsystemJacobians:
     if not taken:
         return site
     return with_equations(site, one_sided(find_switches(site.equations), dict(taken), moving))
 
 
-def _too_many(scene: Instance, pieces: Sequence[Sequence[Piece]]) -> ApcError:
+def _too_many(scene: Instance, pieces: Sequence[Sequence[LinearPiece]]) -> ApcError:
     """Return the refusal of more combinations than are analyzed, with the names of the kinks."""
     names = [
         name
@@ -454,4 +454,4 @@ def _too_many(scene: Instance, pieces: Sequence[Sequence[Piece]]) -> ApcError:
     ]
     kinks = ", ".join(dict.fromkeys(names))
     what = f"{kinks}: more than {MOST_SIDES} combinations of sides meet at the start values"
-    return ApcError(Mistake("E808", Place(scene.system.origin.topology), what))
+    return ApcError(Diagnostic("E808", SourceLocation(scene.system.origin.topology), what))

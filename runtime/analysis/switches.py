@@ -1,6 +1,6 @@
 """Where a peer's equations switch between linear pieces: contacts, walls, limits.
 
-Takes: a kind of a `CompiledSystem` with its decisions.
+Takes: a kind of a `Model` with its decisions.
 Gives: `SwitchingPart`, `switching_parts`; `bind`, `varying_slopes`.
 Guarantees: decisions that change something in common are one part.
 Does not: find the decisions (see `frame.decisions`).
@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.interpolation import jacobian
-from apc.frame.decisions import Decision, SwitchedKind, bound_kind, find_switches
-from apc.frame.jacobians import SiteJacobians, jacobians, with_equations
+from apc.frame.decisions import Decision, SwitchedPeerType, bound_kind, find_switches
+from apc.frame.jacobians import SubsystemJacobians, jacobians, with_equations
 from apc.frame.linearize import start_values
 
 # A part with more decisions than this is refused: its pieces are as many as 2 to that power.
@@ -42,7 +42,7 @@ class SwitchingPart:
     off: tuple[bool, ...]
 
 
-def switching_parts(switched: SwitchedKind, parameters: NDArray[np.float64]) -> tuple[SwitchingPart, ...]:
+def switching_parts(switched: SwitchedPeerType, parameters: NDArray[np.float64]) -> tuple[SwitchingPart, ...]:
     """Group a kind's decisions by what they change, and find each group's pieces "on" and "off".
 
     Parameters
@@ -67,14 +67,14 @@ def switching_parts(switched: SwitchedKind, parameters: NDArray[np.float64]) -> 
                 f"{name} of {switched.kind.name} takes {len(places)} decisions; "
                 f"at most {MOST_DECISIONS} are analysed piece by piece"
             )
-            raise ApcError(Mistake("E863", Place(switched.kind.name), what))
+            raise ApcError(Diagnostic("E863", SourceLocation(switched.kind.name), what))
         pair = _extremes(switched, places, parameters)
         if pair is not None:
             parts.append(SwitchingPart(name, places, *pair))
     return tuple(parts)
 
 
-def varying_slopes(site: SiteJacobians) -> tuple[str, ...]:
+def varying_slopes(site: SubsystemJacobians) -> tuple[str, ...]:
     """Return the names of what has slopes that change with time in some piece, whatever else moves.
 
     Of a kind with a nonlinear loop nothing is known: all that is in the loop depends on all that drives it.
@@ -89,7 +89,9 @@ def varying_slopes(site: SiteJacobians) -> tuple[str, ...]:
     return tuple(result)
 
 
-def bind(switched: SwitchedKind, base: SiteJacobians, settings: Mapping[int, bool]) -> SiteJacobians:
+def bind(
+    switched: SwitchedPeerType, base: SubsystemJacobians, settings: Mapping[int, bool]
+) -> SubsystemJacobians:
     """Return the Jacobians of a kind with every decision set.
 
     Parameters
@@ -117,7 +119,7 @@ def _together(decisions: Sequence[Decision]) -> list[tuple[int, ...]]:
 
 
 def _extremes(
-    switched: SwitchedKind, places: Sequence[int], parameters: NDArray[np.float64]
+    switched: SwitchedPeerType, places: Sequence[int], parameters: NDArray[np.float64]
 ) -> tuple[tuple[bool, ...], tuple[bool, ...]] | None:
     """Return the settings of the steepest and the flattest piece, None where all have the same slopes.
 
@@ -145,7 +147,7 @@ def _extremes(
     return steepest, flattest
 
 
-def _patterns(site: SiteJacobians) -> list[NDArray[Any]]:
+def _patterns(site: SubsystemJacobians) -> list[NDArray[Any]]:
     """Return a site's structural patterns; edges' own parts are among the ticks'."""
     pattern = site.pattern
     listed = [pattern.a, pattern.b]

@@ -1,7 +1,7 @@
 """May contacts open and close at will; by one function that falls all the while.
 
-Takes: a `CompiledSystem` whose peers have parts that switch, and its modes of contact.
-Gives: `Switching`, `switching`.
+Takes: a `Model` whose peers have parts that switch, and its modes of contact.
+Gives: `ArbitrarySwitching`, `switching`.
 Guarantees: what is called stable is proved, for every pattern of contacts that are on, off or anything
 between, each peer and tick by itself: motions die out, but for what drifts with all contacts open, and that
 stays within bounds. The cost grows with the different peers, not with their number.
@@ -23,19 +23,19 @@ import numpy as np
 
 from apc.analysis.circle_criterion import is_proved, least_of, weights_of
 from apc.analysis.contact_modes import ContactModes
-from apc.analysis.opened import OpenLoop, open_loops
-from apc.compiler.compiled import CompiledSystem
+from apc.analysis.opened import LurePlant, open_loops
+from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.compiler.timings import part
 from apc.frame.instance import Prepared, prepare
 from apc.result import Result
-from apc.unserved import UnservedError
+from apc.unserved import NotSupportedError
 
 STABLE, CANNOT, OPEN = "stable", "cannot be", "not decided"
 
 
 @dataclass(frozen=True, slots=True)
-class Switching(Result):
+class ArbitrarySwitching(Result):
     """Whether a scene is stable however its contacts switch; `verdict` is one of STABLE, CANNOT and OPEN.
 
     `reach` is how many times as stiff all contacts might be for the criterion to hold (infinite: any), None
@@ -59,7 +59,7 @@ class Switching(Result):
 
 
 @part("switching")
-def switching(system: CompiledSystem, modes: ContactModes, *, prepared: Prepared | None = None) -> Switching:
+def switching(system: Model, modes: ContactModes, *, prepared: Prepared | None = None) -> ArbitrarySwitching:
     """Say whether contacts may open and close at will.
 
     Parameters
@@ -72,30 +72,32 @@ def switching(system: CompiledSystem, modes: ContactModes, *, prepared: Prepared
         From `instance.prepare`, of this system with these timings.
     """
     if any(link.channel is not None for link in system.links):
-        return Switching(system.name, OPEN, "packets may be lost or late, and it is looked for on time only")
+        return ArbitrarySwitching(
+            system.name, OPEN, "packets may be lost or late, and it is looked for on time only"
+        )
     if modes.unstable:
         named = " or ".join(modes.unstable)
         when = "in any mode" if len(modes.unstable) == len(modes.modes) else f"when {named}"
-        return Switching(system.name, CANNOT, f"it is not stable {when}")
+        return ArbitrarySwitching(system.name, CANNOT, f"it is not stable {when}")
     unknown = [mode.name for mode in modes.modes if mode.stable is None or mode.linearized]
     if unknown or modes.notes:
         reason = f"not known when {' or '.join(unknown)}" if unknown else modes.notes[0]
-        return Switching(system.name, OPEN, reason)
+        return ArbitrarySwitching(system.name, OPEN, reason)
     try:
         return _judge(system.name, open_loops(system, prepared or prepare(system)))
-    except UnservedError as why:
-        return Switching(system.name, OPEN, str(why))
+    except NotSupportedError as why:
+        return ArbitrarySwitching(system.name, OPEN, str(why))
     except ApcError as error:
-        return Switching(system.name, OPEN, error.mistakes[0].sentence)
+        return ArbitrarySwitching(system.name, OPEN, error.mistakes[0].sentence)
 
 
-def _judge(topology: str, loops: Sequence[OpenLoop]) -> Switching:
+def _judge(topology: str, loops: Sequence[LurePlant]) -> ArbitrarySwitching:
     """Prove the circle criterion of all loops, or say which fails."""
     jumps = next((loop.jumps for loop in loops if loop.jumps), "")
     try:
         weights = weights_of(loops)
-    except UnservedError as why:
-        return Switching(topology, OPEN, str(why), jumps=jumps)
+    except NotSupportedError as why:
+        return ArbitrarySwitching(topology, OPEN, str(why), jumps=jumps)
     least, worst = min(((least_of(loop, weights), loop.name) for loop in loops), default=(np.inf, ""))
     reach = float("inf") if least >= 0 else float(-1 / least)
     if not reach > 1:
@@ -103,5 +105,5 @@ def _judge(topology: str, loops: Sequence[OpenLoop]) -> Switching:
     elif fails := [loop.name for loop in loops if not is_proved(loop, weights)]:
         reason = f"the circle criterion holds too narrowly to be proved in the {fails[0]} mode"
     else:
-        return Switching(topology, STABLE, "", reach, worst, jumps)
-    return Switching(topology, OPEN, reason, reach, worst, jumps)
+        return ArbitrarySwitching(topology, STABLE, "", reach, worst, jumps)
+    return ArbitrarySwitching(topology, OPEN, reason, reach, worst, jumps)

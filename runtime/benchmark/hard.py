@@ -20,8 +20,8 @@ from typing import Any
 
 from apc.analysis.analysis import Analysis, analyze
 from apc.benchmark.timing import median_time
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import RefusedError, read_file
 from apc.compiler.pipeline import compile_topology
 from apc.compiler.source.nodes import MAX_BYTES
@@ -87,7 +87,7 @@ def run_hard_cases(
     folder: Path,
     *,
     repeats: int = REPEATS,
-    solve: Callable[[CompiledSystem], Analysis] = analyze,
+    solve: Callable[[Model], Analysis] = analyze,
 ) -> HardReport:
     """Analyse every scene of a folder and compare.
 
@@ -119,12 +119,12 @@ def run_hard_cases(
         cases.append(compare(system, result, truths[path.stem], seconds, path.stem))
     if not cases:
         what = "holds no topology whose truth is known"
-        raise ApcError(Mistake("E920", Place(str(folder)), what, hint=FOLDER))
+        raise ApcError(Diagnostic("E920", SourceLocation(str(folder)), what, hint=FOLDER))
     return HardReport(str(folder), tuple(cases), tuple(without))
 
 
 def compare(
-    system: CompiledSystem, analysis: Analysis, truth: Mapping[str, Any], seconds: float, name: str
+    system: Model, analysis: Analysis, truth: Mapping[str, Any], seconds: float, name: str
 ) -> HardCase:
     """Compare an analysis with the truth.
 
@@ -176,13 +176,13 @@ def compare(
 def _truths(folder: Path) -> dict[str, Any]:
     """Read the truths of a folder."""
     path = folder / TRUTHS
-    place = Place(str(path))
+    place = SourceLocation(str(path))
     try:
         result = json.loads(read_file(path, MAX_BYTES))
     except RefusedError as refused:
-        raise ApcError(Mistake("E920", place, refused.words, hint=FOLDER)) from None
+        raise ApcError(Diagnostic("E920", place, refused.words, hint=FOLDER)) from None
     except ValueError as error:
-        raise ApcError(Mistake("E920", place, f"is not JSON: {error}")) from error
+        raise ApcError(Diagnostic("E920", place, f"is not JSON: {error}")) from error
     pairs: list[tuple[str, Any]] = list(result.items()) if isinstance(result, dict) else [("", None)]
     for name, truth in pairs:
         try:
@@ -193,6 +193,6 @@ def _truths(folder: Path) -> dict[str, Any]:
         except (TypeError, KeyError, ValueError, ArithmeticError) as error:
             expected = "spectral_radius (digits), rigid_modes and verdict of each scene"
             raise ApcError(
-                Mistake("E920", place, name or "the truths", expected, "something else")
+                Diagnostic("E920", place, name or "the truths", expected, "something else")
             ) from error
     return dict(result)

@@ -21,15 +21,15 @@ from apc.analysis.analysis import analyze
 from apc.benchmark.speed_and_error import reason_of
 from apc.benchmark.timing import median_time, timed
 from apc.benchmark.truth import spectral_truth
-from apc.compiler.compiled import LARGEST_COUNT, CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import LARGEST_COUNT, Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.pipeline import stages_of
 from apc.compiler.source.nodes import Mapping, Scalar
 from apc.compiler.source.source import parse_source, read_source
 from apc.compiler.words import counted
 from apc.processes import Patience, local_processes, results
 from apc.result import Result
-from apc.unserved import UnservedError
+from apc.unserved import NotSupportedError
 
 Found = TypeVar("Found")
 
@@ -89,7 +89,7 @@ def scale(path: Path, counts: Sequence[int]) -> Scale:
     if not counts or min(counts) < 1 or max(counts) > LARGEST_COUNT:
         expected = f"numbers from 1 to {LARGEST_COUNT:,}, like 3,30,300"
         got = ",".join(map(str, counts))[:80]
-        raise ApcError(Mistake("E921", Place("--scale"), "the list", expected, got))
+        raise ApcError(Diagnostic("E921", SourceLocation("--scale"), "the list", expected, got))
     name, _ = _largest(path)
     rows, refused = [], []
     floor = _alone(_floor, path, 0)
@@ -101,12 +101,12 @@ def scale(path: Path, counts: Sequence[int]) -> Scale:
     if not rows:
         count, reason = refused[0]
         what = f"leaves nothing to measure: {counted(count, 'peer')} of {name}: {reason}"
-        raise ApcError(Mistake("E921", Place("--scale"), what))
+        raise ApcError(Diagnostic("E921", SourceLocation("--scale"), what))
     text = f"{floor / 2**20:.0f} MiB are the program itself"
     return Scale(path.stem, name, tuple(rows), tuple(refused), text)
 
 
-def with_count(path: Path, count: int) -> CompiledSystem:
+def with_count(path: Path, count: int) -> Model:
     """Compile a topology whose largest group has another number of peers."""
     source = read_source(path)
     _, number = _largest(path)
@@ -119,7 +119,7 @@ def with_count(path: Path, count: int) -> CompiledSystem:
     )
     changed = parse_source("".join(lines).encode(), file=source.file, path=source.path)
     *_, (_, system) = stages_of(changed)
-    assert isinstance(system, CompiledSystem)
+    assert isinstance(system, Model)
     return system
 
 
@@ -134,16 +134,16 @@ def _largest(path: Path) -> tuple[str, Scalar]:
             result.append((number.value, key.text, number))
     if not result:
         what = "no group of this topology has a count that could grow"
-        raise ApcError(Mistake("E921", Place(str(path)), what, hint="peers: {user: {count: 3}}"))
+        raise ApcError(Diagnostic("E921", SourceLocation(str(path)), what, hint="peers: {user: {count: 3}}"))
     _, name, number = max(result, key=lambda item: item[0])
     return name, number
 
 
 def _alone(measure: Callable[[Path, int], Found], path: Path, count: int) -> Found:
     """Measure in a process of its own."""
-    place = Place("--scale")
+    place = SourceLocation("--scale")
     what = "the process that measured it ended without a word: stopped from outside, or out of memory"
-    with local_processes(measure, path, 1, Mistake("E921", place, what)) as workers:
+    with local_processes(measure, path, 1, Diagnostic("E921", place, what)) as workers:
         return next(results(workers, [count], Patience(), place))
 
 
@@ -153,7 +153,7 @@ def _measure(path: Path, count: int) -> ScaleRow:
     analyzed, result = median_time(partial(analyze, system), REPEATS)
     memory = _memory()
     error = None
-    with suppress(UnservedError):
+    with suppress(NotSupportedError):
         error = spectral_truth(system).error_of(result.spectral_radius)
     return ScaleRow(
         count=count,

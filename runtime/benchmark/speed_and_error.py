@@ -1,7 +1,7 @@
 """Speed against error: every method on one scene, on this machine, beside the truth.
 
-Takes: a `CompiledSystem`.
-Gives: `Measured`, `Comparison`, `Bench`, `bench`; `pareto_front`.
+Takes: a `Model`.
+Gives: `MethodTiming`, `TaskComparison`, `Bench`, `bench`; `pareto_front`.
 Guarantees: times are the processor's, medians over rounds in which all methods take turns; an error is the
 distance from the same equations in balls (of a spectral radius) or from the exact transition (of a motion,
 whose own error is what one rounding of every coefficient makes), and is left out where there is none.
@@ -27,7 +27,7 @@ from apc.analysis.methods import AUTO, METHODS, PAPER
 from apc.analysis.paper import analyze_paper
 from apc.benchmark.timing import spread_of, take_turns, timed
 from apc.benchmark.truth import spectral_truth
-from apc.compiler.compiled import Column, CompiledSystem
+from apc.compiler.compiled import Model, PeerColumn
 from apc.compiler.errors import ApcError
 from apc.compiler.words import with_unit
 from apc.distribution import versions
@@ -40,7 +40,7 @@ from apc.simulation.rows_in_time import blocks
 from apc.simulation.settings import CVODES, DEFAULT, EXACT, RK4, SEMI_IMPLICIT, Method, Settings, finer
 from apc.simulation.simulation import Simulation, prepare
 from apc.threads import single_threaded
-from apc.unserved import UnservedError
+from apc.unserved import NotSupportedError
 
 Floats = NDArray[np.float64]
 
@@ -64,7 +64,7 @@ ANALYSES = (*(text for text in METHODS if text not in (AUTO, PAPER)), CERTIFIED,
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class MethodTiming:
     """One method: median `seconds`, `spread` (half the distance between the quartiles), over `rounds` runs.
 
     `error` is the true one, None without a reference; `bound` what the method itself says, None if it says
@@ -87,7 +87,7 @@ class Measured:
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
+class TaskComparison:
     """All methods of one task, the fastest first.
 
     `quantity` says what `error` is of, `relative` to what, `timed` what a time is of. `reference` is the
@@ -99,14 +99,14 @@ class Comparison:
     quantity: str
     relative: str
     timed: str
-    measured: tuple[Measured, ...]
+    measured: tuple[MethodTiming, ...]
     reference: str
     refused: tuple[tuple[str, str], ...]
     notes: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
 
     @property
-    def chosen(self) -> Measured | None:
+    def chosen(self) -> MethodTiming | None:
         """The default method."""
         return next((measured for measured in self.measured if measured.chosen), None)
 
@@ -126,7 +126,7 @@ class Bench(Result):
     topology: str
     peers: int
     machine: Mapping[str, str]
-    comparisons: tuple[Comparison, ...]
+    comparisons: tuple[TaskComparison, ...]
 
     @property
     def faults(self) -> tuple[str, ...]:
@@ -134,7 +134,7 @@ class Bench(Result):
         return tuple(fault for comparison in self.comparisons for fault in comparison.faults)
 
 
-def bench(system: CompiledSystem, *, rounds: int = ROUNDS, duration: Fraction = DURATION) -> Bench:
+def bench(system: Model, *, rounds: int = ROUNDS, duration: Fraction = DURATION) -> Bench:
     """Measure every method of analysis and of simulation on a scene.
 
     Parameters
@@ -186,7 +186,7 @@ def _processor() -> str:
         return platform.processor()
 
 
-def bench_analysis(system: CompiledSystem, *, rounds: int = ROUNDS) -> Comparison:
+def bench_analysis(system: Model, *, rounds: int = ROUNDS) -> TaskComparison:
     """Measure every method of analysis, from the compiled scene to its verdict.
 
     The error is that of the spectral radius, rigid modes left out.
@@ -202,7 +202,7 @@ def bench_analysis(system: CompiledSystem, *, rounds: int = ROUNDS) -> Compariso
     try:
         truth = spectral_truth(system)
         text = f"{text} {truth.digits}"
-    except UnservedError as why:
+    except NotSupportedError as why:
         text = str(why)
     results, refused, slow = _first(calls)
     if CERTIFIED in results and (reason := _not_proved(results[CERTIFIED])):
@@ -229,7 +229,7 @@ def bench_analysis(system: CompiledSystem, *, rounds: int = ROUNDS) -> Compariso
     if default.stable is None:
         notes.append(f"{WRONG}: analyze leaves the verdict open: {default.verdict}")
     notes += [f"{WRONG}: the bound of {item.name} does not hold" for item in measured if item.fails]
-    return Comparison(
+    return TaskComparison(
         task="analyze",
         quantity="spectral radius",
         relative="absolute",
@@ -251,9 +251,7 @@ def _not_proved(analysis: Analysis) -> str:
     )
 
 
-def bench_simulation(
-    system: CompiledSystem, duration: Fraction = DURATION, *, rounds: int = ROUNDS
-) -> Comparison:
+def bench_simulation(system: Model, duration: Fraction = DURATION, *, rounds: int = ROUNDS) -> TaskComparison:
     """Measure every method of simulation, from the first instant to the last.
 
     The error is the largest distance of any continuous state at any tick from the exact transition, relative
@@ -288,12 +286,12 @@ def bench_simulation(
 
 def _simulation(
     duration: Fraction,
-    measured: tuple[Measured, ...],
+    measured: tuple[MethodTiming, ...],
     reference: str,
     refused: tuple[tuple[str, str], ...],
     notes: tuple[str, ...] = (),
-) -> Comparison:
-    return Comparison(
+) -> TaskComparison:
+    return TaskComparison(
         task="simulate",
         quantity=f"states over {float(duration):g} s",
         relative="relative to the largest value of a state's unit",
@@ -305,7 +303,7 @@ def _simulation(
     )
 
 
-def _methods(system: CompiledSystem) -> list[Method]:
+def _methods(system: Model) -> list[Method]:
     """Return the methods to compare, their steps cut from the period of the fastest clock."""
     seconds = resolve(system).timings
     tick = min((seconds[clock.period] for clock in system.clocks), default=Fraction(1, 1000))
@@ -317,7 +315,7 @@ def _methods(system: CompiledSystem) -> list[Method]:
     ]
 
 
-def _rests(system: CompiledSystem, duration: Fraction) -> bool:
+def _rests(system: Model, duration: Fraction) -> bool:
     """Say whether no state ever changes: whatever pushes, and be it between two ticks, leaves its trace."""
     names = tuple(dict.fromkeys(state.name for kind in system.kinds for state in kind.states))
     if not names:
@@ -330,7 +328,7 @@ def _rests(system: CompiledSystem, duration: Fraction) -> bool:
     return True
 
 
-def _moved(system: CompiledSystem) -> tuple[CompiledSystem, str]:
+def _moved(system: Model) -> tuple[Model, str]:
     """Let the first peer start by its first state's own scale elsewhere, and say so."""
     first, *others = system.groups
     kind, numbers = system.kinds[first.kind], resolve(system)
@@ -341,13 +339,13 @@ def _moved(system: CompiledSystem) -> tuple[CompiledSystem, str]:
     values[0] += by
     columns = (
         *(column for column in first.columns if column.name != state.start),
-        Column(state.start, values),
+        PeerColumn(state.start, values),
     )
     changed = replace(system, groups=(replace(first, columns=columns), *others))
     return changed, f"{state.name} of its first peer starts {with_unit(f'{by:g}', state.unit)} elsewhere"
 
 
-def _ready(system: CompiledSystem, duration: Fraction, method: Method) -> Simulation:
+def _ready(system: Model, duration: Fraction, method: Method) -> Simulation:
     return prepare(system, Settings(duration, method))
 
 
@@ -396,11 +394,11 @@ def _first(
 
 def _measured(
     name: str, times: Sequence[float], *, error: float | None, bound: float | None, chosen: bool
-) -> Measured:
-    return Measured(name, statistics.median(times), spread_of(times), len(times), error, bound, chosen)
+) -> MethodTiming:
+    return MethodTiming(name, statistics.median(times), spread_of(times), len(times), error, bound, chosen)
 
 
-def pareto_front(measured: Sequence[Measured]) -> tuple[Measured, ...]:
+def pareto_front(measured: Sequence[MethodTiming]) -> tuple[MethodTiming, ...]:
     """Mark what no other is better than in both ways, and sort by time.
 
     One beats another if it is faster by more than both spreads together and not less right, or more right and
@@ -418,7 +416,7 @@ def pareto_front(measured: Sequence[Measured]) -> tuple[Measured, ...]:
     )
 
 
-def _beats(measured: Measured, other: Measured) -> bool:
+def _beats(measured: MethodTiming, other: MethodTiming) -> bool:
     faster = measured.seconds + measured.spread + other.spread < other.seconds
     mine, its = (max(m.error or 0.0, SAME) for m in (measured, other))
     return (faster and mine <= its) or (mine < its and measured.seconds <= other.seconds)

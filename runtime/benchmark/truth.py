@@ -1,6 +1,6 @@
 """The spectral radius of a scene to fifty digits: the same equations in balls of 512 bits.
 
-Takes: a `CompiledSystem`.
+Takes: a `Model`.
 Gives: `Truth`, `spectral_truth`.
 Guarantees: every entry of a frame's matrix is a ball about the true number (see `eigen.balls`), and two
 precisions agree on every digit given.
@@ -18,12 +18,12 @@ from typing import Any
 import flint
 
 from apc.analysis.analysis import lifted_groups
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.eigen.balls import frame_balls, precision, square, unprovable
-from apc.eigen.closing import ClosedSystem, Loop, close_loop
+from apc.eigen.closing import ClosedLoop, ModalSystem, close_loop
 from apc.eigen.modes import arrange, dense_loop
 from apc.frame.parameters import resolve
-from apc.unserved import UnservedError
+from apc.unserved import NotSupportedError
 
 # What is asked of a reference, relative to the largest: far beyond what floats can be wrong by.
 DIGITS = 50
@@ -58,19 +58,19 @@ class Truth:
         return float(abs(Fraction(radius) - Fraction(self.digits)))
 
 
-def spectral_truth(system: CompiledSystem) -> Truth:
+def spectral_truth(system: Model) -> Truth:
     """Return the truth about one frame of a scene.
 
     Raises
     ------
     ApcError
         As `analysis.lifted_groups`.
-    UnservedError
+    NotSupportedError
         Why there is none.
     """
     systems = [close_loop(loop) for loop in _loops(system)]
     if reason := next(filter(None, map(unprovable, systems)), ""):
-        raise UnservedError(reason)
+        raise NotSupportedError(reason)
     last = None
     for bits in PRECISIONS:
         with precision(bits):
@@ -78,10 +78,10 @@ def spectral_truth(system: CompiledSystem) -> Truth:
             if last is not None and _agree(last, result):
                 return Truth(str(result.str(DIGITS, radius=False)) if result > LEAST else "0")
             last = result
-    raise UnservedError(f"not certain to {DIGITS} digits at {PRECISIONS[-1]} bits")
+    raise NotSupportedError(f"not certain to {DIGITS} digits at {PRECISIONS[-1]} bits")
 
 
-def _loops(system: CompiledSystem) -> Sequence[Loop]:
+def _loops(system: Model) -> Sequence[ModalSystem]:
     """Return the systems that a scene falls into, each of weights known exactly; refuse what is too large."""
     numbers = resolve(system)
     moving = sum(
@@ -89,20 +89,20 @@ def _loops(system: CompiledSystem) -> Sequence[Loop]:
         for rows, group in zip(numbers.parameters, system.groups, strict=True)
     )
     if moving > MOST_STATES:
-        raise UnservedError(f"{moving:,} states of motion of different peers {TOO_LONG}")
+        raise NotSupportedError(f"{moving:,} states of motion of different peers {TOO_LONG}")
     if system.peers > MOST_STATES and any(link.graph.shape not in SPLIT for link in system.links):
-        raise UnservedError(f"{system.peers:,} peers on a graph {TOO_LONG}")
+        raise NotSupportedError(f"{system.peers:,} peers on a graph {TOO_LONG}")
     groups, exchange = lifted_groups(system)
     loops = arrange(groups, exchange).loops
     if any(doubt and way not in loop.surds for loop in loops for way, doubt in loop.doubts.items()):
         loops = (dense_loop(groups, exchange),)  # the eigenvalues of its graph are floats
     if sum(loop.states**3 for loop in loops) > MOST_STATES**3:
         most = max(loop.states for loop in loops)
-        raise UnservedError(f"eigenvalues of {most:,} states together {TOO_LONG}")
+        raise NotSupportedError(f"eigenvalues of {most:,} states together {TOO_LONG}")
     return loops
 
 
-def _radius(systems: Sequence[ClosedSystem]) -> Any:
+def _radius(systems: Sequence[ClosedLoop]) -> Any:
     """Return the largest magnitude of an eigenvalue that is not 1, at the present precision."""
     ball = flint.arb(0)
     for system in systems:

@@ -16,10 +16,10 @@ import click
 from apc.analysis.methods import AUTO, METHODS
 from apc.cli.options import command, note_aside, option, picture_option, print_result
 from apc.cli.progress import at_work
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 
 if TYPE_CHECKING:
-    from apc.compiler.compiled import CompiledSystem
+    from apc.compiler.compiled import Model
     from apc.frame.names import Range
 
 # Of peers that all differ, by the thousand: 100,000 took 9 s on one core of 2026.
@@ -121,7 +121,7 @@ def analyze_command(
     print_result(result, as_json=as_json, written=[plot])
 
 
-def _ranges(system: CompiledSystem, box: tuple[str, ...]) -> list[Range]:
+def _ranges(system: Model, box: tuple[str, ...]) -> list[Range]:
     """Return the ranges of a box as they are written, and those that the topology gives."""
     from apc.analysis.box import parse_range
     from apc.frame.names import given_ranges
@@ -130,7 +130,7 @@ def _ranges(system: CompiledSystem, box: tuple[str, ...]) -> list[Range]:
 
 
 def _judge_passive(
-    system: CompiledSystem, asked: list[str], box: tuple[str, ...], *, certify: bool, as_json: bool
+    system: Model, asked: list[str], box: tuple[str, ...], *, certify: bool, as_json: bool
 ) -> None:
     """Say whether a scene is stable with any passive hands, at all delays if asked; refuse anything else."""
     from apc.hands.passivity import passive_hands
@@ -138,7 +138,7 @@ def _judge_passive(
     if asked:
         options = " and ".join((*asked, "--hands passive"))
         what = f"{options} don't go together: what hands can draw has no modes of its own"
-        raise ApcError(Mistake("E930", Place("--hands"), what, hint="--hands clamped"))
+        raise ApcError(Diagnostic("E930", SourceLocation("--hands"), what, hint="--hands clamped"))
     if ranges := _ranges(system, box):
         from apc.answer import proved_box
 

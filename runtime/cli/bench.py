@@ -14,7 +14,7 @@ import click
 from apc.cli.options import command, note_aside, option, picture_option, print_result, tell
 from apc.cli.progress import at_work
 from apc.compiler.digits import plain_float
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 
 HARD = Path("tests/hard")  # of a copy of the repository
 
@@ -84,7 +84,7 @@ def bench_command(
             tell(f"  {plot} is written")
     if result.faults:
         what = f"not everything came out right: {'; '.join(result.faults)}"
-        raise ApcError(Mistake("E922", Place(result.topology), what))
+        raise ApcError(Diagnostic("E922", SourceLocation(result.topology), what))
 
 
 def _hard(folder: Path, as_json: bool) -> None:
@@ -95,7 +95,9 @@ def _hard(folder: Path, as_json: bool) -> None:
     print_result(hard_report, as_json=as_json)
     if hard_report.failures:
         names = ", ".join(case.name for case in hard_report.failures)
-        raise ApcError(Mistake("E922", Place(str(folder)), f"not every hard case came out right: {names}"))
+        raise ApcError(
+            Diagnostic("E922", SourceLocation(str(folder)), f"not every hard case came out right: {names}")
+        )
 
 
 def _scale(path: Path, counts: str, as_json: bool) -> None:
@@ -104,13 +106,15 @@ def _scale(path: Path, counts: str, as_json: bool) -> None:
 
     if path.suffix == ".apc":
         what = "is a compiled model, whose peers are counted"
-        raise ApcError(Mistake("E921", Place(str(path)), what, hint=f"apc bench {path.with_suffix('.yaml')}"))
+        raise ApcError(
+            Diagnostic("E921", SourceLocation(str(path)), what, hint=f"apc bench {path.with_suffix('.yaml')}")
+        )
     try:
         numbers = [plain_float(text) for text in counts.split(",")]
     except ValueError:
         numbers = []
     if not numbers or not all(number.is_integer() for number in numbers):
         expected = "numbers of peers like 3,30,300"
-        raise ApcError(Mistake("E921", Place("--scale"), "the list", expected, counts[:80]))
+        raise ApcError(Diagnostic("E921", SourceLocation("--scale"), "the list", expected, counts[:80]))
     result = scale(path, [int(number) for number in numbers])
     print_result(result, as_json=as_json)

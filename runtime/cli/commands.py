@@ -48,7 +48,7 @@ def _print_version(context: click.Context, _: click.Parameter, wanted: bool) -> 
         context.exit()
 
 
-class Group(click.Group):
+class CommandGroup(click.Group):
     """The group of all commands, listed in the order of work."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
@@ -61,7 +61,7 @@ class Group(click.Group):
         return command
 
 
-@click.group(cls=Group, context_settings=CONTEXT)
+@click.group(cls=CommandGroup, context_settings=CONTEXT)
 @click.option(
     "--version",
     is_flag=True,

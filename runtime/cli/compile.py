@@ -13,7 +13,7 @@ import click
 
 from apc.cli.options import command, option, tell
 from apc.cli.progress import at_work
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.timings import recording
 from apc.compiler.words import counted
 
@@ -76,7 +76,9 @@ def compile_command(
         tell(describe(run_stages(path, until=until)))  # type: ignore[arg-type] # click checked the word
         return
     if path.suffix == ".apc":
-        raise ApcError(Mistake("E614", Place(str(path)), "is compiled already", hint=f"apc analyze {path}"))
+        raise ApcError(
+            Diagnostic("E614", SourceLocation(str(path)), "is compiled already", hint=f"apc analyze {path}")
+        )
     if not (force or recording()) and compiled_already(path):
         tell(f"{path} → {path.with_suffix('.apc')}: unchanged, not compiled again (--force does)")
         return

@@ -24,10 +24,10 @@ from apc.cli.options import (
     print_result,
 )
 from apc.cli.progress import status_line
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 
 if TYPE_CHECKING:
-    from apc.compiler.compiled import CompiledSystem
+    from apc.compiler.compiled import Model
     from apc.tuning.tuner import Tuning
 
 # What the name of a scene ends in.
@@ -70,7 +70,7 @@ def critical_command(
     note_usual(hands)
     if plot is not None and asked == "passive":
         what = "--plot and --hands passive don't go together: what hands can draw has no eigenvalues"
-        raise ApcError(Mistake("E930", Place("--hands"), what, hint="--hands clamped"))
+        raise ApcError(Diagnostic("E930", SourceLocation("--hands"), what, hint="--hands clamped"))
     system = open_scene(
         file, settings, {"--plot": plot}, hands=hands, varied=(path, *over), notify=note_aside
     )
@@ -89,7 +89,7 @@ def critical_command(
 
 
 def _over(
-    system: CompiledSystem,
+    system: Model,
     path: str,
     ends: tuple[str | None, str | None],
     over: tuple[str, ...],
@@ -101,7 +101,7 @@ def _over(
     from apc.tuning.tuner import tune
     from apc.vary.margins import GROWTH
 
-    free = find(system, path, Place("critical value"))
+    free = find(system, path, SourceLocation("critical value"))
     present, unit = value_now(system, free), unit_of(system, free.name)
     if not present and ends[1] is None:
         raise click.UsageError(f"{path} is 0 now, which says nothing of how large it may be: give --upper")
@@ -124,4 +124,4 @@ def _check_order(path: str, file: str | None) -> None:
         name = next((free.label for free in coupler_parameters(open_scene(path, ()))), None)
     hint = f"apc critical {name} {path}" if name else ""
     wanted = "a parameter or delay, then the scene"
-    raise ApcError(Mistake("E841", Place("apc critical"), "the command", wanted, got, hint))
+    raise ApcError(Diagnostic("E841", SourceLocation("apc critical"), "the command", wanted, got, hint))

@@ -64,10 +64,10 @@ def export_command(
         apc export --peer "left[1]" --out left.c
         apc export --out scene.fmu
     """
-    from apc.exports.formats import Asked, export, format_of
+    from apc.exports.formats import ExportRequest, export, format_of
     from apc.inputs import open_scene
 
     chosen = format_of(to, out)
     system = open_scene(file, settings, {"--out": out}, notify=note_aside)
-    result = export(system, chosen, Asked(cut, free, peer, device, method), out)
+    result = export(system, chosen, ExportRequest(cut, free, peer, device, method), out)
     print_result(result, as_json=as_json, written=[out])

@@ -15,7 +15,7 @@ import click
 
 from apc.cli.options import argument, command, option, tell
 from apc.cli.progress import at_work
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import unwritable
 from apc.present.forms import json_text
 
@@ -46,7 +46,7 @@ def library_command(
 
     own = () if folder is None else (folder,)
     library = Library(
-        tuple(readable_library(path, str(path), Place("--folder"), "--folder parts") for path in own)
+        tuple(readable_library(path, str(path), SourceLocation("--folder"), "--folder parts") for path in own)
     )
     if name is None:
         document, lines = catalogue.library_document(library), catalogue.library_lines(library)
@@ -84,7 +84,9 @@ def new_command(
     if not NAME.match(name):
         what = "a scene's name"
         expected = "letters, digits, - and _, 63 at most, with a letter or digit first"
-        raise ApcError(Mistake("E612", Place(name[:80] or "''"), what, expected, "this", "apc new my-scene"))
+        raise ApcError(
+            Diagnostic("E612", SourceLocation(name[:80] or "''"), what, expected, "this", "apc new my-scene")
+        )
     path = Path(f"{name}.yaml")
     # Its first line names the schema beside the library; a schema beside the new topology serves as well.
     text = _FIRST_LINE.sub("", source.read_text(encoding="utf-8"))
@@ -137,4 +139,4 @@ def _write(texts: dict[Path, str]) -> None:
             raise unwritable(path, error) from None
         hint = "apc new another-name" if path == next(iter(texts)) else f"mv {path} another-name{path.suffix}"
         what = "exists already and is left as it is"
-        raise ApcError(Mistake("E613", Place(str(path)), what, hint=hint)) from None
+        raise ApcError(Diagnostic("E613", SourceLocation(str(path)), what, hint=hint)) from None

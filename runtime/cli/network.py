@@ -10,7 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from apc.cli.options import argument, command, option, print_result
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 
 
 @command
@@ -48,7 +48,9 @@ def network_command(
         between = float(option_value("--interval", interval, what="a time", unit="s"))
         if between <= 0:
             expected, hint = "a time above 0", '--interval "8 ms"'
-            raise ApcError(Mistake("E207", Place("--interval"), "the interval", expected, interval, hint))
+            raise ApcError(
+                Diagnostic("E207", SourceLocation("--interval"), "the interval", expected, interval, hint)
+            )
     network_recording = describe(recording, between)
     if out is not None:
         from apc.present.network_output import recording_table

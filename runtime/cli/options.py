@@ -19,7 +19,7 @@ from typing import Any
 import click
 
 from apc.compiler.digits import plain_int
-from apc.compiler.errors import ApcError, Mistake, Place, visible
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, visible
 from apc.compiler.files import is_stdout
 from apc.compiler.timings import part, record
 from apc.present.forms import json_text
@@ -137,7 +137,9 @@ def criterion_with(hands: str, criterion: str | None) -> str | None:
         return criterion
     if criterion == "mean-square":
         what = "--in mean-square and --hands passive don't go together: hands draw from the nominal network"
-        raise ApcError(Mistake("E930", Place("--hands"), what, hint="--in nominal --hands passive"))
+        raise ApcError(
+            Diagnostic("E930", SourceLocation("--hands"), what, hint="--in nominal --hands passive")
+        )
     return "passive"
 
 

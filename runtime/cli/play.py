@@ -16,7 +16,7 @@ import click
 
 from apc.cli.options import command, note_aside, option, print_result, seed_option, tell
 from apc.cli.progress import at_work
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 
 
 @command
@@ -76,7 +76,9 @@ def play_command(
         patience=float(option_value("--wait", patience, what="a time", unit="s")),
     )
     if how.patience < 0:
-        raise ApcError(Mistake("E207", Place("--wait"), "the time", "0 s or more", patience, '--wait "30 s"'))
+        raise ApcError(
+            Diagnostic("E207", SourceLocation("--wait"), "the time", "0 s or more", patience, '--wait "30 s"')
+        )
     check_folder(folder, path)
     if peer is None:
         if listen or to or device:
@@ -114,15 +116,17 @@ def _secret(path: Path | None) -> bytes:
     try:
         secret = read_file(path, 1 << 16).strip()
     except RefusedError as refused:
-        raise ApcError(Mistake("E974", Place("--secret-file"), f"{path} {refused.words}")) from None
+        raise ApcError(
+            Diagnostic("E974", SourceLocation("--secret-file"), f"{path} {refused.words}")
+        ) from None
     file = shlex.quote(str(path))
     if os.name == "posix" and path.stat().st_mode & 0o077:
         what = f"{path} may be read by other users of this machine"
-        raise ApcError(Mistake("E974", Place("--secret-file"), what, hint=f"chmod 600 {file}"))
+        raise ApcError(Diagnostic("E974", SourceLocation("--secret-file"), what, hint=f"chmod 600 {file}"))
     if len(secret) < SHORTEST:
         hint = f"(umask 077; head -c 32 /dev/urandom | base64 > {file})"
         expected, got = f"{SHORTEST} bytes or more", str(len(secret))
-        raise ApcError(Mistake("E974", Place("--secret-file"), "a secret", expected, got, hint))
+        raise ApcError(Diagnostic("E974", SourceLocation("--secret-file"), "a secret", expected, got, hint))
     return secret
 
 
@@ -139,11 +143,13 @@ def _addresses(listen: str | None, to: tuple[str, ...], *, has_secret: bool):  #
         if not (equals and name):
             expected, hint = "PEER=HOST:PORT", '--to "right[1]=192.0.2.7:5000"'
             raise ApcError(
-                Mistake("E971", Place("--to"), "an address", expected, text[:80] or "nothing", hint)
+                Diagnostic(
+                    "E971", SourceLocation("--to"), "an address", expected, text[:80] or "nothing", hint
+                )
             )
         if name in others:
             what = f"{name} is given twice"
-            raise ApcError(Mistake("E971", Place("--to"), what, hint=f'--to "{name}={address}"'))
+            raise ApcError(Diagnostic("E971", SourceLocation("--to"), what, hint=f'--to "{name}={address}"'))
         others[name] = address_of(address, "--to", name)
     pair = address_of(listen, "--listen") if listen else (LOOPBACK, 0)
     socket = listen_at(pair)

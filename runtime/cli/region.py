@@ -22,7 +22,7 @@ from apc.cli.options import (
     result_option,
 )
 from apc.cli.progress import status_line
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 
 
 @command
@@ -72,7 +72,7 @@ def region_command(
 
     if vary and panels:
         what = "--vary and --panel both say what the panels are: one of them is enough"
-        raise ApcError(Mistake("E907", Place("region"), what))
+        raise ApcError(Diagnostic("E907", SourceLocation("region"), what))
     listed = parse_vary(vary) if vary else tuple(parse_panel(text) for text in panels) or ((),)
     asked = criterion_with(hands, criterion)
     note_usual(hands)

@@ -16,10 +16,10 @@ import click
 
 from apc.cli.options import argument, command, option, tell
 from apc.cli.progress import at_work
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 
 if TYPE_CHECKING:
-    from apc.present.report_output import KeptScene, Page
+    from apc.present.report_output import KeptScene, StoredPage
     from apc.reports.contents import Report
 
 MOST_LINES = 20  # of a page, that are reported one by one
@@ -77,7 +77,7 @@ def _check(path: Path) -> None:
     from apc.reports.contents import report
 
     read = read_page(path)
-    mistakes, notes = list[Mistake](), list[str]()
+    mistakes, notes = list[Diagnostic](), list[str]()
     with tempfile.TemporaryDirectory(prefix="apc-report-") as folder, at_work("reporting"):
         topologies = []
         for k, item in enumerate(read.kept["scenes"]):
@@ -85,15 +85,15 @@ def _check(path: Path) -> None:
         again = report(topologies, read.kept["scenes"][0]["settings"])
         lines = [*_lines_that_differ(path, read, again)]
     for item, now, scene in zip(read.kept["scenes"], again.to_dict()["scenes"], again.scenes, strict=True):
-        place = Place(f"{path}: {item['name'][:80]}")
+        place = SourceLocation(f"{path}: {item['name'][:80]}")
         try:
-            mistakes += [Mistake("E991", place, what) for what in _differs(item, now)]
+            mistakes += [Diagnostic("E991", place, what) for what in _differs(item, now)]
         except (OverflowError, RecursionError):
             raise damaged(path) from None
         made, texts = dict(scene.origin), dict(item["texts"])
         changed = [name for name, digest in item["origin"] if made.get(name) != digest]
         mistakes += [
-            Mistake("E991", place, f"the SHA-256 of {name[:80]} is not that of its text")
+            Diagnostic("E991", place, f"the SHA-256 of {name[:80]} is not that of its text")
             for name in changed
             if name in texts
         ]
@@ -110,7 +110,7 @@ def _check(path: Path) -> None:
     tell(f"{path}: every number is the same, computed anew")
 
 
-def _lines_that_differ(path: Path, read: Page, again: Report) -> Iterator[Mistake]:
+def _lines_that_differ(path: Path, read: StoredPage, again: Report) -> Iterator[Diagnostic]:
     """Yield what the page shows that it would not show if rendered from the report computed anew.
 
     Versions and digests are shown as the page holds them; where they differ here, a note says so.
@@ -127,9 +127,11 @@ def _lines_that_differ(path: Path, read: Page, again: Report) -> Iterator[Mistak
     differences = [*line_differences(read.shown, expected, exact=json == read.json)]
     for each in differences[:MOST_LINES]:
         what = f"shows {each.shown!r}, but computed anew it is {each.expected!r}"
-        yield Mistake("E991", Place(str(path), each.line, 1), what)
+        yield Diagnostic("E991", SourceLocation(str(path), each.line, 1), what)
     if len(differences) > MOST_LINES:
-        yield Mistake("E991", Place(str(path)), f"{len(differences) - MOST_LINES:,} more lines differ")
+        yield Diagnostic(
+            "E991", SourceLocation(str(path)), f"{len(differences) - MOST_LINES:,} more lines differ"
+        )
 
 
 def _differs(kept_scene: KeptScene, now: Mapping[str, Any]) -> Iterator[str]:

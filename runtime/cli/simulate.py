@@ -26,12 +26,12 @@ from apc.cli.options import (
     tell,
 )
 from apc.cli.progress import progress_bar
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import partial_name
 from apc.suffixes import check_suffix
 
 if TYPE_CHECKING:
-    from apc.compiler.compiled import CompiledSystem
+    from apc.compiler.compiled import Model
     from apc.simulation.settings import Settings
     from apc.simulation.simulation import Simulation
     from apc.simulation.summary import Summary
@@ -148,12 +148,14 @@ def _check_rows(out: Path) -> None:
     if out.suffix.lower() in FORMATS:
         what, known = "the suffix of --out", ", ".join((*SUFFIXES, *animation.SUFFIXES))
         hint = f"--plot {out}"
-        raise ApcError(Mistake("E878", Place(str(out)), what, f"one of {known}", out.suffix, hint))
+        raise ApcError(
+            Diagnostic("E878", SourceLocation(str(out)), what, f"one of {known}", out.suffix, hint)
+        )
     if check_suffix(out, (*SUFFIXES, *animation.SUFFIXES), "--out") in animation.SUFFIXES:
         animation.check_animation(out)
 
 
-def _play_many(system: CompiledSystem, how: Settings, runs: int, jobs: int, *, as_json: bool) -> None:
+def _play_many(system: Model, how: Settings, runs: int, jobs: int, *, as_json: bool) -> None:
     """Play a scene many times and print what that amounts to."""
     from apc.simulation.ensemble import play_many
 
@@ -170,11 +172,11 @@ def _play_many(system: CompiledSystem, how: Settings, runs: int, jobs: int, *, a
         raise click.Abort
 
 
-def _play_one(system: CompiledSystem, how: Settings, kept: _Kept, *, as_json: bool) -> None:
+def _play_one(system: Model, how: Settings, kept: _Kept, *, as_json: bool) -> None:
     """Play a scene once, keep what is wanted of it, and print what it amounts to."""
     from apc.simulation.accuracy import compare_with
     from apc.simulation.simulation import prepare
-    from apc.simulation.trajectory import Keeper, Played, provenance_of, trajectory_of
+    from apc.simulation.trajectory import Keeper, SimulationReport, provenance_of, trajectory_of
 
     moving = None
     if kept.out is not None:
@@ -198,7 +200,7 @@ def _play_one(system: CompiledSystem, how: Settings, kept: _Kept, *, as_json: bo
 
         plot = partial_name(plot) if interrupted else plot
         write_picture(trajectory_of(simulation, keeper, summary, interrupted).plot, plot)
-    played = Played(
+    played = SimulationReport(
         topology=system.name,
         summary=summary,
         provenance=provenance_of(simulation),

@@ -23,7 +23,7 @@ from apc.cli.options import (
     tell,
 )
 from apc.cli.progress import Bar, progress_bar
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import is_special
 from apc.option_value import option_value
 
@@ -101,7 +101,9 @@ def _seconds(patience: str | None) -> float | None:
     value = float(option_value("--patience", patience, what="patience", unit="s"))
     if value <= 0:
         form = '--patience "10 min"'
-        raise ApcError(Mistake("E889", Place("sweep"), "--patience", "more than 0 s", patience[:80], form))
+        raise ApcError(
+            Diagnostic("E889", SourceLocation("sweep"), "--patience", "more than 0 s", patience[:80], form)
+        )
     return value
 
 
@@ -112,9 +114,11 @@ def _values(over: tuple[str, ...]) -> dict[str, str]:
     for text in over:
         name, equals, values = (part.strip() for part in text.partition("="))
         if not (equals and name and values):
-            raise ApcError(Mistake("E880", Place("sweep"), "--over", "PATH=VALUES", text[:80], form))
+            raise ApcError(
+                Diagnostic("E880", SourceLocation("sweep"), "--over", "PATH=VALUES", text[:80], form)
+            )
         if name in result:
-            raise ApcError(Mistake("E883", Place("sweep"), f"{name[:80]} is swept twice"))
+            raise ApcError(Diagnostic("E883", SourceLocation("sweep"), f"{name[:80]} is swept twice"))
         result[name] = values
     return result
 

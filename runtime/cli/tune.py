@@ -24,12 +24,12 @@ from apc.cli.options import (
     print_result,
 )
 from apc.cli.progress import status_line
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from apc.compiler.compiled import CompiledSystem
+    from apc.compiler.compiled import Model
     from apc.tuning.tuner import Tuning
 
 
@@ -102,7 +102,9 @@ def tune_command(
     if write is not None and write.suffix not in (".yaml", ".yml"):
         what, got = "the name of a topology", write.suffix or write.name
         raise ApcError(
-            Mistake("E996", Place("--write"), what, ".yaml at its end", got, f"{write.stem}-tuned.yaml")
+            Diagnostic(
+                "E996", SourceLocation("--write"), what, ".yaml at its end", got, f"{write.stem}-tuned.yaml"
+            )
         )
     if write is not None and against:
         raise click.UsageError("--write is of one design, and --against finds several")
@@ -153,7 +155,7 @@ def tune_command(
         raise refused
 
 
-def _write(system: CompiledSystem, tuning: Tuning, settings: Sequence[str], path: Path) -> None:
+def _write(system: Model, tuning: Tuning, settings: Sequence[str], path: Path) -> None:
     """Write the topology with the gains, and with what else was set."""
     from apc.compiler.pipeline import compile_again
     from apc.compiler.words import with_unit

@@ -1,7 +1,7 @@
 """Which stiffness, delay and loss of a scene a comparison looks at.
 
-Takes: a `CompiledSystem`, and names that a person gave.
-Gives: `Choice`, `choose`, `check_over`; `STIFFNESS`, `DELAY`, `LOSS`.
+Takes: a `Model`, and names that a person gave.
+Gives: `SweepChoice`, `choose`, `check_over`; `STIFFNESS`, `DELAY`, `LOSS`.
 Guarantees: found by structure (units, and who hears whom), never by what a part is called; where several
 could be meant, none is taken.
 Does not: vary them (see `vary.critical_values`).
@@ -12,27 +12,27 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
-from apc.frame.names import Free, find, times_of, unit_of
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
+from apc.frame.names import ParameterRef, find, times_of, unit_of
 from apc.frame.parameters import scope_of
 from apc.network.nominal import channel_numbers
 from apc.vary.margins import STIFFNESSES
 
 STIFFNESS, DELAY, LOSS = "stiffness", "delay", "loss"
 
-_PLACE = Place("--over")
+_PLACE = SourceLocation("--over")
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class SweepChoice:
     """What is varied, under the name that a command takes; "" where nothing is, and then `why`."""
 
     name: str
     why: str = ""
 
 
-def check_over(systems: Sequence[CompiledSystem], over: Iterable[str]) -> None:
+def check_over(systems: Sequence[Model], over: Iterable[str]) -> None:
     """Refuse a name that no scene knows, or that is no stiffness, delay or loss.
 
     Parameters
@@ -58,7 +58,7 @@ def check_over(systems: Sequence[CompiledSystem], over: Iterable[str]) -> None:
             raise refused[0]
 
 
-def choose(system: CompiledSystem, over: Sequence[str]) -> dict[str, Choice]:
+def choose(system: Model, over: Sequence[str]) -> dict[str, SweepChoice]:
     """Return which stiffness, delay and loss of a scene are varied.
 
     Those that are named; else the stiffness of the coupler that hears others, the delay of the link over
@@ -86,7 +86,7 @@ def choose(system: CompiledSystem, over: Sequence[str]) -> dict[str, Choice]:
     return {axis: _only(system, axis, named[axis] or _found(system, axis)) for axis in named}
 
 
-def _axis(system: CompiledSystem, free: Free) -> str:
+def _axis(system: Model, free: ParameterRef) -> str:
     """Return what a parameter is. Raises ApcError E940 if it is nothing that is compared."""
     if times_of(system, free.name):
         return DELAY
@@ -98,10 +98,12 @@ def _axis(system: CompiledSystem, free: Free) -> str:
     if unit == "s":
         return DELAY
     what = f"{free.label} of {system.name}"
-    raise ApcError(Mistake("E940", _PLACE, what, "a stiffness, a delay or a loss", f"a quantity in {unit}"))
+    raise ApcError(
+        Diagnostic("E940", _PLACE, what, "a stiffness, a delay or a loss", f"a quantity in {unit}")
+    )
 
 
-def _found(system: CompiledSystem, axis: str) -> list[str]:
+def _found(system: Model, axis: str) -> list[str]:
     """Return the names that could be meant."""
     heard = {receive.link for kind in system.kinds for clock in kind.clocks for receive in clock.receives}
     links = [link for link in system.links if link.name in heard]
@@ -121,7 +123,7 @@ def _found(system: CompiledSystem, axis: str) -> list[str]:
     return _roots(system, [name for name in stiff if name.rpartition(".")[0] in hearing], STIFFNESSES)
 
 
-def _roots(system: CompiledSystem, names: Iterable[str], units: Sequence[str]) -> list[str]:
+def _roots(system: Model, names: Iterable[str], units: Sequence[str]) -> list[str]:
     """Return the numbers of a unit that some follow from, themselves where they follow from nothing."""
     scope = scope_of(system)
     needed = scope.needed(list(names))
@@ -132,15 +134,17 @@ def _roots(system: CompiledSystem, names: Iterable[str], units: Sequence[str]) -
     ]
 
 
-def _only(system: CompiledSystem, axis: str, names: Sequence[str]) -> Choice:
+def _only(system: Model, axis: str, names: Sequence[str]) -> SweepChoice:
     """Return the one of some names. Raises ApcError E941 if there are several."""
     if len(names) > 1:
         what = f"has {len(names)} numbers that could be compared as its {axis}: {', '.join(names)}"
-        raise ApcError(Mistake("E941", Place(system.origin.topology), what, hint=f"--over {names[0]}"))
-    return Choice(names[0]) if names else Choice("", _nothing(system, axis))
+        raise ApcError(
+            Diagnostic("E941", SourceLocation(system.origin.topology), what, hint=f"--over {names[0]}")
+        )
+    return SweepChoice(names[0]) if names else SweepChoice("", _nothing(system, axis))
 
 
-def _nothing(system: CompiledSystem, axis: str) -> str:
+def _nothing(system: Model, axis: str) -> str:
     """Say why nothing of a scene is varied."""
     if axis == STIFFNESS:
         return "no stiffness is that of a coupler which hears others (--over NAME takes another)"

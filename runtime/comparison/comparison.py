@@ -1,7 +1,7 @@
 """Schemes side by side: of several scenes the same numbers, each as its own command gives it.
 
-Takes: `CompiledSystem`s.
-Gives: `Comparison`, `Scheme`, `compare`; `FREQUENCIES`.
+Takes: `Model`s.
+Gives: `SchemeComparison`, `Scheme`, `compare`; `FREQUENCIES`.
 Guarantees: every number is that of `analysis`, `vary.critical_values`, `hands.frequency_response`,
 `simulation` or `effort`; what can't be had says why and keeps nothing else from being told.
 Does not: compute any of it itself, or say which scheme is the better one.
@@ -15,19 +15,19 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeVar, Unpack
 
 from apc.analysis.analysis import Analysis, analyze
-from apc.comparison.choice import DELAY, LOSS, STIFFNESS, Choice, check_over, choose
+from apc.comparison.choice import DELAY, LOSS, STIFFNESS, SweepChoice, check_over, choose
 from apc.comparison.effort import Effort, effort
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, SourceLocation
 from apc.compiler.timings import part
 from apc.frame.instance import Prepared, prepare
 from apc.hands.answers import held_names
-from apc.hands.frequency_response import Feel, feel
-from apc.moments.network_verdict import NetworkVerdict, judge_network
-from apc.result import Look, Result
+from apc.hands.frequency_response import Transparency, feel
+from apc.moments.network_verdict import MeanSquareStability, judge_network
+from apc.result import PlotStyle, Result
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare as prepare_to_play
-from apc.simulation.trajectory import Played, duration_of, play, provenance_of
+from apc.simulation.trajectory import SimulationReport, duration_of, play, provenance_of
 from apc.vary.critical_values import Critical, critical
 from apc.vary.crossing import Progress
 from apc.vary.growth import NOMINAL, PASSIVE, criterion_of
@@ -35,7 +35,7 @@ from apc.vary.growth import NOMINAL, PASSIVE, criterion_of
 if TYPE_CHECKING:
     import pandas
 
-    from apc.hands.passivity import PassiveHands
+    from apc.hands.passivity import AbsoluteStability
 
 FREQUENCIES = (1.0, 10.0)  # Hz, at which is told what a hand feels
 NOTHING: Mapping[int, str] = MappingProxyType({})  # refused
@@ -59,13 +59,13 @@ class Scheme:
     topology: str
     peers: int
     analysis: Analysis | None
-    network: NetworkVerdict | None
-    passive: PassiveHands | None
-    played: Played | None
+    network: MeanSquareStability | None
+    passive: AbsoluteStability | None
+    played: SimulationReport | None
     stiffness: Critical | None
     delay: Critical | None
     loss: Critical | None
-    feel: Feel | None
+    feel: Transparency | None
     effort: Effort
     missing: tuple[tuple[str, str], ...]
     refused: str = ""
@@ -95,7 +95,7 @@ class Scheme:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Comparison(Result):
+class SchemeComparison(Result):
     """Schemes side by side, in the order asked for; `notes` say in what they can't be compared."""
 
     shown_by = "comparison_output:comparison"
@@ -113,7 +113,7 @@ class Comparison(Result):
         every = len(self.schemes)
         return tuple(f"{', '.join(on)}: {text}" if len(on) < every else text for text, on in said.items())
 
-    def plot(self, **look: Unpack[Look]) -> Any:
+    def plot(self, **look: Unpack[PlotStyle]) -> Any:
         """Draw all schemes beside each other, as `look` says; return the matplotlib Figure."""
         return self._drawn(look=look)
 
@@ -125,14 +125,14 @@ class Comparison(Result):
 
 @part("compare")
 def compare(
-    systems: Sequence[CompiledSystem],
+    systems: Sequence[Model],
     *,
     over: Sequence[str] = (),
     criterion: str | None = None,
     at: str = "",
     refused: Mapping[int, str] = NOTHING,
     progress: Progress | None = None,
-) -> Comparison:
+) -> SchemeComparison:
     """Ask the same of several scenes.
 
     Parameters
@@ -159,7 +159,7 @@ def compare(
     check_over(systems, over)
     asked = {place: system for place, system in enumerate(systems) if place not in refused}
     for system in asked.values():
-        criterion_of(system, criterion, Place("criterion"))
+        criterion_of(system, criterion, SourceLocation("criterion"))
     chosen = {place: choose(system, over) for place, system in asked.items()}
     schemes = []
     for place, system in enumerate(systems):
@@ -172,12 +172,12 @@ def compare(
                 why = error.mistakes[0].reason
         nothing = (None,) * 8
         schemes.append(Scheme(system.name, system.peers, *nothing, effort(system), (), why))
-    return Comparison(tuple(schemes), _notes(schemes))
+    return SchemeComparison(tuple(schemes), _notes(schemes))
 
 
 def _scheme(
-    system: CompiledSystem,
-    axes: Mapping[str, Choice],
+    system: Model,
+    axes: Mapping[str, SweepChoice],
     criterion: str | None,
     at: str,
     progress: Progress | None,
@@ -225,26 +225,26 @@ def _scheme(
     )
 
 
-def _played(system: CompiledSystem, say: Progress) -> Played:
+def _played(system: Model, say: Progress) -> SimulationReport:
     """Return what a scene does in time, by its experiment."""
     simulation = prepare_to_play(system, Settings(duration_of(system, None)))
     say(f"{system.name}: apc simulate")
     summary, interrupted = play(simulation, [])
     if interrupted:
         raise KeyboardInterrupt
-    return Played(
+    return SimulationReport(
         topology=system.name, summary=summary, provenance=provenance_of(simulation), interrupted=False
     )
 
 
-def _feel(system: CompiledSystem, prepared: Prepared, at: str) -> Feel:
+def _feel(system: Model, prepared: Prepared, at: str) -> Transparency:
     """Return what is felt, at the first device there is if it isn't said: a server has none."""
     names = held_names(system, prepared)
     at = at or (names[0].partition(".")[0] if names else "")
     return feel(system, FREQUENCIES, at=at, beside=(), prepared=prepared)
 
 
-def _passive(system: CompiledSystem, prepared: Prepared) -> PassiveHands:
+def _passive(system: Model, prepared: Prepared) -> AbsoluteStability:
     """Return the verdict with all passive hands; imported here, as few comparisons ask for it."""
     from apc.hands.passivity import passive_hands
 

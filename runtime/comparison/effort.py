@@ -1,6 +1,6 @@
 """What a scheme costs: the operations of a tick, and the numbers that go over its links.
 
-Takes: a `CompiledSystem`.
+Takes: a `Model`.
 Gives: `Effort`, `effort`.
 Guarantees: counted from the compiled functions and the graphs, so it is the same on every machine; peers that
 hear each other all cost a group, not a peer.
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem, Kind, Link, Receive
+from apc.compiler.compiled import Link, Model, PeerType, Receive
 from apc.compiler.plain import POLISH, straight
 from apc.frame.exchange import arcs
 from apc.frame.parameters import resolve
@@ -39,7 +39,7 @@ class Effort:
     sent_by_all: float
 
 
-def effort(system: CompiledSystem) -> Effort:
+def effort(system: Model) -> Effort:
     """Count what a scheme costs.
 
     Parameters
@@ -72,12 +72,12 @@ def effort(system: CompiledSystem) -> Effort:
     return Effort(operations, name, float(busiest.max(initial=0.0)), float(every.sum()))
 
 
-def _channels(kind: Kind, link: Link) -> int:
+def _channels(kind: PeerType, link: Link) -> int:
     """Return how many numbers a peer's packet over a link holds."""
     return sum(len(send.channels) for send in kind.sends if send.link == link.name)
 
 
-def _hears(kind: Kind, link: Link) -> bool:
+def _hears(kind: PeerType, link: Link) -> bool:
     """Say whether a peer reads what it hears over a link."""
     return any(receive.link == link.name for clock in kind.clocks for receive in clock.receives)
 

@@ -1,6 +1,6 @@
 """The frame of a closed system in ball arithmetic: every entry an interval that holds the true number.
 
-Takes: a `ClosedSystem`; its sites' matrices as exact rationals.
+Takes: a `ClosedLoop`; its sites' matrices as exact rationals.
 Gives: `precision`, `unprovable`, `rational_ball`, `site_balls`, `frame_steps`, `closed_frame`, `frame_balls`,
 `reduced_balls`, `square`; `weight_balls`.
 Guarantees: the true matrix, of the numbers the sites hold, lies in the balls, whatever the number of bits;
@@ -23,15 +23,15 @@ import flint
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.closing import ClosedSystem, Loop, Packet
+from apc.eigen.closing import ClosedLoop, DelayedSample, ModalSystem
 from apc.eigen.graph_modes import Surd
 from apc.eigen.relative import Relative, relative
 from apc.frame.discretize import step_balls
 from apc.frame.exact import is_rational
 from apc.frame.lift import follow
 from apc.frame.radius import Arithmetic
-from apc.frame.schedule import Propagate, Schedule, Way
-from apc.frame.site import LinearSite, entrywise
+from apc.frame.schedule import CouplingTerm, Propagate, Schedule
+from apc.frame.site import LinearSubsystem, entrywise
 
 Balls = NDArray[Any]  # of flint.arb, and the integers 0 and 1 where these are exact
 
@@ -39,7 +39,7 @@ Balls = NDArray[Any]  # of flint.arb, and the integers 0 and 1 where these are e
 Steps = Mapping[int, Balls]
 
 # Whom each site hears with what weight, way by way and site by site.
-Weights = Mapping[Way, Sequence[Sequence[tuple[int, Any]]]]
+Weights = Mapping[CouplingTerm, Sequence[Sequence[tuple[int, Any]]]]
 
 
 @contextmanager
@@ -52,7 +52,7 @@ def precision(bits: int) -> Iterator[None]:
         flint.ctx.prec = before
 
 
-def unprovable(system: ClosedSystem | Loop) -> str:
+def unprovable(system: ClosedLoop | ModalSystem) -> str:
     """Return why a system's coefficients can't be had exactly, or "" when they can."""
     if not system.sites:
         return "its matrix was not composed from sites"
@@ -73,9 +73,9 @@ def rational_ball(value: Fraction | int) -> Any:
     return flint.arb(flint.fmpq(exact.numerator, exact.denominator))
 
 
-def site_balls(system: ClosedSystem | Loop) -> list[LinearSite]:
+def site_balls(system: ClosedLoop | ModalSystem) -> list[LinearSubsystem]:
     """Return the sites' matrices as balls at the present precision; equal sites are worked out once."""
-    known: dict[int, LinearSite] = {}
+    known: dict[int, LinearSubsystem] = {}
     linear_sites = []
     for group in system.sites:
         if id(group.site) not in known:
@@ -85,7 +85,7 @@ def site_balls(system: ClosedSystem | Loop) -> list[LinearSite]:
 
 
 def frame_steps(
-    site: LinearSite,
+    site: LinearSubsystem,
     schedule: Schedule,
     step: Callable[[Balls, Balls, Fraction], Balls] = step_balls,
 ) -> Steps:
@@ -94,7 +94,7 @@ def frame_steps(
     return {duration: step(site.a, site.b, duration * schedule.quantum) for duration in sorted(durations)}
 
 
-def frame_balls(system: ClosedSystem | Loop) -> Balls:
+def frame_balls(system: ClosedLoop | ModalSystem) -> Balls:
     """Return the closed matrix (n, n) of a system as balls at the present precision."""
     sites = site_balls(system)
     known: dict[tuple[int, int], Steps] = {}
@@ -108,8 +108,8 @@ def frame_balls(system: ClosedSystem | Loop) -> Balls:
 
 
 def closed_frame(
-    system: ClosedSystem | Loop,
-    sites: Sequence[LinearSite],
+    system: ClosedLoop | ModalSystem,
+    sites: Sequence[LinearSubsystem],
     steps: Sequence[Steps],
     *,
     weights: Weights | None = None,
@@ -151,7 +151,7 @@ def closed_frame(
             for h, weight in weights[heard.way][g]:
                 row = rows_of[h][heard.sent]
                 if heard.lag:
-                    total = total + start[place_of[Packet(h, row, heard.lag)]] * weight
+                    total = total + start[place_of[DelayedSample(h, row, heard.lag)]] * weight
                 elif (h, row) in sent:
                     total = total + sent[h, row] * weight
                 else:
@@ -184,12 +184,12 @@ def closed_frame(
                 del courses[g]
         assert (len(courses), len(sent)) != pair, "a packet is heard before it is sent"
     for packet, place in place_of.items():
-        older = Packet(packet.site, packet.row, packet.lag - 1)
+        older = DelayedSample(packet.site, packet.row, packet.lag - 1)
         matrix[place] = sent[packet.site, packet.row] if packet.lag == 1 else start[place_of[older]]
     return matrix
 
 
-def weight_balls(system: ClosedSystem | Loop) -> Weights:
+def weight_balls(system: ClosedLoop | ModalSystem) -> Weights:
     """Return, way by way and site by site, whom it hears with what weight, the doubts included."""
     result = {}
     for way, rows in system.coupling.items():

@@ -1,6 +1,6 @@
 """Proof in ball arithmetic that a closed system is stable, or that it is not.
 
-Takes: a `ClosedSystem` and its rigid modes.
+Takes: a `ClosedLoop` and its rigid modes.
 Gives: `Proof`, `prove`; `root_discs`; `MOST_PROVED`.
 Guarantees: a verdict True or False is proved: every rounding since the sites' exact numbers is inside a ball.
 What is too near the circle for the last precision is left open, and so is what lies on it.
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.balls import Balls, frame_balls, precision, rational_ball, reduced_balls, square
-from apc.eigen.closing import ClosedSystem
+from apc.eigen.closing import ClosedLoop
 from apc.eigen.eigenpairs import components
 from apc.eigen.enclosure import discs
 from apc.eigen.relative import independent_places
@@ -96,7 +96,7 @@ class Discs:
         return True if most < 0 else False if least > 0 else None
 
 
-def prove(system: ClosedSystem, free: RigidModes) -> Proof:
+def prove(system: ClosedLoop, free: RigidModes) -> Proof:
     """Prove a closed system stable or unstable, in rising precision.
 
     Parameters

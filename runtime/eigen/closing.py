@@ -1,8 +1,8 @@
 """Close a loop: what each site hears is what the others send, and one matrix moves them all.
 
 Takes: groups of equal peers, and what each weighs the packets of each other by.
-Gives: `Loop`, `Coupling`, `without_packets`; `Packet`, `StateLayout`, `lay_out`; `ClosedSystem`,
-`close_loop`; `Feedback`, `bounded_weight`, `feedback_of`, `close`, `close_outside`.
+Gives: `ModalSystem`, `Coupling`, `without_packets`; `DelayedSample`, `StateLayout`, `lay_out`; `ClosedLoop`,
+`close_loop`; `InterconnectionMatrices`, `bounded_weight`, `feedback_of`, `close`, `close_outside`.
 Guarantees: the state holds, site by site, z and then the packets on their way, in order of row and age. The
 matrix of `close_loop` comes with a bound on its rounding error, entry by entry; `close` takes one system or
 many (k, …), real or complex.
@@ -22,37 +22,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.graph_modes import Surd
-from apc.eigen.peers import PeerGroup, states_of
+from apc.eigen.peers import PeerClass, states_of
 from apc.frame.lift import FrameMap
 from apc.frame.radius import FLOATS, RADII, UNIT, Arithmetic, common_shape, radius_of, value_of
-from apc.frame.schedule import Schedule, Way
+from apc.frame.schedule import CouplingTerm, Schedule
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]  # float64 or complex128; of balls where it says so
 
 # What site g hears of site h on a way: the weight on h's packet.
-Coupling = Mapping[Way, tuple[tuple[Fraction, ...], ...]]
+Coupling = Mapping[CouplingTerm, tuple[tuple[Fraction, ...], ...]]
 
 
 @dataclass(frozen=True, slots=True)
-class Loop:
+class ModalSystem:
     """Some sites and what each hears of each, `coupling`: a closed system before its matrix is built.
 
-    The whole holds it `multiplicity` times. `doubts` and `surds` as in `ClosedSystem`.
+    The whole holds it `multiplicity` times. `doubts` and `surds` as in `ClosedLoop`.
     """
 
     name: str
     multiplicity: int
-    sites: tuple[PeerGroup, ...]
+    sites: tuple[PeerClass, ...]
     coupling: Coupling
-    doubts: Mapping[Way, float] = field(default_factory=dict)
-    surds: Mapping[Way, Surd] = field(default_factory=dict)
+    doubts: Mapping[CouplingTerm, float] = field(default_factory=dict)
+    surds: Mapping[CouplingTerm, Surd] = field(default_factory=dict)
 
     @property
-    def packets(self) -> tuple[Packet, ...]:
+    def packets(self) -> tuple[DelayedSample, ...]:
         """The packets on their way, in order of state."""
         return tuple(
-            Packet(h, row, lag)
+            DelayedSample(h, row, lag)
             for h, group in enumerate(self.sites)
             for row, depth in enumerate(group.schedule.depths)
             for lag in range(1, depth + 1)
@@ -75,7 +75,7 @@ class Loop:
 
 
 @dataclass(frozen=True, slots=True)
-class Packet:
+class DelayedSample:
     """A packet that is still to be heard: row of s of site `site`, sent `lag` frames ago (1 or more)."""
 
     site: int
@@ -89,15 +89,15 @@ class StateLayout:
 
     offsets: tuple[int, ...]
     names: tuple[str, ...]
-    places: Mapping[Packet, int]  # in order of state
+    places: Mapping[DelayedSample, int]  # in order of state
 
     @property
-    def packets(self) -> tuple[Packet, ...]:
+    def packets(self) -> tuple[DelayedSample, ...]:
         """The packets on their way, in order of state."""
         return tuple(self.places)
 
 
-def without_packets(loop: Loop) -> Loop:
+def without_packets(loop: ModalSystem) -> ModalSystem:
     """Return the loop with no packet in its state: how many motions are rigid does not depend on delays."""
     sites = tuple(
         replace(group, schedule=replace(group.schedule, depths=(0,) * len(group.schedule.depths)))
@@ -110,7 +110,7 @@ def lay_out(z_names: Sequence[Sequence[str]], schedules: Sequence[Schedule]) -> 
     """Lay out a state: site by site what its z is named, then its packets."""
     offsets: list[int] = []
     names: list[str] = []
-    places: dict[Packet, int] = {}
+    places: dict[DelayedSample, int] = {}
     for site, (z_name, schedule) in enumerate(zip(z_names, schedules, strict=True)):
         offsets.append(len(names))
         names += z_name
@@ -118,12 +118,12 @@ def lay_out(z_names: Sequence[Sequence[str]], schedules: Sequence[Schedule]) -> 
         for row, depth in enumerate(schedule.depths):
             for lag in range(1, depth + 1):
                 when = (schedule.sent_times[row] - lag * schedule.frame) * over / under
-                places[Packet(site, row, lag)] = len(names)
+                places[DelayedSample(site, row, lag)] = len(names)
                 names.append(f"{schedule.sent_names[row]}({when:.6g} ms)")
     return StateLayout(tuple(offsets), tuple(names), places)
 
 
-def lay_out_loop(loop: Loop | ClosedSystem) -> StateLayout:
+def lay_out_loop(loop: ModalSystem | ClosedLoop) -> StateLayout:
     """Lay out the state of a loop; of several sites, each name says whose it is."""
     groups = loop.sites
     layout = lay_out([group.z_names for group in groups], [group.schedule for group in groups])
@@ -137,7 +137,7 @@ def lay_out_loop(loop: Loop | ClosedSystem) -> StateLayout:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ClosedSystem:
+class ClosedLoop:
     """One autonomous system: state⁺ = `matrix` · state, once a frame.
 
     `layout` says what the state holds; `motion` where in it the continuous states are (site by site). `error`
@@ -148,7 +148,7 @@ class ClosedSystem:
 
     name: str
     multiplicity: int
-    sites: tuple[PeerGroup, ...]
+    sites: tuple[PeerClass, ...]
     coupling: Coupling
     frame_s: float
     layout: StateLayout
@@ -156,8 +156,8 @@ class ClosedSystem:
     error: Floats  # (n, n)
     heard: tuple[Floats, ...]  # (n_r, n), one a site
     motion: tuple[int, ...]
-    doubts: Mapping[Way, float] = field(default_factory=dict)
-    surds: Mapping[Way, Surd] = field(default_factory=dict)
+    doubts: Mapping[CouplingTerm, float] = field(default_factory=dict)
+    surds: Mapping[CouplingTerm, Surd] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -170,17 +170,17 @@ class ClosedSystem:
         return self.layout.offsets
 
     @property
-    def packets(self) -> tuple[Packet, ...]:
+    def packets(self) -> tuple[DelayedSample, ...]:
         """The packets on their way, in order of state."""
         return self.layout.packets
 
 
-def close_loop(loop: Loop | ClosedSystem) -> ClosedSystem:
+def close_loop(loop: ModalSystem | ClosedLoop) -> ClosedLoop:
     """Let K sites hear each other: r_g = Σ_h W_gh s_h, each packet as old as its receiver finds it."""
     maps = [group.lifted for group in loop.sites]
     layout = lay_out_loop(loop)
     closed = close(maps, feedback_of(loop, layout), layout, numbers=RADII)
-    return ClosedSystem(
+    return ClosedLoop(
         name=loop.name,
         multiplicity=loop.multiplicity,
         sites=loop.sites,
@@ -201,7 +201,7 @@ def close_loop(loop: Loop | ClosedSystem) -> ClosedSystem:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Feedback:
+class InterconnectionMatrices:
     """What a site hears, r = `now` s + `before` x, in floats or with their radii.
 
     s are the packets that all sites send in this frame, site by site; x is the state, and behind it, if
@@ -212,13 +212,13 @@ class Feedback:
     before: Matrix  # (n_r, n)
 
     @property
-    def plain(self) -> Feedback:
+    def plain(self) -> InterconnectionMatrices:
         """The weights without their radii."""
-        return Feedback(value_of(self.now), value_of(self.before))
+        return InterconnectionMatrices(value_of(self.now), value_of(self.before))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Closed:
+class ClosedLoopMatrices:
     """A closed loop over its state and what comes from outside: what it becomes, is heard and is sent.
 
     `turns` says how many packets in a row are sent upon one another in a frame.
@@ -236,7 +236,7 @@ def bounded_weight(weight: Fraction, doubt: float) -> tuple[float, float]:
     return known, doubt if is_exact else doubt + UNIT * abs(known)
 
 
-def feedback_of(loop: Loop | ClosedSystem, layout: StateLayout) -> list[Feedback]:
+def feedback_of(loop: ModalSystem | ClosedLoop, layout: StateLayout) -> list[InterconnectionMatrices]:
     """Return what each site hears, each weight with the radius of its doubt and of its rounding."""
     row_of = [{sent: row for row, sent in enumerate(group.schedule.sent)} for group in loop.sites]
     starts = np.cumsum([0] + [len(group.schedule.sent) for group in loop.sites]).tolist()
@@ -259,17 +259,17 @@ def feedback_of(loop: Loop | ClosedSystem, layout: StateLayout) -> list[Feedback
                 weights.append(known.get(key) or known.setdefault(key, bounded_weight(weight, doubt)))
             if columns:
                 (before if heard.lag else now)[:, line, columns] = np.array(weights).T
-        feedbacks.append(Feedback(now, before))
+        feedbacks.append(InterconnectionMatrices(now, before))
     return feedbacks
 
 
 def close(
     maps: Sequence[FrameMap],
-    feedback: Sequence[Feedback],
+    feedback: Sequence[InterconnectionMatrices],
     layout: StateLayout,
     *,
     numbers: Arithmetic = FLOATS,
-) -> Closed:
+) -> ClosedLoopMatrices:
     """Close a loop, or many of one layout (k, …).
 
     Parameters
@@ -321,18 +321,18 @@ def close(
         if packet.lag == 1:
             matrix[..., at, :] = sent[..., starts[packet.site] + packet.row, :]
         else:
-            matrix[..., at, layout.places[Packet(packet.site, packet.row, packet.lag - 1)]] = unit
-    return Closed(matrix, tuple(received), sent)
+            matrix[..., at, layout.places[DelayedSample(packet.site, packet.row, packet.lag - 1)]] = unit
+    return ClosedLoopMatrices(matrix, tuple(received), sent)
 
 
 def close_outside(
-    loop: Loop | ClosedSystem,
+    loop: ModalSystem | ClosedLoop,
     maps: Sequence[FrameMap],
     ways: Sequence[int],
     layout: StateLayout,
     *,
     numbers: Arithmetic = FLOATS,
-) -> Closed:
+) -> ClosedLoopMatrices:
     """Close a loop into whose sites something comes from outside: over the state, and that behind it.
 
     Parameters
@@ -359,7 +359,7 @@ def close_outside(
         now[..., :heard, :], before[..., :heard, : len(layout.names)] = plain.now, plain.before
         columns = len(layout.names) + first
         before[..., heard:, columns : columns + many] = numbers.exact(np.eye(many))
-        feedback.append(Feedback(now, before))
+        feedback.append(InterconnectionMatrices(now, before))
         first += many
     return close(maps, feedback, layout, numbers=numbers)
 

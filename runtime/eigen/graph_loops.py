@@ -18,14 +18,14 @@ from fractions import Fraction
 import numpy as np
 
 from apc.compiler.weights import sum_weights
-from apc.eigen.closing import Coupling, Loop
+from apc.eigen.closing import Coupling, ModalSystem
 from apc.eigen.graph_modes import GraphMode, Surd
-from apc.eigen.peers import PeerGroup
-from apc.frame.exchange import Exchange, check_mean
-from apc.frame.schedule import Way
+from apc.eigen.peers import PeerClass
+from apc.frame.exchange import CommunicationGraph, check_mean
+from apc.frame.schedule import CouplingTerm
 
 
-def common_graph(ways: Sequence[Way], exchange: Exchange) -> str:
+def common_graph(ways: Sequence[CouplingTerm], exchange: CommunicationGraph) -> str:
     """Return "" if the links' W are one graph, or else why they have not the same eigenvectors."""
     links = list(dict.fromkeys(way.link for way in ways))
     shapes = {exchange.links[link].graph.shape for link in links}
@@ -42,7 +42,7 @@ def common_graph(ways: Sequence[Way], exchange: Exchange) -> str:
     return ""
 
 
-def _degree(link: str, exchange: Exchange) -> Fraction | None:
+def _degree(link: str, exchange: CommunicationGraph) -> Fraction | None:
     """Return the sum of the weights that every peer hears over a link, None when it differs."""
     pairs, weights = exchange.arcs(link)
     sums = sum_weights(pairs[:, 1], weights, exchange.peers)
@@ -53,11 +53,11 @@ def _degree(link: str, exchange: Exchange) -> Fraction | None:
 class GraphScale:
     """What each way weighs a neighbour by, in units of W; `by_mean`: of the W whose rows add up to 1."""
 
-    weights: Mapping[Way, Fraction]
+    weights: Mapping[CouplingTerm, Fraction]
     by_mean: bool
 
 
-def graph_scale(group: PeerGroup, ways: Sequence[Way], exchange: Exchange) -> GraphScale:
+def graph_scale(group: PeerClass, ways: Sequence[CouplingTerm], exchange: CommunicationGraph) -> GraphScale:
     """Return how equal peers weigh their neighbours on the graph that all their ways share.
 
     Raises
@@ -83,7 +83,7 @@ def graph_scale(group: PeerGroup, ways: Sequence[Way], exchange: Exchange) -> Gr
     )
 
 
-def graph_loop(group: PeerGroup, mode: GraphMode, scale: GraphScale) -> Loop:
+def graph_loop(group: PeerClass, mode: GraphMode, scale: GraphScale) -> ModalSystem:
     """Let one site hear itself by an eigenvalue, or two by a complex pair."""
     a, b = mode.real, mode.imaginary
     weights = scale.weights
@@ -93,11 +93,11 @@ def graph_loop(group: PeerGroup, mode: GraphMode, scale: GraphScale) -> Loop:
     name = "common" if mode.common else f"graph {named:+.6g}"
     if not b:
         coupling: Coupling = {way: ((weight * a,),) for way, weight in weights.items()}
-        surds: Mapping[Way, Surd] = {}
+        surds: Mapping[CouplingTerm, Surd] = {}
         if mode.doubt and mode.surd:
             surd = mode.surd
             surds = {way: replace(surd, scale=weight * surd.scale) for way, weight in weights.items()}
-        return Loop(name, mode.multiplicity, (group,), coupling, doubts, surds)
+        return ModalSystem(name, mode.multiplicity, (group,), coupling, doubts, surds)
     pair = {way: ((weight * a, -weight * b), (weight * b, weight * a)) for way, weight in weights.items()}
     sites = tuple(replace(group, name=part) for part in ("real", "imaginary"))
-    return Loop(f"{name} ± {mode.value.imag:.6g}i", mode.multiplicity, sites, pair, doubts)
+    return ModalSystem(f"{name} ± {mode.value.imag:.6g}i", mode.multiplicity, sites, pair, doubts)

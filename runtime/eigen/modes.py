@@ -1,7 +1,7 @@
 """A whole system as few and small loops instead of one large one.
 
 Takes: the groups of equal peers of a scene, and the exchange between them.
-Gives: `split`; `Arrangement`, `arrange`; `loops_at_right_angles`; `complete_loops`, `dense_loop`,
+Gives: `split`; `ModalDecomposition`, `arrange`; `loops_at_right_angles`; `complete_loops`, `dense_loop`,
 `dense`, `refuse_dense`, `split_exchangeable`; `couple`, `complete_degrees`.
 Guarantees: the systems of a split, each as often as its multiplicity says, have together the spectrum of
 `dense`, whatever the number of peers. Weights are exact; a mean over nobody, or of weights that add up to 0,
@@ -30,29 +30,29 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from apc.compiler.weights import exact_weight
-from apc.eigen.closing import ClosedSystem, Coupling, Loop, close_loop
+from apc.eigen.closing import ClosedLoop, Coupling, ModalSystem, close_loop
 from apc.eigen.graph_loops import common_graph, graph_loop, graph_scale
 from apc.eigen.graph_modes import graph_modes
-from apc.eigen.peers import MOST_STATES, PeerGroup, group_name, states_of, too_large, used_ways
-from apc.frame.exchange import Exchange, check_mean
-from apc.frame.instance import Peers
-from apc.frame.schedule import Way
-from apc.unserved import UnservedError
+from apc.eigen.peers import MOST_STATES, PeerClass, group_name, states_of, too_large, used_ways
+from apc.frame.exchange import CommunicationGraph, check_mean
+from apc.frame.instance import PeerIndices
+from apc.frame.schedule import CouplingTerm
+from apc.unserved import NotSupportedError
 
 # The shape of modes of peers that differ.
 COUPLED = "coupled"
 
 
 @dataclass(frozen=True, slots=True)
-class Arrangement:
+class ModalDecomposition:
     """A whole system as independent loops; `method` is "modes" or "dense", `notes` say why."""
 
     method: str
-    loops: tuple[Loop, ...]
+    loops: tuple[ModalSystem, ...]
     notes: tuple[str, ...]
 
 
-def split(groups: Sequence[PeerGroup], exchange: Exchange) -> tuple[ClosedSystem, ...]:
+def split(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> tuple[ClosedLoop, ...]:
     """Split the whole system into as few and small closed systems as its graphs and groups allow.
 
     Parameters
@@ -74,7 +74,7 @@ def split(groups: Sequence[PeerGroup], exchange: Exchange) -> tuple[ClosedSystem
     return tuple(close_loop(loop) for loop in loops)
 
 
-def arrange(groups: Sequence[PeerGroup], exchange: Exchange) -> Arrangement:
+def arrange(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> ModalDecomposition:
     """Find the independent loops of a whole system: `split`, before any matrix is built.
 
     Parameters
@@ -85,7 +85,7 @@ def arrange(groups: Sequence[PeerGroup], exchange: Exchange) -> Arrangement:
     ways = used_ways(group.schedule for group in groups)
     graphs = list(dict.fromkeys(way.link for way in ways if not exchange.is_complete(way.link)))
     if not graphs:
-        return Arrangement("modes", complete_loops(groups, exchange), ())
+        return ModalDecomposition("modes", complete_loops(groups, exchange), ())
     named = " and ".join(f"{link} ({exchange.links[link].graph.shape})" for link in graphs)
     reason = f"the peers on {named} differ" if len(groups) > 1 else common_graph(ways, exchange)
     if not reason:
@@ -93,18 +93,20 @@ def arrange(groups: Sequence[PeerGroup], exchange: Exchange) -> Arrangement:
         modes = graph_modes(exchange.links[graphs[0]].graph, exchange.peers, mean=scale.by_mean)
         if modes is not None:
             note = f"{len(modes)} systems, one an eigenvalue of the graph of {named}"
-            return Arrangement(
+            return ModalDecomposition(
                 "modes", tuple(graph_loop(groups[0], graph_mode, scale) for graph_mode in modes), (note,)
             )
         reason = f"the graph of {named} has no full set of eigenvectors"
     parts = split_exchangeable(dense_loop(groups, exchange), exchange)
     if len(parts) > 1:
         note = f"{len(parts)} systems, as peers that can change places move alike or apart"
-        return Arrangement("modes", parts, (note,))
-    return Arrangement("dense", parts, (f"all peers as one system: {reason}",))
+        return ModalDecomposition("modes", parts, (note,))
+    return ModalDecomposition("dense", parts, (f"all peers as one system: {reason}",))
 
 
-def loops_at_right_angles(groups: Sequence[PeerGroup], exchange: Exchange, most: int) -> tuple[Loop, ...]:
+def loops_at_right_angles(
+    groups: Sequence[PeerClass], exchange: CommunicationGraph, most: int
+) -> tuple[ModalSystem, ...]:
     """Split a scene into loops at right angles to one another, all peers alike the first.
 
     Parameters
@@ -116,7 +118,7 @@ def loops_at_right_angles(groups: Sequence[PeerGroup], exchange: Exchange, most:
 
     Raises
     ------
-    UnservedError
+    NotSupportedError
         More peers on such a graph.
     """
     graphs = {way.link for way in used_ways(group.schedule for group in groups)}
@@ -125,7 +127,7 @@ def loops_at_right_angles(groups: Sequence[PeerGroup], exchange: Exchange, most:
         return complete_loops(groups, exchange)
     count = sum(group.count for group in groups)
     if count > most:
-        raise UnservedError(
+        raise NotSupportedError(
             f"{count:,} peers on a graph that is not complete are too many: {most} are the most"
         )
     if len(groups) == 1 and all(exchange.links[link].graph.shape == "ring" for link in graphs):
@@ -135,7 +137,7 @@ def loops_at_right_angles(groups: Sequence[PeerGroup], exchange: Exchange, most:
     return split_exchangeable(dense_loop(groups, exchange), exchange)
 
 
-def complete_loops(groups: Sequence[PeerGroup], exchange: Exchange) -> tuple[Loop, ...]:
+def complete_loops(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> tuple[ModalSystem, ...]:
     """Split a system of complete graphs into a common loop and a difference loop a group of two or more.
 
     Parameters
@@ -149,7 +151,7 @@ def complete_loops(groups: Sequence[PeerGroup], exchange: Exchange) -> tuple[Loo
     weights = couple(
         groups, exchange, lambda way, g, h: Fraction(groups[h].count - (1 if g == h else 0)), degrees
     )
-    loops = [Loop(_together_named(groups), 1, tuple(groups), weights)]
+    loops = [ModalSystem(_together_named(groups), 1, tuple(groups), weights)]
     if all(group.count < 2 for group in groups):
         return tuple(loops)
     apart = couple(groups, exchange, lambda way, g, h: Fraction(-1 if g == h else 0), degrees)
@@ -158,11 +160,11 @@ def complete_loops(groups: Sequence[PeerGroup], exchange: Exchange) -> tuple[Loo
             continue
         own = {key: ((rows[place][place],),) for key, rows in apart.items()}
         name = "difference" if len(groups) == 1 else f"difference {group.name}"
-        loops.append(Loop(name, group.count - 1, (group,), own))
+        loops.append(ModalSystem(name, group.count - 1, (group,), own))
     return tuple(loops)
 
 
-def dense(groups: Sequence[PeerGroup], exchange: Exchange) -> ClosedSystem:
+def dense(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> ClosedLoop:
     """Assemble every peer of the whole system: the check on all else, at the cost of N³.
 
     Parameters
@@ -181,17 +183,17 @@ def dense(groups: Sequence[PeerGroup], exchange: Exchange) -> ClosedSystem:
     return close_loop(dense_loop(groups, exchange))
 
 
-def refuse_dense(groups: Sequence[PeerGroup], exchange: Exchange) -> None:
+def refuse_dense(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> None:
     """Refuse so many peers before each of them is looked at."""
     states = sum(group.count * states_of(group.schedule, group.jacobians) for group in groups)
     if states > MOST_STATES:
         raise too_large(exchange, f"{exchange.peers:,} peers", states)
 
 
-def dense_loop(groups: Sequence[PeerGroup], exchange: Exchange) -> Loop:
+def dense_loop(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> ModalSystem:
     """Return every peer of the whole system as one loop."""
     everyone = tuple(
-        replace(group, name=exchange.peer_name(peer), count=1, peers=Peers((range(peer, peer + 1),)))
+        replace(group, name=exchange.peer_name(peer), count=1, peers=PeerIndices((range(peer, peer + 1),)))
         for peer, group in sorted(
             ((peer, group) for group in groups for peer in group.peers), key=lambda pair: pair[0]
         )
@@ -211,15 +213,15 @@ def dense_loop(groups: Sequence[PeerGroup], exchange: Exchange) -> Loop:
     coupling = couple(
         everyone, exchange, lambda way, g, h: weights[way.link].get((g, h), Fraction(0)), degrees
     )
-    return Loop(COUPLED, 1, everyone, coupling)
+    return ModalSystem(COUPLED, 1, everyone, coupling)
 
 
-def _together_named(sites: Sequence[PeerGroup]) -> str:
+def _together_named(sites: Sequence[PeerClass]) -> str:
     """Return how peers move together: one alone, equal ones alike, others each in its own way."""
     return COUPLED if len(sites) > 1 else "common" if sites[0].count > 1 else "single"
 
 
-def split_exchangeable(loop: Loop, exchange: Exchange) -> tuple[Loop, ...]:
+def split_exchangeable(loop: ModalSystem, exchange: CommunicationGraph) -> tuple[ModalSystem, ...]:
     """Split a loop by its exchangeable peers.
 
     Parameters
@@ -252,11 +254,11 @@ def split_exchangeable(loop: Loop, exchange: Exchange) -> tuple[Loop, ...]:
                 way: ((rows[first][first] - rows[first][second],),) for way, rows in loop.coupling.items()
             }
             many = loop.multiplicity * (len(members) - 1)
-            loops.append(Loop(f"difference {site.name}", many, (site,), apart))
+            loops.append(ModalSystem(f"difference {site.name}", many, (site,), apart))
     return tuple(loops)
 
 
-def _are_exchangeable(loop: Loop, g: int, h: int) -> bool:
+def _are_exchangeable(loop: ModalSystem, g: int, h: int) -> bool:
     """Say whether two sites can change places."""
     site, other = loop.sites[g], loop.sites[h]
     if site.lifting is not other.lifting or site.schedule is not other.schedule:
@@ -270,22 +272,24 @@ def _are_exchangeable(loop: Loop, g: int, h: int) -> bool:
     )
 
 
-def _weight_of(loop: Loop, way: Way, members: Sequence[int], others: Sequence[int]) -> Fraction:
+def _weight_of(
+    loop: ModalSystem, way: CouplingTerm, members: Sequence[int], others: Sequence[int]
+) -> Fraction:
     """Return what a site of one class hears of a class whose sites all move alike."""
     row = loop.coupling[way][members[0]]
     return sum((row[place] for place in others), Fraction(0))
 
 
-def _together(sites: Sequence[PeerGroup], exchange: Exchange) -> PeerGroup:
+def _together(sites: Sequence[PeerClass], exchange: CommunicationGraph) -> PeerClass:
     """Return equal sites as one group."""
-    peers = Peers(tuple(run for site in sites for run in site.peers.runs))
+    peers = PeerIndices(tuple(run for site in sites for run in site.peers.runs))
     return replace(sites[0], name=group_name(peers, exchange), count=len(peers), peers=peers)
 
 
 def couple(
-    groups: Sequence[PeerGroup],
-    exchange: Exchange,
-    weigh: Callable[[Way, int, int], Fraction],
+    groups: Sequence[PeerClass],
+    exchange: CommunicationGraph,
+    weigh: Callable[[CouplingTerm, int, int], Fraction],
     degrees: Mapping[tuple[str, int], Fraction],
 ) -> Coupling:
     """Weigh each site's packets at each other, way by way.
@@ -327,7 +331,9 @@ def couple(
     return coupling
 
 
-def complete_degrees(groups: Sequence[PeerGroup], exchange: Exchange) -> dict[tuple[str, int], Fraction]:
+def complete_degrees(
+    groups: Sequence[PeerClass], exchange: CommunicationGraph
+) -> dict[tuple[str, int], Fraction]:
     """Return how many others a peer of each group hears over each complete link."""
     degrees = {}
     for link in exchange.links:

@@ -1,7 +1,7 @@
 """The groups of peers that move alike: one site each, linearized and lifted once for all of them.
 
 Takes: an `Instance` of a scene.
-Gives: `PeerGroup`, `peer_groups`, `representatives`, `more_differ`; `used_ways`, `states_of`; `too_large`.
+Gives: `PeerClass`, `peer_groups`, `representatives`, `more_differ`; `used_ways`, `states_of`; `too_large`.
 Guarantees: as few groups as there are peers of different dynamics, found in a time that grows with the number
 of peers, not with its square; peers that follow one another take no memory, however many they are. A site
 that is not affine is linearized at its own start values, hearing the others at theirs. A group's matrices are
@@ -22,20 +22,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.errors import ApcError, Mistake, Place
-from apc.frame.exchange import Exchange
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
+from apc.frame.exchange import CommunicationGraph
 from apc.frame.finite_equations import at_its_part
-from apc.frame.instance import Instance, Peers
-from apc.frame.jacobians import SiteJacobians
+from apc.frame.instance import Instance, PeerIndices
+from apc.frame.jacobians import SubsystemJacobians
 from apc.frame.lift import FrameMap, check_packets, lift
 from apc.frame.linearize import (
-    Listening,
+    InitialReception,
     linearize,
     linearize_exact,
     linearize_rows,
 )
-from apc.frame.schedule import Schedule, Way
-from apc.frame.site import LinearSite, rational_floats
+from apc.frame.schedule import CouplingTerm, Schedule
+from apc.frame.site import LinearSubsystem, rational_floats
 from apc.frame.start_classes import Gains, StartClasses
 
 Floats = NDArray[np.float64]
@@ -50,31 +50,31 @@ MOST_NAMED = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PeerGroup:
+class PeerClass:
     """`count` peers that move alike; `parameters` is the vector (n_p,) of the first of them.
 
     `peers` are their numbers in the scene, from 0; `role` is the scene's group where it has delays of its own
-    (see `Exchange.role`); `place` is what `gains` calls the group. `exacting` gives `exact`, the site's
-    matrices in rationals, where they can't be had its floats taken at their word, and `lifting` gives
+    (see `CommunicationGraph.role`); `place` is what `gains` calls the group. `exacting` gives `exact`, the
+    site's matrices in rationals, where they can't be had its floats taken at their word, and `lifting` gives
     `lifted`: both are made when they are asked for.
     """
 
     name: str
     count: int
     parameters: Floats
-    jacobians: SiteJacobians
-    site: LinearSite
-    exacting: Callable[[], LinearSite]
+    jacobians: SubsystemJacobians
+    site: LinearSubsystem
+    exacting: Callable[[], LinearSubsystem]
     schedule: Schedule
     lifting: Callable[[], FrameMap]
-    peers: Peers
+    peers: PeerIndices
     role: int
     place: int
-    listening: Listening | None
+    listening: InitialReception | None
     gains: Gains
 
     @property
-    def exact(self) -> LinearSite:
+    def exact(self) -> LinearSubsystem:
         """The site's matrices in rationals."""
         return self.exacting()
 
@@ -88,7 +88,7 @@ class PeerGroup:
         """The names of its part of the state: what moves, then what is remembered."""
         return (*(state.name for state in self.site.kind.states), *self.schedule.value_names)
 
-    def with_lifted(self, lifted: FrameMap) -> PeerGroup:
+    def with_lifted(self, lifted: FrameMap) -> PeerClass:
         """Return the same peers with another map of one frame."""
         return replace(self, lifting=lambda: lifted)
 
@@ -96,7 +96,7 @@ class PeerGroup:
         """Say whether these peers send over a link."""
         return any(sending.link == link for sending in self.jacobians.kind.sends)
 
-    def gain(self, way: Way, sender: PeerGroup) -> Fraction:
+    def gain(self, way: CouplingTerm, sender: PeerClass) -> Fraction:
         """Return what a peer weighs a sender's packets on a way by, beside the link's own weights."""
         if not way.edge:
             return Fraction(1)
@@ -104,8 +104,12 @@ class PeerGroup:
         return listed[0] if len(listed) == 1 else listed[sender.place]
 
     def with_site(
-        self, site: LinearSite, exact: LinearSite, schedule: Schedule, lifted: FrameMap | None = None
-    ) -> PeerGroup:
+        self,
+        site: LinearSubsystem,
+        exact: LinearSubsystem,
+        schedule: Schedule,
+        lifted: FrameMap | None = None,
+    ) -> PeerClass:
         """Return the same peers with other equations and events in a frame.
 
         Parameters
@@ -130,10 +134,10 @@ class PeerGroup:
 def build_group(
     instance: Instance,
     place: int,
-    peers: Peers,
-    listening: Listening | None = None,
+    peers: PeerIndices,
+    listening: InitialReception | None = None,
     gains: Gains | None = None,
-) -> PeerGroup:
+) -> PeerClass:
     """Return peers that move alike as a group.
 
     Parameters
@@ -154,14 +158,14 @@ def build_group(
     site = linearize(built, vector, listening)
 
     @functools.cache
-    def exacting() -> LinearSite:
+    def exacting() -> LinearSubsystem:
         # The functions of a nonlinear loop can't be walked one by one.
         return linearize_exact(built, vector, listening) if built.walkable else rational_floats(site)
 
     def lifting() -> FrameMap:
         return lift(site, schedule, exact=exacting() if built.walkable else None)
 
-    return PeerGroup(
+    return PeerClass(
         name=group_name(peers, exchange),
         count=len(peers),
         parameters=vector,
@@ -178,11 +182,11 @@ def build_group(
     )
 
 
-def group_name(peers: Peers, exchange: Exchange) -> str:
+def group_name(peers: PeerIndices, exchange: CommunicationGraph) -> str:
     """Return `left+right[1,3]`, for peers of the scene's groups; all of a group are its name alone."""
     names, starts = [], exchange.starts.tolist()
     for end, listed in itertools.groupby(peers.runs, key=lambda run: bisect.bisect(starts, run.start)):
-        inside, start = Peers(tuple(listed)), starts[end - 1]
+        inside, start = PeerIndices(tuple(listed)), starts[end - 1]
         name = exchange.groups[end - 1]
         if len(inside) < starts[end] - start:
             more = ["…"] if len(inside) > MOST_NAMED else []
@@ -194,30 +198,30 @@ def group_name(peers: Peers, exchange: Exchange) -> str:
     return "+".join(names)
 
 
-def used_ways(schedules: Iterable[Schedule]) -> tuple[Way, ...]:
+def used_ways(schedules: Iterable[Schedule]) -> tuple[CouplingTerm, ...]:
     """Return every way on which something is heard, in order."""
     return tuple(sorted({heard.way for schedule in schedules for heard in schedule.heard}))
 
 
-def states_of(schedule: Schedule, site: SiteJacobians) -> int:
+def states_of(schedule: Schedule, site: SubsystemJacobians) -> int:
     """Return how many states a peer keeps from frame to frame."""
     return len(site.kind.states) + len(schedule.carried) + sum(schedule.depths)
 
 
-def check_size(sites: Sequence[SiteJacobians], exchange: Exchange) -> None:
+def check_size(sites: Sequence[SubsystemJacobians], exchange: CommunicationGraph) -> None:
     """Refuse more different peers than are worth an object each."""
     states = sum(len(site.kind.states) for site in sites)
     if states > MOST_STATES:
         raise too_large(exchange, f"{len(sites):,} different peers", states)
 
 
-def too_large(exchange: Exchange, what: str, states: int, *, auto: bool = False) -> ApcError:
+def too_large(exchange: CommunicationGraph, what: str, states: int, *, auto: bool = False) -> ApcError:
     """Return the refusal of a system of too many states, by the method `auto` or one that it may spare."""
     spared = "" if auto else "; apc analyze --method auto needs no such matrix of linear ones"
     return ApcError(
-        Mistake(
+        Diagnostic(
             "E804",
-            Place(exchange.scene),
+            SourceLocation(exchange.scene),
             f"{what} make one system of {states:,} states; the matrix of one may have {MOST_STATES:,}",
             hint=f"fewer peers that differ{spared}",
         )
@@ -229,7 +233,7 @@ def too_large(exchange: Exchange, what: str, states: int, *, auto: bool = False)
 MOST_DIFFERENT = 400
 
 
-def peer_groups(instance: Instance) -> tuple[PeerGroup, ...]:
+def peer_groups(instance: Instance) -> tuple[PeerClass, ...]:
     """Find the groups of equal peers of a system, linearize each once.
 
     Raises
@@ -248,12 +252,12 @@ def peer_groups(instance: Instance) -> tuple[PeerGroup, ...]:
         ) from None
 
 
-def _peer_groups(instance: Instance) -> tuple[PeerGroup, ...]:
+def _peer_groups(instance: Instance) -> tuple[PeerClass, ...]:
     """Group peers of equal matrices; where the start matters, those that start alike among such others."""
     exchange = instance.exchange
     by_matrices = all(site.parameters_suffice for site in instance.sites)
     classes = _classes(instance, by_matrices=True) if by_matrices else start_classes(instance)
-    heard: list[tuple[Listening | None, Gains]] = [(None, {})] * len(classes)
+    heard: list[tuple[InitialReception | None, Gains]] = [(None, {})] * len(classes)
     places = list(range(len(classes)))
     if not by_matrices:
         starting = StartClasses(instance, classes)
@@ -267,7 +271,7 @@ def _peer_groups(instance: Instance) -> tuple[PeerGroup, ...]:
     )
 
 
-def start_classes(instance: Instance) -> list[Peers]:
+def start_classes(instance: Instance) -> list[PeerIndices]:
     """Return the peers in classes of equal start values that receive from the same peers.
 
     Raises
@@ -280,16 +284,18 @@ def start_classes(instance: Instance) -> list[Peers]:
     links = {way.link for way in used_ways(instance.schedules)}
     if not all(map(exchange.is_complete, links)):  # the senders may differ from peer to peer
         each = itertools.islice(itertools.chain.from_iterable(classes), MOST_DIFFERENT + 1)
-        classes = [Peers((range(peer, peer + 1),)) for peer in each]
+        classes = [PeerIndices((range(peer, peer + 1),)) for peer in each]
     if len(classes) > MOST_DIFFERENT:
         what = f"more than {MOST_DIFFERENT} peers that differ, in their place in a graph or at the start,"
-        raise ApcError(Mistake("E804", Place(exchange.scene), f"{what} can't be linearized pair by pair"))
+        raise ApcError(
+            Diagnostic("E804", SourceLocation(exchange.scene), f"{what} can't be linearized pair by pair")
+        )
     return sorted(classes, key=lambda peers: peers.first)
 
 
 def _merged(
-    starting: StartClasses, heard: Sequence[tuple[Listening, Gains]], classes: Sequence[Peers]
-) -> tuple[list[int], list[Peers]]:
+    starting: StartClasses, heard: Sequence[tuple[InitialReception, Gains]], classes: Sequence[PeerIndices]
+) -> tuple[list[int], list[PeerIndices]]:
     """Return the classes that start alike joined: the place of the first of each, and all its peers."""
     alike = all(len(gain) == 1 for _, gains in heard for gain in gains.values())
     members: dict[tuple[Any, ...], list[int]] = {}
@@ -308,12 +314,12 @@ def _merged(
     ]
 
 
-def _joined(runs: Iterable[range]) -> Peers:
+def _joined(runs: Iterable[range]) -> PeerIndices:
     """Return the peers of some runs, in order."""
-    return Peers(tuple(sorted(runs, key=lambda run: run.start)))
+    return PeerIndices(tuple(sorted(runs, key=lambda run: run.start)))
 
 
-def _classes(instance: Instance, *, by_matrices: bool) -> list[Peers]:
+def _classes(instance: Instance, *, by_matrices: bool) -> list[PeerIndices]:
     """Return the peers of equal matrices, or of equal numbers, that have the same kind and role."""
     numbers, exchange = instance.numbers, instance.exchange
     classes: dict[tuple[int, int, bytes], list[range]] = {}
@@ -330,7 +336,7 @@ def _classes(instance: Instance, *, by_matrices: bool) -> list[Peers]:
         listed = list(number)
         for first, end in zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True):
             classes.setdefault(listed[of_peer[first]], []).append(range(start + first, start + end))
-    return [Peers(tuple(runs)) for runs in classes.values()]
+    return [PeerIndices(tuple(runs)) for runs in classes.values()]
 
 
 def more_differ(instance: Instance, states: int) -> bool:
@@ -343,7 +349,7 @@ def more_differ(instance: Instance, states: int) -> bool:
     return len(_classes(instance, by_matrices=True)) > max(1, states // max(sizes))
 
 
-def representatives(instance: Instance) -> list[PeerGroup]:
+def representatives(instance: Instance) -> list[PeerClass]:
     """Return the first peer of each group of the scene, as many as there are peers in it."""
     runs = itertools.pairwise(instance.exchange.starts.tolist())
-    return [build_group(instance, place, Peers((range(*run),))) for place, run in enumerate(runs)]
+    return [build_group(instance, place, PeerIndices((range(*run),))) for place, run in enumerate(runs)]

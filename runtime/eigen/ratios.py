@@ -16,9 +16,9 @@ from typing import Any
 import flint
 
 from apc.frame.exact import evaluate_exact
-from apc.frame.jacobians import SiteJacobians
+from apc.frame.jacobians import SubsystemJacobians
 from apc.frame.linearize import site_of_entries
-from apc.frame.site import LinearSite
+from apc.frame.site import LinearSubsystem
 
 # Terms a numerator or denominator may have: products of many parameters grow without end.
 MOST_TERMS = 2000
@@ -147,7 +147,7 @@ class Ratio:
         return float(self.constant())
 
 
-def open_site(built: SiteJacobians, vector: Sequence[Any]) -> LinearSite:
+def open_site(built: SubsystemJacobians, vector: Sequence[Any]) -> LinearSubsystem:
     """Return the matrices of a site that follow from its parameters (n_p,), some of them open.
 
     Raises

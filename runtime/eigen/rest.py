@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.words import with_unit
-from apc.eigen.peers import PeerGroup
+from apc.eigen.peers import PeerClass
 from apc.frame.linearize import start_values
 
 # Of the size of what adds up to a rate, what may be left of it where all of it balances.
@@ -27,7 +27,7 @@ ROUNDED = 1e-12
 FORCES = ("N", "N*m")
 
 
-def unrest(groups: Sequence[PeerGroup]) -> str:
+def unrest(groups: Sequence[PeerClass]) -> str:
     """Say what is not at rest at the start: the largest force that nothing balances, "" where all balances.
 
     Without one it is the largest torque, and else a rate that is not 0.
@@ -49,7 +49,7 @@ def unrest(groups: Sequence[PeerGroup]) -> str:
     return ""
 
 
-def _moved(group: PeerGroup, *, named: bool) -> list[tuple[float, str, str]]:
+def _moved(group: PeerClass, *, named: bool) -> list[tuple[float, str, str]]:
     """Return what is not at rest: the force and its part, or by how much a state changes in a second.
 
     The force is that of a hold that changes the state as fast.

@@ -1,7 +1,7 @@
 """The motions that nothing holds back, found in exact arithmetic.
 
-Takes: a `ClosedSystem`, or a `Loop` whose matrix was never built.
-Gives: `RigidModes`, `find_rigid_modes`, `rigid_modes_of`; `Standing`, `what_stands`; `stays_rigid`.
+Takes: a `ClosedLoop`, or a `ModalSystem` whose matrix was never built.
+Gives: `RigidModes`, `find_rigid_modes`, `rigid_modes_of`; `NeutralModes`, `what_stands`; `stays_rigid`.
 Guarantees: found from the equations with the parameters as exact rationals, never from an eigenvalue near 1;
 a stiffness of exactly zero frees what it held.
 Does not: find a motion that only repeats from frame to frame without standing still in between, or chains of
@@ -31,11 +31,11 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import ANGLES, LENGTH
 from apc.eigen.balls import BALLS, closed_frame, frame_steps
-from apc.eigen.closing import ClosedSystem, Loop
+from apc.eigen.closing import ClosedLoop, ModalSystem
 from apc.eigen.enclosure import misses_an_eigenvalue
 from apc.eigen.null_space import null_space, null_space_modulo, residue
-from apc.eigen.peers import PeerGroup, states_of
-from apc.frame.site import LinearSite, entrywise
+from apc.eigen.peers import PeerClass, states_of
+from apc.frame.site import LinearSubsystem, entrywise
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]  # of fractions, quotients of polynomials, or flint.fmpq; 0 and 1 may be whole numbers
@@ -63,7 +63,7 @@ class RigidModes:
         return len(self.exact) - len(self.names)
 
 
-def find_rigid_modes(system: ClosedSystem | Loop, *, with_drifts: bool = True) -> RigidModes:
+def find_rigid_modes(system: ClosedLoop | ModalSystem, *, with_drifts: bool = True) -> RigidModes:
     """Find the rigid modes of a closed system and the drifts among them, in exact rationals.
 
     Parameters
@@ -86,7 +86,7 @@ def find_rigid_modes(system: ClosedSystem | Loop, *, with_drifts: bool = True) -
     )
 
 
-def rigid_modes_of(system: ClosedSystem) -> RigidModes:
+def rigid_modes_of(system: ClosedLoop) -> RigidModes:
     """Return the rigid modes of a system whose matrix is that of its sites' numbers, without drifts.
 
     Where the matrix tells that 1 is none of its eigenvalues there are none, and none are looked for.
@@ -97,7 +97,7 @@ def rigid_modes_of(system: ClosedSystem) -> RigidModes:
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class NeutralModes:
     """What neither grows nor dies out: `translations` and `rotations`, which turn something, `drifts` among
     them, and the rest.
 
@@ -112,7 +112,7 @@ class Standing:
     names: tuple[str, ...]
 
 
-def what_stands(system: ClosedSystem | Loop, *, with_drifts: bool = True) -> Standing:
+def what_stands(system: ClosedLoop | ModalSystem, *, with_drifts: bool = True) -> NeutralModes:
     """Tell the rigid modes that move something from those that do not.
 
     Something moves where a length or an angle does that changes between the ticks. What a memory that nothing
@@ -138,7 +138,7 @@ def what_stands(system: ClosedSystem | Loop, *, with_drifts: bool = True) -> Sta
     pairs = _echelon(standing, moving)
     pivots = [pivot for pivot, _ in pairs if pivot in moving]
     unfelt = [row for _, row in pairs[len(pivots) :]]
-    return Standing(
+    return NeutralModes(
         translations=sum(pivot not in turning for pivot in pivots),
         rotations=sum(pivot in turning for pivot in pivots),
         drifts=drifts,
@@ -171,7 +171,7 @@ def _shifted(names: Sequence[str], vector: Sequence[Fraction]) -> str:
     return f"the common shift of {', '.join([*listed[:MOST_NAMED], *more])}"
 
 
-def _places(sites: Sequence[PeerGroup], units: Sequence[str]) -> list[int]:
+def _places(sites: Sequence[PeerClass], units: Sequence[str]) -> list[int]:
     """Return the places in the state of what changes between the ticks and has one of some units."""
     numbers, start = [], 0
     ends = [states_of(group.schedule, group.jacobians) for group in sites]
@@ -182,7 +182,7 @@ def _places(sites: Sequence[PeerGroup], units: Sequence[str]) -> list[int]:
     return numbers
 
 
-def stays_rigid(system: ClosedSystem | Loop, others: Sequence[LinearSite]) -> bool:
+def stays_rigid(system: ClosedLoop | ModalSystem, others: Sequence[LinearSubsystem]) -> bool:
     """Say whether the directions of a system's rigid modes are rigid with other matrices of its sites, too.
 
     Parameters
@@ -207,7 +207,7 @@ def stays_rigid(system: ClosedSystem | Loop, others: Sequence[LinearSite]) -> bo
     return True
 
 
-def _standing_solutions(system: ClosedSystem | Loop) -> list[tuple[list[Fraction], list[Fraction]]]:
+def _standing_solutions(system: ClosedLoop | ModalSystem) -> list[tuple[list[Fraction], list[Fraction]]]:
     """Return the standing solutions whose states are independent, each with its state.
 
     An output nobody reads may be free without being part of the state.
@@ -230,7 +230,7 @@ def _times(matrix: Matrix, vector: Sequence[Fraction]) -> list[Fraction]:
     ]
 
 
-def _standing(system: ClosedSystem | Loop, sites: Sequence[LinearSite]) -> tuple[Matrix, Matrix]:
+def _standing(system: ClosedLoop | ModalSystem, sites: Sequence[LinearSubsystem]) -> tuple[Matrix, Matrix]:
     """Return what must vanish of a constant solution, and the closed state that belongs to it.
 
     Both are matrices over the unknowns: every site's states, then the outputs of its clocks.
@@ -295,7 +295,7 @@ def _placed(size: int, rows: int, *blocks: tuple[Sequence[int], Matrix]) -> Matr
 
 
 def _drifts(
-    system: ClosedSystem | Loop, standing: Sequence[Sequence[Fraction]]
+    system: ClosedLoop | ModalSystem, standing: Sequence[Sequence[Fraction]]
 ) -> list[tuple[list[Fraction], list[Fraction]]]:
     """Return the ramps on top of standing states: of each the weights of these in its rate, and its state.
 
@@ -324,7 +324,7 @@ def _drifts(
 
 
 def _ramp_equations(
-    system: ClosedSystem | Loop,
+    system: ClosedLoop | ModalSystem,
     standing: Sequence[Sequence[Fraction]],
     unknowns: Matrix,
     number: Callable[[Fraction], Any],

@@ -1,7 +1,7 @@
 """Eigenvalues with error bounds, and the verdict.
 
-Takes: the `ClosedSystem`s that make up a whole.
-Gives: `Mode`, `Motion`, `Spectrum`, `solve_spectrum`, `mode_near`; `whole_vectors`, `angles_in_frame`,
+Takes: the `ClosedLoop`s that make up a whole.
+Gives: `Mode`, `ModeMotion`, `Spectrum`, `solve_spectrum`, `mode_near`; `whole_vectors`, `angles_in_frame`,
 `oscillation`, `finite`.
 Guarantees: rigid modes are removed before any eigenvalue is computed; every reported error bounds what
 rounding did since the site's coefficients. What floats leave open is proved in balls where that can be (see
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from apc.eigen.balls import unprovable
 from apc.eigen.certify import MOST_PROVED, prove
-from apc.eigen.closing import ClosedSystem
+from apc.eigen.closing import ClosedLoop
 from apc.eigen.eigenpairs import Eigenpairs, components, pairs_to
 from apc.eigen.enclosure import SMALL, WIDE, Enclosure, descending, discs, enclose_eigenvalues
 from apc.eigen.relative import Relative, relative_bounded, relative_coordinates
@@ -31,7 +31,7 @@ from apc.frame.course import turns
 from apc.frame.radius import UNIT
 from apc.frame.schedule import Propagate
 from apc.frame.site import every_matrix
-from apc.later import Later
+from apc.later import LazyTuple
 from apc.threads import single_threaded
 
 Floats = NDArray[np.float64]
@@ -64,7 +64,7 @@ LEAST_SHARE = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class ModeMotion:
     """What a mode does inside a frame, and which states do it.
 
     `frequency_hz` and `damping_ratio` belong to s = log(eigenvalue)/frame on the branch the motion takes
@@ -82,7 +82,7 @@ class Mode:
     """One eigenvalue of the whole system's frame map, held `multiplicity` times.
 
     `magnitude` is per frame; `error` bounds |eigenvalue − truth|. `shape` is the system the mode belongs to.
-    `motion` is one `Motion`: of a large system it is dear, and made for the modes that are looked at.
+    `motion` is one `ModeMotion`: of a large system it is dear, and made for the modes that are looked at.
     """
 
     eigenvalue: complex
@@ -90,21 +90,21 @@ class Mode:
     multiplicity: int
     shape: str
     error: float
-    motion: Sequence[Motion]
+    motion: Sequence[ModeMotion]
 
     @property
     def frequency_hz(self) -> float:
-        """See `Motion`."""
+        """See `ModeMotion`."""
         return self.motion[0].frequency_hz
 
     @property
     def damping_ratio(self) -> float:
-        """See `Motion`."""
+        """See `ModeMotion`."""
         return self.motion[0].damping_ratio
 
     @property
     def participation(self) -> tuple[tuple[str, float], ...]:
-        """See `Motion`."""
+        """See `ModeMotion`."""
         return self.motion[0].participation
 
 
@@ -132,7 +132,7 @@ class Spectrum:
 
 
 def solve_spectrum(
-    systems: Sequence[ClosedSystem], *, certify: bool = False, in_balls: bool = True
+    systems: Sequence[ClosedLoop], *, certify: bool = False, in_balls: bool = True
 ) -> Spectrum:
     """Compute the spectrum of a whole system given as independent closed systems.
 
@@ -181,7 +181,7 @@ def solve_spectrum(
         drifts += system.multiplicity * item.free.drifts
     verdict, stable = judge([item.inside for item in solved], rigid, drifts)
     return Spectrum(
-        modes=Later(functools.partial(_modes, tuple(systems), tuple(solved))),
+        modes=LazyTuple(functools.partial(_modes, tuple(systems), tuple(solved))),
         spectral_radius=radius,
         spectral_radius_error=max(high - radius, radius - low, 0.0),
         rigid_modes=rigid,
@@ -194,14 +194,14 @@ def solve_spectrum(
     )
 
 
-def _beyond(solved: Sequence[_Solved]) -> tuple[float, float] | None:
+def _beyond(solved: Sequence[_SolvedLoop]) -> tuple[float, float] | None:
     if not any(item.bits for item in solved):
         return None
     least, most = map(max, zip(*(item.beyond for item in solved), strict=True))
     return least, most
 
 
-def mode_near(systems: Sequence[ClosedSystem], eigenvalue: complex) -> Mode:
+def mode_near(systems: Sequence[ClosedLoop], eigenvalue: complex) -> Mode:
     """Return the mode of closed systems whose eigenvalue, or its conjugate, is nearest to a value."""
     modes = solve_spectrum(systems, in_balls=False).modes
     value = complex(eigenvalue.real, abs(eigenvalue.imag))
@@ -209,7 +209,7 @@ def mode_near(systems: Sequence[ClosedSystem], eigenvalue: complex) -> Mode:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Solved:
+class _SolvedLoop:
     """One closed system: its eigenvalues, each with its error, and bounds on its spectral radius.
 
     `inside` says whether all its eigenvalues but the rigid ones are inside the unit circle; `bits` with how
@@ -238,12 +238,12 @@ class _Solved:
         return bool((np.abs(self.pairs.values - 1) > self.bounds.errors).all())
 
 
-def _tied(system: ClosedSystem) -> int:
+def _tied(system: ClosedLoop) -> int:
     """Return how many states drive each other at most."""
     return max((len(part) for part in components(~(np.abs(system.matrix) + system.error == 0))), default=0)
 
 
-def _is_open(solved: _Solved, lowest: float) -> bool:
+def _is_open(solved: _SolvedLoop, lowest: float) -> bool:
     """Say whether floats leave something open that decides: the verdict, or the radius of the whole.
 
     `lowest` is what the radius of the whole is at least.
@@ -259,7 +259,7 @@ def _is_open(solved: _Solved, lowest: float) -> bool:
 TO_DRIFT = "to drift"
 
 
-def _proof_in_words(solved: Sequence[_Solved], drifts: int) -> str:
+def _proof_in_words(solved: Sequence[_SolvedLoop], drifts: int) -> str:
     """Say what was proved, "" where floats decided everything."""
     bits = max((item.bits for item in solved), default=0)
     if not bits:
@@ -292,17 +292,17 @@ def up_to(translations: int, rotations: int = 0) -> str:
     return STABLE_TURNING if rotations else STABLE
 
 
-def _solve(system: ClosedSystem, free: RigidModes) -> _Solved:
+def _solve(system: ClosedLoop, free: RigidModes) -> _SolvedLoop:
     """Solve a system in floats, rigid modes taken out."""
     at = relative_coordinates(free.basis)
     matrix, error = relative_bounded(system.matrix, system.error, at)
     pairs, bounds = enclose_eigenvalues(matrix, error)
     inside = False if bounds.low > 1 else True if bounds.high < 1 else None  # NaN decides nothing
     low, high = bounds.low, bounds.high
-    return _Solved(free, at, matrix, pairs, bounds, low, high, inside, 0, (low - 1, high - 1))
+    return _SolvedLoop(free, at, matrix, pairs, bounds, low, high, inside, 0, (low - 1, high - 1))
 
 
-def _prove(system: ClosedSystem, estimate: _Solved) -> _Solved:
+def _prove(system: ClosedLoop, estimate: _SolvedLoop) -> _SolvedLoop:
     """Solve one system in balls; what these leave open stays as floats found it."""
     proof = prove(system, estimate.free)
     if proof.free.drifts != estimate.free.drifts:
@@ -325,7 +325,7 @@ def _prove(system: ClosedSystem, estimate: _Solved) -> _Solved:
     )
 
 
-def _modes(systems: Sequence[ClosedSystem], solved: Sequence[_Solved]) -> tuple[Mode, ...]:
+def _modes(systems: Sequence[ClosedLoop], solved: Sequence[_SolvedLoop]) -> tuple[Mode, ...]:
     """List the eigenvalues of all systems, the largest first; how they move is made when it is looked at."""
     ranked = sorted(
         (-abs(value), system.name, value.real, -value.imag, place, row)
@@ -334,7 +334,7 @@ def _modes(systems: Sequence[ClosedSystem], solved: Sequence[_Solved]) -> tuple[
     )
     modes = []
     for some in (ranked[:LOOKED_AT], ranked[LOOKED_AT:]):
-        motions = Later(functools.partial(_motions, systems, solved, [item[-2:] for item in some]))
+        motions = LazyTuple(functools.partial(_motions, systems, solved, [item[-2:] for item in some]))
         for number, (*_, place, row) in enumerate(some):
             value = complex(solved[place].pairs.values[row])
             modes.append(
@@ -344,21 +344,21 @@ def _modes(systems: Sequence[ClosedSystem], solved: Sequence[_Solved]) -> tuple[
                     multiplicity=systems[place].multiplicity,
                     shape=systems[place].name,
                     error=float(solved[place].bounds.errors[row]),
-                    motion=Later(functools.partial(_one_of, motions, number)),
+                    motion=LazyTuple(functools.partial(_one_of, motions, number)),
                 )
             )
     return tuple(modes)
 
 
-def _one_of(motions: Sequence[Motion], number: int) -> tuple[Motion]:
+def _one_of(motions: Sequence[ModeMotion], number: int) -> tuple[ModeMotion]:
     return (motions[number],)
 
 
 def _motions(
-    systems: Sequence[ClosedSystem], solved: Sequence[_Solved], places: Sequence[tuple[int, int]]
-) -> tuple[Motion, ...]:
+    systems: Sequence[ClosedLoop], solved: Sequence[_SolvedLoop], places: Sequence[tuple[int, int]]
+) -> tuple[ModeMotion, ...]:
     """Describe some eigenvalues, given by their systems and rows."""
-    result: dict[tuple[int, int], Motion] = {}
+    result: dict[tuple[int, int], ModeMotion] = {}
     with single_threaded(), np.errstate(all="ignore"):
         for s, (system, item) in enumerate(zip(systems, solved, strict=True)):
             rows = [row for own, row in places if own == s]
@@ -368,7 +368,7 @@ def _motions(
     return tuple(result[place] for place in places)
 
 
-def _described(system: ClosedSystem, solved: _Solved, rows: Integers) -> list[Motion]:
+def _described(system: ClosedLoop, solved: _SolvedLoop, rows: Integers) -> list[ModeMotion]:
     """Describe the eigenvalues of some rows of a system, in their order."""
     pairs = solved.whole.at(rows)
     vectors, shares = whole_vectors(system, solved.at, pairs)
@@ -384,11 +384,11 @@ def _described(system: ClosedSystem, solved: _Solved, rows: Integers) -> list[Mo
         frequency, damping = 0.0, 1.0
         if not ends or math.isnan(angle):
             frequency, damping = oscillation(size, angle, system.frame_s)
-        motions.append(Motion(frequency, damping, tuple(zip(system.names, taking, strict=True))))
+        motions.append(ModeMotion(frequency, damping, tuple(zip(system.names, taking, strict=True))))
     return motions
 
 
-def _ticks(system: ClosedSystem) -> bool:
+def _ticks(system: ClosedLoop) -> bool:
     """Say whether anything but the exact exponential makes the frame's map, as far as that is known."""
     return not system.sites or any(
         not isinstance(event, Propagate) for group in system.sites for event in group.schedule.events
@@ -396,7 +396,7 @@ def _ticks(system: ClosedSystem) -> bool:
 
 
 def whole_vectors(
-    system: ClosedSystem,
+    system: ClosedLoop,
     at: Relative,
     pairs: Eigenpairs,
 ) -> tuple[Complexes, Floats]:
@@ -447,7 +447,7 @@ def finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def angles_in_frame(system: ClosedSystem, values: Complexes, vectors: Complexes, shares: Floats) -> Floats:
+def angles_in_frame(system: ClosedLoop, values: Complexes, vectors: Complexes, shares: Floats) -> Floats:
     """Return by how much modes turn in a frame (k,), in radians, with whole turns; NaN if it can't be told.
 
     The eigenvalue knows the angle up to whole turns; these are counted on the continuous state that takes

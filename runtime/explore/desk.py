@@ -17,7 +17,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 
-from apc.compiler.errors import Mistake, Place
+from apc.compiler.errors import Diagnostic, SourceLocation
 from apc.explore.sections import SectionAnswer, Task, compute
 from apc.processes import Workers, local_processes
 
@@ -29,7 +29,9 @@ HELD = 0.2
 # Seconds that a browser has for drawing an answer before there is more to do.
 DRAWN = 0.05
 
-LOST = Mistake("E981", Place("explore"), "the process that computes ended without a word: too little memory?")
+LOST = Diagnostic(
+    "E981", SourceLocation("explore"), "the process that computes ended without a word: too little memory?"
+)
 
 # Is told a section, and what it has to show.
 Deliver = Callable[[str, SectionAnswer], None]

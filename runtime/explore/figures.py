@@ -1,7 +1,7 @@
 """The figures of the page, and the words beside them.
 
 Takes: what `sections` tell.
-Gives: `Words`; `RegionFigure`, `RootsFigure`, `MotionFigure`, `FeelFigure`; `FOCUS`.
+Gives: `LiveText`; `RegionFigure`, `RootsFigure`, `MotionFigure`, `FeelFigure`; `FOCUS`.
 Guarantees: what a figure shows stands beside it in words, for whoever does not see it; nothing is told by
 colour alone.
 Does not: compute, or know sliders.
@@ -27,7 +27,7 @@ from bokeh.models import (
 from bokeh.plotting import figure
 
 from apc.compiler.words import counted
-from apc.explore.motion import MM, ROWS, Motion
+from apc.explore.motion import MM, ROWS, AnimationFrames
 from apc.present.forms import Plain, axis_label
 
 # Colours that are distinct in print and for colour-blind eyes: Okabe and Ito, 2008, the lightest two of them
@@ -124,7 +124,7 @@ def _legend_below(plot: Any) -> None:
     plot.add_layout(legend, "above")
 
 
-class Words:
+class LiveText:
     """A text of the page, which is read aloud when it changes."""
 
     def __init__(self, name: str) -> None:
@@ -191,7 +191,7 @@ class RegionFigure:
             legend_label="the sliders",
         )
         _legend_below(self.plot)
-        self.words = Words("region-words")
+        self.words = LiveText("region-words")
 
     def show(self, result: Plain) -> None:
         """Draw a region."""
@@ -261,7 +261,7 @@ class RootsFigure:
         # As wide as high: a circle is one.
         self.plot.update(sizing_mode="fixed", width=HEIGHT + 30, height=HEIGHT + 30)
         _legend_below(self.plot)
-        self.words, self.way_words = Words("roots-words"), Words("way-words")
+        self.words, self.way_words = LiveText("roots-words"), LiveText("way-words")
         self.way_words.say("Move a slider: dots show the way the eigenvalues take.")
 
     def show(self, result: Plain) -> None:
@@ -365,9 +365,9 @@ class MotionFigure:
         self.play.js_on_change(
             "active", CustomJS(args={"slider": self.time, "frames": self.frames}, code=PLAYING)
         )
-        self.words = Words("motion-words")
+        self.words = LiveText("motion-words")
 
-    def show(self, motion: Motion) -> None:
+    def show(self, motion: AnimationFrames) -> None:
         """Draw a motion, and put the bodies where they are at the time that is shown."""
         self._visible(True)
         peers, names = (
@@ -473,7 +473,7 @@ class FeelFigure:
             plot.add_tools(HoverTool(tooltips=[("Hz", "@frequency"), (column, f"@{column}")], mode="vline"))
         self.phase.yaxis.ticker = [-180, -90, 0, 90, 180]
         self.plot.yaxis.minor_tick_line_color = None  # over less than a decade they lie on each other
-        self.words = Words("feel-words")
+        self.words = LiveText("feel-words")
 
     def show(self, result: Plain) -> None:
         """Draw what is felt."""

@@ -1,7 +1,7 @@
 """A scene played for the page: a push and what follows of it, and the bodies that move.
 
-Takes: a `CompiledSystem`.
-Gives: `Motion`, `motion_of`.
+Takes: a `Model`.
+Gives: `AnimationFrames`, `motion_of`.
 Guarantees: rows are those of `simulation`, some of them left out where more are not seen; what grows without
 end is shown until it has left the picture, and says so.
 Does not: draw.
@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
-from apc.present.bodies import Body, Disc, heading, moves_in_plane, views_of
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
+from apc.present.bodies import Disc, DrawnBody, heading, moves_in_plane, views_of
 from apc.simulation.strike import WATCHED, impulse_text, strike
 from apc.simulation.trajectory import simulate
 
@@ -30,7 +30,7 @@ MM = 1e3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Motion:
+class AnimationFrames:
     """What is seen of a scene: times (rows,) in s, n bodies, and what stands still: (row, mm), or discs.
 
     `x`, `y` and `angle` (rows, n) are where each body is, in mm and rad; `y` is None where all move along
@@ -39,7 +39,7 @@ class Motion:
     """
 
     time: Floats
-    bodies: tuple[tuple[str, Body], ...]
+    bodies: tuple[tuple[str, DrawnBody], ...]
     x: Floats
     y: Floats | None
     angle: Floats
@@ -49,7 +49,7 @@ class Motion:
     others: int
 
 
-def motion_of(system: CompiledSystem, *, struck: bool) -> Motion:
+def motion_of(system: Model, *, struck: bool) -> AnimationFrames:
     """Play a scene: as it begins, or with the first peer's device struck besides.
 
     Parameters
@@ -76,7 +76,9 @@ def motion_of(system: CompiledSystem, *, struck: bool) -> Motion:
         for peer, body in shown
     ]
     if not names:
-        raise ApcError(Mistake("E983", Place(system.name), "nothing here has a position that could be shown"))
+        raise ApcError(
+            Diagnostic("E983", SourceLocation(system.name), "nothing here has a position that could be shown")
+        )
     duration = system.experiment.duration or WATCHED
     played = simulate(system, duration=duration, signals=[text for name in names for text in name])
     values, time = played.values, played.time
@@ -93,7 +95,7 @@ def motion_of(system: CompiledSystem, *, struck: bool) -> Motion:
     angle = np.stack([heading(track[:, 2:]) for track in tracks], axis=1)
     fixed = [(row, surface) for row, view in enumerate(views) for surface in view.surfaces]
     remarks.append(f"Motion: {played.summary.verdict}.")
-    return Motion(
+    return AnimationFrames(
         time=time[texts],
         bodies=shown,
         x=MM * x,

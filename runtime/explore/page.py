@@ -1,7 +1,7 @@
 """The page: sliders to the left, and beside them what follows, redrawn as they move.
 
 Takes: a compiled model; a Bokeh document, one a tab.
-Gives: `Scene`, `scene_of`, `open_page`.
+Gives: `SharedState`, `scene_of`, `open_page`.
 Guarantees: whatever a slider says is what is computed, and what it can't say changes nothing; nothing is
 computed on the thread that serves the page; the link holds the values of the sliders that were moved, and a
 link with values opens with them.
@@ -24,11 +24,11 @@ from bokeh.layouts import column, row
 from bokeh.models import Button, ColumnDataSource, CustomJS, CustomJSTickFormatter, Div, Select
 from bokeh.models import Slider as Handle
 
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.distribution import program_version
 from apc.explore.desk import Desk
-from apc.explore.figures import FOCUS, FeelFigure, MotionFigure, RegionFigure, RootsFigure, Words
+from apc.explore.figures import FOCUS, FeelFigure, LiveText, MotionFigure, RegionFigure, RootsFigure
 from apc.explore.sections import SectionAnswer, Task
 from apc.explore.server import TOKEN
 from apc.explore.sliders import (
@@ -130,20 +130,20 @@ whole.toBlob(blob => {
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scene:
+class SharedState:
     """What all tabs share: the scene, its bytes for those who compute, its sliders, what they are set to.
 
     `text` is the topology, None where there is only a compiled model.
     """
 
-    system: CompiledSystem
+    system: Model
     model: bytes
     sliders: tuple[Slider, ...]
     settings: tuple[str, ...]
     text: str | None
 
 
-def scene_of(system: CompiledSystem, settings: Sequence[str], text: str | None) -> Scene:
+def scene_of(system: Model, settings: Sequence[str], text: str | None) -> SharedState:
     """Return what the tabs of a scene share.
 
     Parameters
@@ -163,28 +163,32 @@ def scene_of(system: CompiledSystem, settings: Sequence[str], text: str | None) 
     sliders = sliders_of(system)
     pairs = [set_to(system, sliders, setting) for setting in settings]
     apply(system, [Override(sliders[place].free, value) for place, value in pairs])
-    return Scene(system, model_bytes(system), sliders, tuple(settings), text)
+    return SharedState(system, model_bytes(system), sliders, tuple(settings), text)
 
 
-def open_page(scene: Scene, document: Document) -> None:
+def open_page(scene: SharedState, document: Document) -> None:
     """Fill the document of a new tab."""
-    Page(scene, document)
+    TopologyTab(scene, document)
 
 
-class Page:
+class TopologyTab:
     """One tab: its sliders and where they are, its figures, and who computes for it."""
 
-    def __init__(self, scene: Scene, document: Document) -> None:
+    def __init__(self, scene: SharedState, document: Document) -> None:
         self.scene, self.system, self.document = scene, scene.system, document
         self.sliders, self.places = list(scene.sliders), [slider.start for slider in scene.sliders]
         self.chosen = self._axes_at_first()
-        self.message = Words("message")
+        self.message = LiveText("message")
         self.message.model.text = ""
         for setting in scene.settings:
             self._start_at(setting)
         self._take_link(document.session_context.request.arguments)
-        self.verdict, self.margins, self.network = Words("verdict"), Words("margins"), Words("network")
-        self.tuned = Words("tuned")
+        self.verdict, self.margins, self.network = (
+            LiveText("verdict"),
+            LiveText("margins"),
+            LiveText("network"),
+        )
+        self.tuned = LiveText("tuned")
         self.region, self.roots = RegionFigure(), RootsFigure()
         self.motion, self.feel = MotionFigure(), FeelFigure()
         self.modes: Plain | None = None  # of the newest verdict
@@ -563,7 +567,7 @@ class Page:
             case _:
                 self._words(section).table(result["text"])
 
-    def _words(self, section: str) -> Words:
+    def _words(self, section: str) -> LiveText:
         words = {"verdict": self.verdict, "roots": self.roots.way_words}
         words |= {"margins": self.margins, "network": self.network, "tune": self.tuned}
         return words.get(section, self.message)

@@ -18,15 +18,15 @@ from typing import Any
 import numpy as np
 
 from apc.analysis.analysis import Analysis, analyze, prepare_at_start
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.words import in_hertz
 from apc.eigen.spectrum import Mode
 from apc.explore.motion import motion_of
 from apc.explore.sliders import text_of
 from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, prepare
-from apc.frame.names import Free, Range, unit_of
+from apc.frame.names import ParameterRef, Range, unit_of
 from apc.frame.overrides import Override, apply
 from apc.hands.answers import held_names
 from apc.hands.asked import read_frequencies
@@ -71,7 +71,7 @@ class SectionAnswer:
 
 
 @lru_cache(maxsize=1)
-def _opened(model: bytes) -> tuple[CompiledSystem, Prepared]:
+def _opened(model: bytes) -> tuple[Model, Prepared]:
     """Return the scene of a page, and what all its analyses share."""
     system = model_of_bytes(model)
     return system, prepare(system)
@@ -101,7 +101,7 @@ def compute(model: bytes, task: Task) -> SectionAnswer:
         )
 
 
-def _verdict(system: CompiledSystem, prepared: Prepared, _: None) -> Plain:
+def _verdict(system: Model, prepared: Prepared, _: None) -> Plain:
     analysis = analyze(system, prepared=prepared)
     values = np.array([mode.eigenvalue for mode in analysis.modes], dtype=np.complex128)
     return {
@@ -136,7 +136,7 @@ def _limits(analysis: Analysis) -> str:
     return f"{_named(leading)[0].upper()}{_named(leading)[1:]} {changes}, {times}: mostly {moves}."
 
 
-def _region(system: CompiledSystem, prepared: Prepared, asked: tuple[Range, Range, str]) -> Plain:
+def _region(system: Model, prepared: Prepared, asked: tuple[Range, Range, str]) -> Plain:
     x, y, criterion = asked
     result = region(system, (x, y), tolerance=DRAWN, criterion=criterion, prepared=prepared)
     return {
@@ -150,7 +150,7 @@ def _region(system: CompiledSystem, prepared: Prepared, asked: tuple[Range, Rang
     }
 
 
-def _roots(system: CompiledSystem, prepared: Prepared, asked: tuple[Free, tuple[Fraction, ...]]) -> Plain:
+def _roots(system: Model, prepared: Prepared, asked: tuple[ParameterRef, tuple[Fraction, ...]]) -> Plain:
     """Return the eigenvalues at values of a slider."""
     free, values = asked
     slow = reaches_time(system, free) or reaches_count(system, free)
@@ -175,11 +175,11 @@ def _thinned(values: Sequence[Fraction], most: int) -> list[Fraction]:
     return [values[place] for place in places.tolist()]
 
 
-def _margins(system: CompiledSystem, prepared: Prepared, _: None) -> Plain:
+def _margins(system: Model, prepared: Prepared, _: None) -> Plain:
     return {"text": str(margins(system, prepared=prepared, quick=True))}
 
 
-def _tune(system: CompiledSystem, _: Prepared, asked: tuple[tuple[str, ...], str]) -> Plain:
+def _tune(system: Model, _: Prepared, asked: tuple[tuple[str, ...], str]) -> Plain:
     """Return the best of the gains that the scene's `studies: tune:` frees, or else of those asked for."""
     free, best = asked
     held, criterion = held_as_studied(system)
@@ -187,11 +187,11 @@ def _tune(system: CompiledSystem, _: Prepared, asked: tuple[tuple[str, ...], str
     return {"text": str(tune(held, demands))}
 
 
-def _motion(system: CompiledSystem, _: Prepared, struck: bool) -> Plain:
+def _motion(system: Model, _: Prepared, struck: bool) -> Plain:
     return {"motion": motion_of(system, struck=struck)}
 
 
-def _feel(system: CompiledSystem, prepared: Prepared, at: str) -> Plain:
+def _feel(system: Model, prepared: Prepared, at: str) -> Plain:
     """Return what is felt at a device, the first there is if it isn't said, and what else may be held."""
     frequencies = read_frequencies(system, None, LOWEST, None, FREQUENCIES)
     names = held_names(system, prepared)
@@ -206,14 +206,14 @@ def _feel(system: CompiledSystem, prepared: Prepared, at: str) -> Plain:
     }
 
 
-def _network(system: CompiledSystem, prepared: Prepared, _: None) -> Plain:
+def _network(system: Model, prepared: Prepared, _: None) -> Plain:
     """Return the verdict over the network, and the loss and the jitter of each link at which it changes."""
     links = [link for link in system.links if link.channel is not None]
     if not links:
         name = system.links[0].name if system.links else "lan"
         what = "no link here loses packets or delays them by chance: there is nothing to look for"
         write = f"To look, write in the topology: links: {{{name}: {{…, loss: 1 %, jitter: 1 ms}}}}"
-        raise ApcError(Mistake("E984", Place(system.name), f"{what}. {write}"))
+        raise ApcError(Diagnostic("E984", SourceLocation(system.name), f"{what}. {write}"))
     verdict = judge_network(system, prepared)
     texts = ["Here packets are always on time." if verdict is None else str(verdict)]
     for link in links:
@@ -224,14 +224,14 @@ def _network(system: CompiledSystem, prepared: Prepared, _: None) -> Plain:
     return {"text": "\n\n".join(texts)}
 
 
-def _critical(system: CompiledSystem, name: str) -> str:
+def _critical(system: Model, name: str) -> str:
     try:
         return str(critical(system, name, criterion=MEAN_SQUARE))
     except ApcError as error:
         return f"{name}: {error.mistakes[0].reason}"
 
 
-def _numbers(system: CompiledSystem, prepared: Prepared, asked: tuple[Range, Range, str] | None) -> Plain:
+def _numbers(system: Model, prepared: Prepared, asked: tuple[Range, Range, str] | None) -> Plain:
     """Return what is downloaded: the analysis and the region as `--json` prints them."""
     document = {"analyze": analyze(system, prepared=prepared).to_dict()}
     if asked is not None:
@@ -240,7 +240,7 @@ def _numbers(system: CompiledSystem, prepared: Prepared, asked: tuple[Range, Ran
     return document
 
 
-SECTIONS: dict[str, Callable[[CompiledSystem, Prepared, Any], Plain]] = {
+SECTIONS: dict[str, Callable[[Model, Prepared, Any], Plain]] = {
     "verdict": _verdict,
     "region": _region,
     "roots": _roots,

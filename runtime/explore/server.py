@@ -38,7 +38,7 @@ from tornado.httpserver import HTTPServer
 from tornado.ioloop import IOLoop
 from tornado.web import HTTPError
 
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 
 HOST = "127.0.0.1"
 TOKEN = "token"  # the argument of the link that holds it
@@ -145,7 +145,9 @@ def bound(make: Callable[[Document], None], port: int) -> tuple[BaseServer, str]
     except OSError as error:
         why = {errno.EADDRINUSE: "is taken", errno.EACCES: "may not be taken by you"}
         what = f"port {port} {why.get(error.errno or 0, f'can not be used: {error.strerror}')}"
-        raise ApcError(Mistake("E982", Place("--port"), what, hint="--port 0  (any that is free)")) from None
+        raise ApcError(
+            Diagnostic("E982", SourceLocation("--port"), what, hint="--port 0  (any that is free)")
+        ) from None
     token, address = secrets.token_urlsafe(24), f"{HOST}:{port}"
     application = BokehTornado(
         {"/": Application(FunctionHandler(make))},

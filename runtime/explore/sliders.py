@@ -1,6 +1,6 @@
 """Which numbers of a scene have a slider, and the values that each can be set to.
 
-Takes: a `CompiledSystem`.
+Takes: a `Model`.
 Gives: `Slider`, `sliders_of`, `set_to`, `with_value`; `text_of`, `place_of`, `overrides_of`, `axes_of`;
 `is_number`, `is_place`, `is_one_of`.
 Guarantees: every value is an exact rational within the parameter's bounds, and the scene's own is among them;
@@ -18,12 +18,12 @@ from fractions import Fraction
 from math import ceil, floor, lcm, log10
 from typing import Any
 
-from apc.compiler.compiled import CompiledSystem, group_count
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model, group_count
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.words import with_unit
 from apc.frame.display_units import as_shown
 from apc.frame.linearize import start_names
-from apc.frame.names import Free, Range, named_times, parameter_of, times_of, unit_of
+from apc.frame.names import ParameterRef, Range, named_times, parameter_of, times_of, unit_of
 from apc.frame.overrides import Override, parse_override
 from apc.vary.evaluator import free_parameters
 from apc.vary.margins import STIFFNESSES, coupler_parameters
@@ -54,7 +54,7 @@ class Slider:
     where it can't be one.
     """
 
-    free: Free
+    free: ParameterRef
     unit: str
     kind: str
     about: str
@@ -69,7 +69,7 @@ class Slider:
         return self.free.label
 
 
-def sliders_of(system: CompiledSystem) -> tuple[Slider, ...]:
+def sliders_of(system: Model) -> tuple[Slider, ...]:
     """Return the sliders of a scene: what follows from no other number, and each group's number of peers.
 
     Parameters
@@ -100,8 +100,8 @@ def sliders_of(system: CompiledSystem) -> tuple[Slider, ...]:
 
 
 def _slider(
-    system: CompiledSystem,
-    free: Free,
+    system: Model,
+    free: ParameterRef,
     kind: str,
     about: str,
     values: Iterable[Fraction],
@@ -130,7 +130,7 @@ def _is_float(value: Fraction) -> bool:
     return Fraction(repr(float(value))) == value
 
 
-def _bounds(system: CompiledSystem, free: Free) -> tuple[Fraction | None, Fraction | None]:
+def _bounds(system: Model, free: ParameterRef) -> tuple[Fraction | None, Fraction | None]:
     """Return the least and the largest value a parameter may have; above an open bound, a little more."""
     parameter = parameter_of(system, free)
     low = None if parameter.minimum is None else Fraction(repr(parameter.minimum))
@@ -140,7 +140,7 @@ def _bounds(system: CompiledSystem, free: Free) -> tuple[Fraction | None, Fracti
 
 
 def _span(
-    system: CompiledSystem, free: Free, now: Fraction, low: Fraction | None, high: Fraction | None
+    system: Model, free: ParameterRef, now: Fraction, low: Fraction | None, high: Fraction | None
 ) -> tuple[Fraction, Fraction]:
     """Return a range around a value: all that it may be, or to `ROOM` times it, below 0 too if it may."""
     if low is not None and high is not None:
@@ -192,7 +192,7 @@ def _decades(now: Fraction, low: Fraction | None, high: Fraction | None) -> list
     ]
 
 
-def _times(system: CompiledSystem, studied: dict[str, tuple[Fraction, Fraction]]) -> list[Slider]:
+def _times(system: Model, studied: dict[str, tuple[Fraction, Fraction]]) -> list[Slider]:
     """Return the sliders of delays, phases and periods that follow from nothing."""
     periods = {clock.period: clock for clock in system.clocks}
     phases = {clock.phase: clock for clock in system.clocks}
@@ -200,7 +200,7 @@ def _times(system: CompiledSystem, studied: dict[str, tuple[Fraction, Fraction]]
     longest = max((now[name] for name in periods), default=Fraction(1))
     sliders = []
     for timing in named_times(system):
-        free, value = Free(timing.name), timing.value
+        free, value = ParameterRef(timing.name), timing.value
         if timing.formula is not None:
             continue
         span = None
@@ -220,7 +220,7 @@ def _times(system: CompiledSystem, studied: dict[str, tuple[Fraction, Fraction]]
     return sorted(sliders, key=lambda slider: (slider.span is None, slider.free.name in phases))
 
 
-def _about(system: CompiledSystem, name: str) -> str:
+def _about(system: Model, name: str) -> str:
     about = next((parameter.about for parameter in system.parameters if parameter.name == name), "")
     return f"{about}, of all groups" if len(times_of(system, name)) > 1 else about
 
@@ -244,11 +244,11 @@ def _frame(periods: Sequence[Fraction]) -> Fraction:
     return Fraction(lcm(*(int(period * below) for period in periods)), below)
 
 
-def _people(system: CompiledSystem) -> list[Slider]:
+def _people(system: Model) -> list[Slider]:
     """Return the sliders of how many peers groups have, where that is no list of their own numbers."""
     sliders = []
     for group in system.groups:
-        free = Free(group_count(group.name))
+        free = ParameterRef(group_count(group.name))
         parameter = parameter_of(system, free)
         if group.columns or parameter.formula is not None:
             continue
@@ -284,7 +284,7 @@ def place_of(slider: Slider, value: Fraction | float) -> int:
     return min(places, key=lambda place: abs(slider.values[place] - Fraction(value)))
 
 
-def set_to(system: CompiledSystem, sliders: Sequence[Slider], text: str) -> tuple[int, Fraction]:
+def set_to(system: Model, sliders: Sequence[Slider], text: str) -> tuple[int, Fraction]:
     """Return which slider `NAME=QUANTITY` sets, and to what.
 
     Raises
@@ -297,7 +297,7 @@ def set_to(system: CompiledSystem, sliders: Sequence[Slider], text: str) -> tupl
         if slider.free == override.free:
             return place, override.value
     what = f"{override.free.label} has no slider: it follows from other numbers, or differs from peer to peer"
-    raise ApcError(Mistake("E980", Place("explore"), what))
+    raise ApcError(Diagnostic("E980", SourceLocation("explore"), what))
 
 
 def with_value(slider: Slider, value: Fraction) -> tuple[Slider, int]:

@@ -23,13 +23,13 @@ from typing import Any
 import yaml
 
 from apc.analysis.analysis import analyze
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import write_text
 from apc.compiler.language.vectors import whole_and_index
 from apc.compiler.pipeline import compile_again, stages_of
 from apc.compiler.source.source import parse_source
-from apc.frame.names import Free
+from apc.frame.names import ParameterRef
 from apc.frame.overrides import apply, parse_override
 from apc.frame.parameters import columns_of
 from apc.frame.start_checks import check_values
@@ -40,7 +40,7 @@ _PLAIN = re.compile(r"(?:[\w.(][\w .+*/^%()@-]*[\w.)%]|[\w.])?\Z|[-+][\w.(][\w .
 _BLOCK_COMMENT = re.compile(r"[|>][-+0-9]*([ \t]+#[^\r\n]*)")
 
 
-def write_topology(path: Path, text: str, system: CompiledSystem, values: Mapping[Free, str]) -> None:
+def write_topology(path: Path, text: str, system: Model, values: Mapping[ParameterRef, str]) -> None:
     """Write the text of a topology with other values to a file, once it is known to compile to them there.
 
     Parameters
@@ -57,16 +57,16 @@ def write_topology(path: Path, text: str, system: CompiledSystem, values: Mappin
     """
     changed = _changed(text, system, values)
     *_, (_, compiled) = stages_of(parse_source(changed.encode(), file=str(path), path=path))
-    assert isinstance(compiled, CompiledSystem)
+    assert isinstance(compiled, Model)
     check_values(compiled)
-    meant = _check(compiled, system, values, Place(str(path)))
+    meant = _check(compiled, system, values, SourceLocation(str(path)))
     verdicts = [analyze(item).verdict for item in (meant, compiled)]
     if verdicts[0] != verdicts[1]:
-        raise ApcError(Mistake("E997", Place(str(path)), "the topology written", *verdicts))
+        raise ApcError(Diagnostic("E997", SourceLocation(str(path)), "the topology written", *verdicts))
     write_text(path, changed.removesuffix("\n"))
 
 
-def with_values(text: str, system: CompiledSystem, values: Mapping[Free, str]) -> str:
+def with_values(text: str, system: Model, values: Mapping[ParameterRef, str]) -> str:
     """Return the text of a topology with other values.
 
     Parameters
@@ -87,11 +87,11 @@ def with_values(text: str, system: CompiledSystem, values: Mapping[Free, str]) -
     name = system.origin.topology
     texts = tuple((key, changed.encode() if key == name else old) for key, old in system.origin.texts)
     compiled = compile_again(replace(system.origin, texts=texts, changes=()), Path())
-    _check(compiled, system, values, Place(name))
+    _check(compiled, system, values, SourceLocation(name))
     return changed
 
 
-def _changed(text: str, system: CompiledSystem, values: Mapping[Free, str]) -> str:
+def _changed(text: str, system: Model, values: Mapping[ParameterRef, str]) -> str:
     """Return the text with the values where they belong, unchecked."""
     text = text.removeprefix("\ufeff")
     groups = {group.name: group.count for group in system.groups}
@@ -110,9 +110,7 @@ def _changed(text: str, system: CompiledSystem, values: Mapping[Free, str]) -> s
 # ---- that it is the model that was meant ----
 
 
-def _check(
-    written: CompiledSystem, system: CompiledSystem, values: Mapping[Free, str], place: Place
-) -> CompiledSystem:
+def _check(written: Model, system: Model, values: Mapping[ParameterRef, str], place: SourceLocation) -> Model:
     """Return the model with these values; raise E997 if a compiled text has another number than that."""
     overrides = [parse_override(system, f"{free.label}={value}") for free, value in values.items()]
     result = apply(system, overrides)
@@ -122,7 +120,7 @@ def _check(
             expected, got = (_shown(numbers.get(name)) for numbers in (meant, found))
             what = f"{name} in the topology to be written"
             hint = " ".join(f'--set "{free.label}={value}"' for free, value in values.items())
-            raise ApcError(Mistake("E997", place, what, expected, got, hint))
+            raise ApcError(Diagnostic("E997", place, what, expected, got, hint))
     return result
 
 
@@ -132,7 +130,7 @@ def _shown(number: Any) -> str:
     return "none" if number is None else f"{float(number):.12g}"
 
 
-def _numbers(system: CompiledSystem) -> dict[str, Any]:
+def _numbers(system: Model) -> dict[str, Any]:
     """Return every number of a model, exactly: of each group its own, of one that differs a tuple."""
     # A lone share lost is the first of four numbers once another of these is given, and has another name.
     losses = [(link.name, link.channel.loss) for link in system.links if link.channel is not None]
@@ -154,7 +152,7 @@ def _numbers(system: CompiledSystem) -> dict[str, Any]:
 # ---- where a number is ----
 
 
-def _paths(root: _Node, system: CompiledSystem, free: Free) -> list[Sequence[str]]:
+def _paths(root: _Node, system: Model, free: ParameterRef) -> list[Sequence[str]]:
     """Return where a number is, or belongs: the keys that lead to it."""
     groups = [group.name for group in system.groups]
     if free.group is not None:

@@ -1,6 +1,6 @@
 """A peer in plain C99: its header, what it computes, and a program that runs it.
 
-Takes: a `Peer`. Gives: `header`, `source`, `driver`; `memory`, `parameter_units`.
+Takes: a `ExportedPeer`. Gives: `header`, `source`, `driver`; `memory`, `parameter_units`.
 Guarantees: no allocation, no global that changes, nothing included but math.h; what happens at an instant is
 computed by the functions that `simulate` evaluates, in their order and with their roundings; a number is read
 as the very same double; nothing in a comment ends it.
@@ -24,32 +24,32 @@ from apc.compiler.plain import straight
 from apc.compiler.weights import sum_weights
 from apc.distribution import program_version
 from apc.exports.identifiers import prefixed
-from apc.exports.peer_step import Line, Move, Peer, has_edge
+from apc.exports.peer_step import ExportedPeer, Move, PeerLink, has_edge
 from apc.exports.texts import filled, number
 from apc.simulation.machine import straight_lines
 from apc.simulation.pairs import pair_function
 from apc.simulation.signals import LocalSignal, ticking_partitions
 
 
-def memory(peer: Peer, signal: LocalSignal) -> str:
+def memory(peer: ExportedPeer, signal: LocalSignal) -> str:
     """Return the member of a peer's memory that holds a signal."""
     if signal.role == "output":
         return _output(peer, *signal.place)
     return f"{'x' if signal.role == 'state' else 'u'}[{signal.place[0]}]"
 
 
-def parameter_units(peer: Peer) -> dict[str, str]:
+def parameter_units(peer: ExportedPeer) -> dict[str, str]:
     """Return the unit of each of a peer's parameters."""
     known = {parameter.name: parameter.unit for parameter in peer.system.parameters}
     return {name: known.get(name, "1") for name in peer.kind.parameters}
 
 
-def _output(peer: Peer, partition: int, output: int) -> str:
+def _output(peer: ExportedPeer, partition: int, output: int) -> str:
     first = [*accumulate((len(clock.outputs) for clock in peer.kind.clocks), initial=0)]
     return f"y[{first[partition] + output}]"
 
 
-def _filled(file: str, peer: Peer, **values: object) -> str:
+def _filled(file: str, peer: ExportedPeer, **values: object) -> str:
     """Return one of a peer's texts, its title with it."""
     system, clocks = peer.system, {partition.clock for partition in peer.kind.clocks}
     timings = {timing.name: float(timing.value) for timing in system.timings}
@@ -58,7 +58,7 @@ def _filled(file: str, peer: Peer, **values: object) -> str:
     return filled(file, **shared, **values)
 
 
-def header(peer: Peer) -> str:
+def header(peer: ExportedPeer) -> str:
     """Return the header: what goes in and out of a peer, its memory, and what it does."""
     kind, units = peer.kind, parameter_units(peer)
     named = [(kind.parameters[place], units[kind.parameters[place]]) for place in peer.settable]
@@ -81,12 +81,12 @@ def header(peer: Peer) -> str:
     )
 
 
-def _kept(peer: Peer) -> int:
+def _kept(peer: ExportedPeer) -> int:
     """Return how many computed values of each hold are remembered."""
     return 1 + max((act.lag for instant in peer.instants for act in instant.acts), default=0)
 
 
-def source(peer: Peer, include: str) -> str:
+def source(peer: ExportedPeer, include: str) -> str:
     """Return the code; `include` is the name of the header."""
     kind, kinds = peer.kind, tuple(dict.fromkeys(peer.instants))
     names = _parameters(peer)
@@ -143,14 +143,14 @@ def _sum(terms: Iterable[tuple[float, str]]) -> str:
     return " + ".join(f"{number(value)} * {factor}" for value, factor in terms) or "0.0"
 
 
-def _parameters(peer: Peer) -> list[str]:
+def _parameters(peer: ExportedPeer) -> list[str]:
     names = [*prefixed("PARAMETER", peer.kind.parameters)]
     for k, place in enumerate(peer.settable):
         names[place] = f"peer->p[{k}]"
     return names
 
 
-def _moving(peer: Peer) -> list[str]:
+def _moving(peer: ExportedPeer) -> list[str]:
     """Return what the arguments x and u of a function are called."""
     x = [f"peer->x[{i}]" for i in range(len(peer.kind.states))]
     for i in peer.outside:
@@ -158,7 +158,7 @@ def _moving(peer: Peer) -> list[str]:
     return [*x, *(f"peer->u[{h}]" for h in range(len(peer.kind.holds)))]
 
 
-def _memories(peer: Peer, p: int) -> list[str]:
+def _memories(peer: ExportedPeer, p: int) -> list[str]:
     return [f"peer->{_output(peer, p, o)}" for o in peer.kind.clocks[p].memories]
 
 
@@ -169,7 +169,7 @@ def _computed(function: Any, arguments: Sequence[str]) -> tuple[list[str], list[
     return lines, [names[place] for place in plain.results[0]]
 
 
-def _heard(peer: Peer, p: int) -> tuple[list[Line], list[dict[str, Any]]]:
+def _heard(peer: ExportedPeer, p: int) -> tuple[list[PeerLink], list[dict[str, Any]]]:
     """Return of which lines a partition's tick needs the peer's own packet, and what its receives hear."""
     receives, lines = peer.kind.clocks[p].receives, {line.link: line for line in peer.lines}
     heard = [_received(peer, p, place) for place in range(len(receives))]
@@ -177,7 +177,7 @@ def _heard(peer: Peer, p: int) -> tuple[list[Line], list[dict[str, Any]]]:
     return [lines[link] for link in read if lines[link].missing], heard
 
 
-def _received(peer: Peer, p: int, place: int) -> dict[str, Any]:
+def _received(peer: ExportedPeer, p: int, place: int) -> dict[str, Any]:
     """Return what a receive makes of its senders: lines of C, the value of sender k, how these are joined."""
     receive = peer.kind.clocks[p].receives[place]
     line = peer.line(receive.link) if (p, place) in peer.channels else None
@@ -212,7 +212,7 @@ def _received(peer: Peer, p: int, place: int) -> dict[str, Any]:
     }
 
 
-def _moved(peer: Peer, move: Move) -> tuple[list[str], dict[int, str]]:
+def _moved(peer: ExportedPeer, move: Move) -> tuple[list[str], dict[int, str]]:
     """Return the lines of C that move the computer's states for a while, and what each state is then."""
     moving, count = _moving(peer), len(peer.start)
     exact = [i for i in range(count) if i not in peer.outside and i not in move.flowing]
@@ -231,7 +231,7 @@ def _moved(peer: Peer, move: Move) -> tuple[list[str], dict[int, str]]:
     return lines, stores
 
 
-def driver(peer: Peer, include: str) -> str:
+def driver(peer: ExportedPeer, include: str) -> str:
     """Return a program that reads what a peer measures and hears, a row an instant, and prints what it does.
 
     With a number N it does N instants of what is heard at the start, and prints the time of one. It prints in

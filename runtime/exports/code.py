@@ -1,6 +1,6 @@
 """A scene handed over as code: a peer in C99, or an FMU of a peer or of all.
 
-Takes: a `CompiledSystem`, a peer's name, a device, a method. Gives: `Code`, `peer_code`, `write_code`;
+Takes: a `Model`, a peer's name, a device, a method. Gives: `Code`, `peer_code`, `write_code`;
 `scene_unit`.
 Guarantees: three texts are written together or not at all: `left.c`, `left.h`, and the driver `left_test.c`.
 Does not: compile what is written as C.
@@ -13,19 +13,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import write_texts
 from apc.exports.c_text import driver, header, source
-from apc.exports.fmu import Unit, unit_of
-from apc.exports.peer_step import Peer, peer_of, refused, sites_of
+from apc.exports.fmu import FmuContent, unit_of
+from apc.exports.peer_step import ExportedPeer, peer_of, refused, sites_of
 from apc.exports.pushed import pushed
 from apc.exports.scene_text import c_scene, one_peer
 from apc.frame.finite_equations import finite_equations
 from apc.loop.peer import number_of
 from apc.result import Result
 from apc.simulation.settings import DEFAULT, Method, parse_method
-from apc.simulation.simulation import Plan, plan_of
+from apc.simulation.simulation import SimulationPlan, plan_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,12 +33,12 @@ class Code(Result):
     """One peer of a scene in C, and the method of what moves in it."""
 
     topology: str
-    code: Peer
+    code: ExportedPeer
     method: str
     shown_by: ClassVar[str] = "exports_output:code"
 
 
-def peer_code(system: CompiledSystem, *, peer: str = "", device: str = "", method: str = "") -> Code:
+def peer_code(system: Model, *, peer: str = "", device: str = "", method: str = "") -> Code:
     """Write one peer in C.
 
     Parameters
@@ -62,21 +62,21 @@ def peer_code(system: CompiledSystem, *, peer: str = "", device: str = "", metho
     if not peer and len(set(sites_of(plan))) > 1:
         what = "--peer: the peers differ, and a text of C is of one"
         hint = f'--peer "{plan.exchange.peer_name(0)}"'
-        raise ApcError(Mistake("E963", Place(system.origin.topology), what, hint=hint))
+        raise ApcError(Diagnostic("E963", SourceLocation(system.origin.topology), what, hint=hint))
     result = peer_of(
         plan, number_of(plan.exchange, peer, "--peer") if peer else 0, how, device=device or None
     )
     return Code(system.name, result, str(how))
 
 
-def scene_unit(system: CompiledSystem, *, peer: str = "", method: str = "") -> Unit:
+def scene_unit(system: Model, *, peer: str = "", method: str = "") -> FmuContent:
     """Make an FMU of a scene, or of one peer of it; parameters, and what is raised, as for `peer_code`."""
     how, plan = _plan(pushed(system), method)
     scene = one_peer(plan, number_of(plan.exchange, peer, "--peer"), how) if peer else c_scene(plan, how)
     return unit_of(system, scene, peer=peer)
 
 
-def _plan(system: CompiledSystem, method: str) -> tuple[Method, Plan]:
+def _plan(system: Model, method: str) -> tuple[Method, SimulationPlan]:
     how = parse_method(method) if method else DEFAULT
     if not system.clocks:
         raise refused(system, f"{system.name} has no clock: nothing is computed at any tick")
@@ -92,7 +92,7 @@ def write_code(path: Path, code: Code) -> None:
     include = f"{path.stem}.h"
     if not _INCLUDED.fullmatch(include):
         what = f"{include} can't be the name of a header in C"
-        raise ApcError(Mistake("E601", Place(str(path)), what, hint="--out peer.c"))
+        raise ApcError(Diagnostic("E601", SourceLocation(str(path)), what, hint="--out peer.c"))
     write_texts(
         {
             path.with_suffix(".h"): header(code.code),

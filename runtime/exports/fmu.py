@@ -1,6 +1,6 @@
 """An FMU: a scene or one peer of it as FMI 2.0 for co-simulation, an archive that runs without Python.
 
-Takes: a `CScene`. Gives: `Unit`, `unit_of`, `write_fmu`; `compile_texts`.
+Takes: a `CScene`. Gives: `FmuContent`, `unit_of`, `write_fmu`; `compile_texts`.
 Guarantees: the archive holds a description, the sources and a library of this platform; the same scene gives
 the same description and sources. An FMU's step is exact at the scene's instants; the time of a step is the
 simulator's choice.
@@ -19,8 +19,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import write_file
 from apc.distribution import program_version
 from apc.exports.c_text import header, source
@@ -38,13 +38,13 @@ DATE = (1980, 1, 1, 0, 0, 0)  # of every member of the archive: the first there 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Unit(Result):
+class FmuContent(Result):
     """An FMU: the scene it plays, of which `peer` if it is one, and its texts by their names.
 
     `step` and `duration` are what a simulator may take, in seconds; `guid` is a digest of the texts.
     """
 
-    system: CompiledSystem
+    system: Model
     peer: str
     scene: CScene
     step: float
@@ -66,7 +66,7 @@ class Unit(Result):
         return filled("fmu.xml", unit=self, version=program_version(), **fields)
 
 
-def unit_of(system: CompiledSystem, scene: CScene, *, peer: str = "") -> Unit:
+def unit_of(system: Model, scene: CScene, *, peer: str = "") -> FmuContent:
     """Return the FMU of a scene, or of the peer of that name."""
     timings = {timing.name: timing.value for timing in system.timings}
     step = float(min(timings[clock.period] for clock in system.clocks))
@@ -82,12 +82,12 @@ def unit_of(system: CompiledSystem, scene: CScene, *, peer: str = "") -> Unit:
         **shared(scene),
     )
     guid = hashlib.sha256("\0".join((*texts.values(), main)).encode()).hexdigest()
-    unit = Unit(system, peer, scene, step, float(duration) if duration else 1.0, guid, texts)
+    unit = FmuContent(system, peer, scene, step, float(duration) if duration else 1.0, guid, texts)
     texts[f"{unit.identifier}.c"] = main.replace(PLACE_OF_GUID, guid)
     return unit
 
 
-def compile_texts(texts: Mapping[str, str], options: Sequence[str], place: Place) -> bytes:
+def compile_texts(texts: Mapping[str, str], options: Sequence[str], place: SourceLocation) -> bytes:
     """Return what a compiler makes of texts of C, by their file names; `place` is what is told of.
 
     Raises
@@ -99,7 +99,7 @@ def compile_texts(texts: Mapping[str, str], options: Sequence[str], place: Place
     if pair is None:
         what = "no C compiler answers to cc, gcc or clang, or to what the variable CC says"
         raise ApcError(
-            Mistake("E962", place, what, hint="gcc or clang installed, or --to c, which needs none")
+            Diagnostic("E962", place, what, hint="gcc or clang installed, or --to c, which needs none")
         )
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -112,18 +112,18 @@ def compile_texts(texts: Mapping[str, str], options: Sequence[str], place: Place
                 command, cwd=folder, capture_output=True, text=True, timeout=PATIENCE, check=False
             )
         except (OSError, subprocess.SubprocessError) as error:
-            raise ApcError(Mistake("E962", place, f"{pair[0]} can't be run: {error}")) from None
+            raise ApcError(Diagnostic("E962", place, f"{pair[0]} can't be run: {error}")) from None
         if done.returncode:
             said = (done.stderr.strip().splitlines() or ["nothing"])[0][:200]
             what = f"{pair[0]} doesn't compile it, and says: {said}"
-            raise ApcError(Mistake("E962", place, what))
+            raise ApcError(Diagnostic("E962", place, what))
         return (folder / "built").read_bytes()
 
 
-def write_fmu(path: Path, unit: Unit) -> None:
+def write_fmu(path: Path, unit: FmuContent) -> None:
     """Write an FMU, whole or not at all. Raises ApcError (E601, E962)."""
     system, suffix = PLATFORMS.get(platform.system(), PLATFORMS["Linux"])
-    library = compile_texts(unit.texts, OPTIONS, Place(str(path)))
+    library = compile_texts(unit.texts, OPTIONS, SourceLocation(str(path)))
     members = {"modelDescription.xml": unit.description.encode()}
     members |= {f"sources/{item}": text.encode() for item, text in unit.texts.items()}
     members[f"binaries/{system}64/{unit.identifier}{suffix}"] = library

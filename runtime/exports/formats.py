@@ -1,7 +1,7 @@
 """What a scene can be handed over as: the table of formats, and who makes each.
 
-Takes: a `CompiledSystem`, where it goes and what is asked of it.
-Gives: `Format`, `FORMATS`; `Asked`; `format_of`, `export`.
+Takes: a `Model`, where it goes and what is asked of it.
+Gives: `Format`, `FORMATS`; `ExportRequest`; `format_of`, `export`.
 Guarantees: a format is chosen by its name or by the suffix, which agree; an option that means nothing to a
 format is refused; a maker is imported when it is asked for.
 Does not: make anything itself.
@@ -17,15 +17,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
 from apc.network.nominal import refuse_range
 from apc.result import Result
 from apc.suffixes import check_suffix
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class ExportRequest:
     """What is asked of an export, each "" or () where it is not: where to `cut` the loop, `free` numbers.
 
     `peer` is one alone, `device` what its computer doesn't move, `method` how it moves the others.
@@ -40,7 +40,7 @@ class Asked:
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """A format: its name, its suffix, what it is, and which fields of `Asked` mean something to it."""
+    """A format: its name, its suffix, what it is, and which fields of `ExportRequest` apply to it."""
 
     name: str
     suffix: str
@@ -102,23 +102,25 @@ def format_of(to: str | None, out: Path | None, *, option: str = "--") -> Format
     if to is None:
         if out is None:
             raise ApcError(
-                Mistake("E952", Place("export"), "no format is named", f"one of {', '.join(names)}")
+                Diagnostic(
+                    "E952", SourceLocation("export"), "no format is named", f"one of {', '.join(names)}"
+                )
             )
         suffix = check_suffix(out, [item.suffix for item in FORMATS], written)
         return next(item for item in FORMATS if item.suffix == suffix)
     result = next((item for item in FORMATS if item.name == to), None)
     if result is None:
         near = nearest(to, names) or names[0]
-        place = Place("--to" if option == "--" else "to")
+        place = SourceLocation("--to" if option == "--" else "to")
         raise ApcError(
-            Mistake("E952", place, "a format", f"one of {', '.join(names)}", to[:40], f"{place} {near}")
+            Diagnostic("E952", place, "a format", f"one of {', '.join(names)}", to[:40], f"{place} {near}")
         )
     if out is not None:
         check_suffix(out, [result.suffix], written)
     return result
 
 
-def export(system: CompiledSystem, chosen: Format, asked: Asked, out: Path | None = None) -> Result:
+def export(system: Model, chosen: Format, asked: ExportRequest, out: Path | None = None) -> Result:
     """Make what a format says of a scene, and write it.
 
     Parameters
@@ -136,11 +138,13 @@ def export(system: CompiledSystem, chosen: Format, asked: Asked, out: Path | Non
         E953 an option that means nothing to the format; E899 a delay that is a range; E601 the file can't
         be written; and the maker's.
     """
-    for name in Asked.__slots__:
+    for name in ExportRequest.__slots__:
         if getattr(asked, name) and name not in chosen.takes:
             able = ", ".join(item.name for item in FORMATS if name in item.takes)
             what = f"--{name} means nothing to the format {chosen.name}"
-            raise ApcError(Mistake("E953", Place(f"--{name}"), what, hint=f"--to {able}" if able else ""))
+            raise ApcError(
+                Diagnostic("E953", SourceLocation(f"--{name}"), what, hint=f"--to {able}" if able else "")
+            )
     refuse_range(system)
     make, write = _makers(chosen.name)
     parameter = make(system, **{name: getattr(asked, name) for name in chosen.takes})

@@ -1,6 +1,6 @@
 """A state space as a function of some of the scene's numbers.
 
-Takes: a `CompiledSystem`, names of its parameters. Gives: `state_space_of`.
+Takes: a `Model`, names of its parameters. Gives: `state_space_of`.
 Guarantees: what follows from a free number by a formula follows from it here too; at the scene's own numbers
 the matrices are those of `lifted.state_space`, but for rounding.
 Does not: free a time: another delay is another order of events, another number of states.
@@ -23,20 +23,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import prepare_at_start
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.plain import symbolic
-from apc.eigen.peers import PeerGroup
-from apc.exports.identifiers import Port, words
-from apc.exports.lifted import Numbers, StateSpace, lifted, peers_of, state_space, steps_in_floats
-from apc.frame.devices import Push
-from apc.frame.exchange import Exchange
-from apc.frame.instance import Peers, prepare
+from apc.eigen.peers import PeerClass
+from apc.exports.identifiers import ExportedSignal, words
+from apc.exports.lifted import FrameNumbers, StateSpace, lifted, peers_of, state_space, steps_in_floats
+from apc.frame.devices import ForceInput
+from apc.frame.exchange import CommunicationGraph
+from apc.frame.instance import PeerIndices, prepare
 from apc.frame.linearize import site_of_entries
-from apc.frame.names import Free, find, overlap, times_of, unit_of
+from apc.frame.names import ParameterRef, find, overlap, times_of, unit_of
 from apc.frame.parameters import free_values
 from apc.frame.radius import Arithmetic
-from apc.frame.site import LinearSite
+from apc.frame.site import LinearSubsystem
 from apc.network.nominal import refuse_channel_number
 
 Matrix = NDArray[Any]
@@ -48,7 +48,7 @@ OPTION = "--free"
 SPAN, TERMS = 64, 16
 
 
-def state_space_of(system: CompiledSystem, *, cut: str = "", free: Sequence[str] = ()) -> StateSpace:
+def state_space_of(system: Model, *, cut: str = "", free: Sequence[str] = ()) -> StateSpace:
     """Lift a scene, with its matrices as a function of some numbers.
 
     Parameters
@@ -68,17 +68,17 @@ def state_space_of(system: CompiledSystem, *, cut: str = "", free: Sequence[str]
     if not free:
         return space
     frees = _frees(system, free)
-    ports = tuple(Port(free.label, unit_of(system, free.name)) for free in frees)
+    ports = tuple(ExportedSignal(free.label, unit_of(system, free.name)) for free in frees)
     symbols = [casadi.SX.sym(word) for word in words(ports)]
     prepared = prepare_at_start(system, prepare(system), frees)
     if prepared is None:
         what = "where the scene is linearized does not follow from its numbers alone"
-        raise ApcError(Mistake("E954", Place(OPTION), what, hint=f"no {OPTION}"))
+        raise ApcError(Diagnostic("E954", SourceLocation(OPTION), what, hint=f"no {OPTION}"))
     groups, exchange = peers_of(system, prepared=prepared)
     groups = tuple(part for group in groups for part in _by_groups(group, exchange))
     values = dict(zip(frees, symbols, strict=True))
 
-    def vector(group: PeerGroup) -> Any:
+    def vector(group: PeerClass) -> Any:
         place = exchange.group_of(group.peers.first)
         peer = group.peers.first - int(exchange.starts[place])
         listed = free_values(system, system.groups[place], peer, values, symbolic)
@@ -91,45 +91,45 @@ def state_space_of(system: CompiledSystem, *, cut: str = "", free: Sequence[str]
     return replace(space, free=ports, function=function)
 
 
-def _frees(system: CompiledSystem, names: Sequence[str]) -> list[Free]:
+def _frees(system: Model, names: Sequence[str]) -> list[ParameterRef]:
     """Return what is free. Raises ApcError for what can't be."""
-    frees: list[Free] = []
+    frees: list[ParameterRef] = []
     for name in names:
-        free = find(system, name, Place(OPTION))
+        free = find(system, name, SourceLocation(OPTION))
         if times_of(system, free.name):
             what = f"{free.label} is a time: another one is another order of events, and another state"
             hint = f'one value at a time: --set {free.label}="…"'
-            raise ApcError(Mistake("E954", Place(OPTION), what, hint=hint))
-        refuse_channel_number(system, free, Place(OPTION))
+            raise ApcError(Diagnostic("E954", SourceLocation(OPTION), what, hint=hint))
+        refuse_channel_number(system, free, SourceLocation(OPTION))
         if any(overlap(system, free, other) for other in frees):
             what = f"{free.label} is named twice"
-            raise ApcError(Mistake("E954", Place(OPTION), what, hint=f"{OPTION} {free.label}"))
+            raise ApcError(Diagnostic("E954", SourceLocation(OPTION), what, hint=f"{OPTION} {free.label}"))
         frees.append(free)
     return frees
 
 
-def _by_groups(group: PeerGroup, exchange: Exchange) -> list[PeerGroup]:
+def _by_groups(group: PeerClass, exchange: CommunicationGraph) -> list[PeerClass]:
     """Return equal peers apart by the scene's groups: a group's own number may be free."""
     runs = itertools.groupby(group.peers.runs, key=lambda run: exchange.group_of(run.start))
-    parts = [Peers(tuple(inside)) for _, inside in runs]
+    parts = [PeerIndices(tuple(inside)) for _, inside in runs]
     return [replace(group, peers=peers, count=len(peers)) for peers in parts]
 
 
-def _numbers(vector: Callable[[PeerGroup], Any]) -> Numbers:
+def _numbers(vector: Callable[[PeerClass], Any]) -> FrameNumbers:
     """Return what a frame is made of in CasADi's expressions of each group's vector (n_p,) of parameters."""
 
-    def values(function: Any, group: PeerGroup) -> list[Any]:
+    def values(function: Any, group: PeerClass) -> list[Any]:
         rest = [casadi.DM.zeros(*function.size_in(place)) for place in range(function.n_in() - 2)]
         return [_plain(nonzero) for nonzero in function(*rest, vector(group), 0).nonzeros()]
 
-    def site(group: PeerGroup) -> LinearSite:
+    def site(group: PeerClass) -> LinearSubsystem:
         return site_of_entries(group.jacobians, values(group.jacobians.function, group), 0)
 
-    def inverses(group: PeerGroup, push: Push) -> list[Any]:
+    def inverses(group: PeerClass, push: ForceInput) -> list[Any]:
         return values(push.symbolic, group)
 
     def steps(
-        group: PeerGroup, forces: Sequence[Push], count: int, durations: Sequence[Fraction]
+        group: PeerClass, forces: Sequence[ForceInput], count: int, durations: Sequence[Fraction]
     ) -> list[Matrix]:
         plain = site(group)
         moving = np.concatenate([plain.a, plain.b, np.zeros((len(plain.a), count))], axis=1).astype(object)
@@ -139,7 +139,7 @@ def _numbers(vector: Callable[[PeerGroup], Any]) -> Numbers:
             return [matrix.astype(object) for matrix in steps_in_floats(group, forces, count, durations)]
         return [_step(moving, group.site.a, float(duration)) for duration in durations]
 
-    return Numbers(site, inverses, steps, SYMBOLS)
+    return FrameNumbers(site, inverses, steps, SYMBOLS)
 
 
 def _step(moving: Matrix, now: Matrix, seconds: float) -> Matrix:

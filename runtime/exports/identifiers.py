@@ -1,6 +1,6 @@
 """Names out of a scene as other tools want them.
 
-Takes: names such as `left[2].cube.x`. Gives: `Port`, `words`; `identifier`; `prefixed`; `unique`.
+Takes: names such as `left[2].cube.x`. Gives: `ExportedSignal`, `words`; `identifier`; `prefixed`; `unique`.
 Guarantees: an identifier is made of letters, digits and `_`, begins with a letter, and is no reserved word of
 C; of several no two are equal. A prefixed identifier is no word or macro of C or C++ either.
 Does not: say which tool wants that.
@@ -22,14 +22,14 @@ RESERVED = frozenset(_TEXT.split())
 
 
 @dataclass(frozen=True, slots=True)
-class Port:
+class ExportedSignal:
     """An input, an output or a state: its name, such as `left[2].cube.x`, and its SI unit."""
 
     name: str
     unit: str
 
 
-def words(ports: Sequence[Port]) -> list[str]:
+def words(ports: Sequence[ExportedSignal]) -> list[str]:
     """Return an identifier for each of some names, of which no two are equal."""
     return [*unique(identifier(port.name) for port in ports)]
 

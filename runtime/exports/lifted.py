@@ -1,8 +1,8 @@
 """A scene over one frame as a state space, all peers in it: from forces and noise to what is simulated.
 
-Takes: a `CompiledSystem`; a link or coupler to cut it at.
-Gives: `StateSpace`, `state_space`; `Numbers`, `lifted`, `peers_of`, `steps_in_floats`: the same in any kind
-of number.
+Takes: a `Model`; a link or coupler to cut it at.
+Gives: `StateSpace`, `state_space`; `FrameNumbers`, `lifted`, `peers_of`, `steps_in_floats`: the same in any
+kind of number.
 Guarantees: every event within a frame is in it, exactly but for rounding; its eigenvalues are those that
 `analyze` finds, and 0 for each force that nothing else remembers until the frame ends. Cut open and closed
 again by u = −y it is the closed loop.
@@ -32,23 +32,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import lifted_groups, near_start
-from apc.compiler.compiled import CompiledSystem, Kind
-from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.compiled import Model, PeerType
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
 from apc.distribution import versions
-from apc.eigen.closing import Loop, close_outside, lay_out_loop
+from apc.eigen.closing import ModalSystem, close_outside, lay_out_loop
 from apc.eigen.modes import dense_loop
-from apc.eigen.peers import PeerGroup, states_of
-from apc.exports.identifiers import Port
-from apc.frame.devices import Device, Push, find_push
+from apc.eigen.peers import PeerClass, states_of
+from apc.exports.identifiers import ExportedSignal
+from apc.frame.devices import Device, ForceInput, find_push
 from apc.frame.discretize import TOO_LARGE, discretize
-from apc.frame.exchange import Exchange
+from apc.frame.exchange import CommunicationGraph
 from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, prepare
 from apc.frame.lift import MOST_PACKETS, FrameMap, check_packets, compose, step_durations
 from apc.frame.ports import OUTSIDE, with_cuts, with_holds, with_ports
 from apc.frame.radius import FLOATS, RADII, Arithmetic, value_of
-from apc.frame.schedule import Heard, Schedule, Tick, Value
-from apc.frame.site import LinearSite
+from apc.frame.schedule import ClockedValue, ReceivedSample, Schedule, Tick
+from apc.frame.site import LinearSubsystem
 from apc.memory import refuse_beyond
 from apc.network.nominal import left_out
 from apc.result import Result
@@ -69,8 +69,8 @@ Blocks = tuple[Matrix, Matrix, Matrix, Matrix]
 ENTRY = 40
 
 
-Labels = tuple[Port, ...]
-Placed = list[tuple[Port, int]]  # and where each is in z
+Labels = tuple[ExportedSignal, ...]
+Placed = list[tuple[ExportedSignal, int]]  # and where each is in z
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,12 +90,12 @@ class StateSpace(Result):
     b: Floats  # (n, inputs)
     c: Floats  # (outputs, n)
     d: Floats  # (outputs, inputs)
-    states: tuple[Port, ...]
-    inputs: tuple[Port, ...]
-    outputs: tuple[Port, ...]
+    states: tuple[ExportedSignal, ...]
+    inputs: tuple[ExportedSignal, ...]
+    outputs: tuple[ExportedSignal, ...]
     notes: tuple[str, ...]
     made_by: str
-    free: tuple[Port, ...] = ()
+    free: tuple[ExportedSignal, ...] = ()
     function: Any = None
 
     @property
@@ -124,23 +124,23 @@ class StateSpace(Result):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Numbers:
+class FrameNumbers:
     """What a frame is made of in a kind of number.
 
     `site` gives the matrices of some peers, `inverses` the 1/m of what is pushed, `steps` [F G] of each of
     some durations in seconds, with so many inputs behind the holds, forces first.
     """
 
-    site: Callable[[PeerGroup], LinearSite]
-    inverses: Callable[[PeerGroup, Push], Sequence[Any]]
-    steps: Callable[[PeerGroup, Sequence[Push], int, Sequence[Fraction]], list[Matrix]]
+    site: Callable[[PeerClass], LinearSubsystem]
+    inverses: Callable[[PeerClass, ForceInput], Sequence[Any]]
+    steps: Callable[[PeerClass, Sequence[ForceInput], int, Sequence[Fraction]], list[Matrix]]
     arithmetic: Arithmetic
 
 
 def steps_in_floats(
-    group: PeerGroup, forces: Sequence[Push], count: int, durations: Sequence[Fraction]
+    group: PeerClass, forces: Sequence[ForceInput], count: int, durations: Sequence[Fraction]
 ) -> list[Matrix]:
-    """Return [F G] of some durations in floats, of exact matrices: see `Numbers`."""
+    """Return [F G] of some durations in floats, of exact matrices: see `FrameNumbers`."""
     columns = np.zeros((len(group.exact.a), count), dtype=object)
     for place, push in enumerate(forces):
         columns[list(push.velocities), place] = push.inverses
@@ -148,12 +148,12 @@ def steps_in_floats(
     return [value_of(step) for step in steps]
 
 
-IN_FLOATS = Numbers(
+IN_FLOATS = FrameNumbers(
     lambda group: group.site, lambda group, push: [*map(float, push.inverses)], steps_in_floats, FLOATS
 )
 
 
-def state_space(system: CompiledSystem, *, cut: str = "") -> StateSpace:
+def state_space(system: Model, *, cut: str = "") -> StateSpace:
     """Lift a scene, all its peers in one system.
 
     Parameters
@@ -171,15 +171,15 @@ def state_space(system: CompiledSystem, *, cut: str = "") -> StateSpace:
     groups, exchange = peers_of(system)
     (a, b, c, d), (states, inputs, outputs), unpushed = lifted(system, groups, exchange, cut, IN_FLOATS)
     if not all(np.isfinite(block).all() for block in (a, b, c, d)):
-        raise ApcError(Mistake("E806", Place(system.name), TOO_LARGE))
+        raise ApcError(Diagnostic("E806", SourceLocation(system.name), TOO_LARGE))
     frame_s, notes = about(system)
     notes = (*notes, *unpushed)
     return StateSpace(system.name, cut, frame_s, a, b, c, d, states, inputs, outputs, notes, made_by(system))
 
 
 def peers_of(
-    system: CompiledSystem, *, prepared: Prepared | None = None
-) -> tuple[tuple[PeerGroup, ...], Exchange]:
+    system: Model, *, prepared: Prepared | None = None
+) -> tuple[tuple[PeerClass, ...], CommunicationGraph]:
     """Return the peers of a system as `analysis.lifted_groups`, and what is too large as E951."""
     try:
         return lifted_groups(system, prepared=prepared)
@@ -187,16 +187,18 @@ def peers_of(
         if any(mistake.code != "E804" for mistake in error.mistakes):
             raise
         what = error.mistakes[0].what
-        raise ApcError(Mistake("E951", Place(system.origin.topology), what, hint="fewer peers")) from None
+        raise ApcError(
+            Diagnostic("E951", SourceLocation(system.origin.topology), what, hint="fewer peers")
+        ) from None
 
 
-def about(system: CompiledSystem) -> tuple[float, tuple[str, ...]]:
+def about(system: Model) -> tuple[float, tuple[str, ...]]:
     """Return how long a frame of a scene is, in seconds, and what its linear map leaves out."""
     prepared = prepare(system)
     return float(prepared.schedules[0].frame_s), (*near_start(system, prepared), *left_out(system))
 
 
-def made_by(system: CompiledSystem) -> str:
+def made_by(system: Model) -> str:
     """Return what a scene's export is made of, as one line of JSON."""
     about = {
         "topology": system.name,
@@ -209,7 +211,7 @@ def made_by(system: CompiledSystem) -> str:
 
 
 def lifted(
-    system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange, cut: str, numbers: Numbers
+    system: Model, groups: Sequence[PeerClass], exchange: CommunicationGraph, cut: str, numbers: FrameNumbers
 ) -> tuple[Blocks, tuple[Labels, Labels, Labels], tuple[str, ...]]:
     """Return A, B, C and D of a scene in a kind of number, the names of states, inputs, outputs, and notes.
 
@@ -235,7 +237,7 @@ def lifted(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Opened:
+class _DrivenPeers:
     """Peers that are moved from outside: `group` has the ways in, `map` is their frame.
 
     `signals` and where each is in z are what is simulated, `inputs`
@@ -244,7 +246,7 @@ class _Opened:
     says what no force comes in at, and why.
     """
 
-    group: PeerGroup
+    group: PeerClass
     map: FrameMap
     signals: Placed
     inputs: Placed
@@ -252,7 +254,7 @@ class _Opened:
     unpushed: tuple[str, ...]
 
 
-def _open(system: CompiledSystem, group: PeerGroup, cut: str, numbers: Numbers) -> _Opened:
+def _open(system: Model, group: PeerClass, cut: str, numbers: FrameNumbers) -> _DrivenPeers:
     """Let forces and noise into some peers, and cut the forces of a coupler open."""
     schedule, kind = _remembering(group), group.jacobians.kind
     (forces, unpushed), noises = _masses(system, group), _measured(group.site)
@@ -269,17 +271,19 @@ def _open(system: CompiledSystem, group: PeerGroup, cut: str, numbers: Numbers) 
     first = {value: len(kind.states) + k for k, value in enumerate(schedule.carried)}
     signals = [
         (
-            Port(local_signal.name, local_signal.unit),
+            ExportedSignal(local_signal.name, local_signal.unit),
             local_signal.place[0]
             if local_signal.role == "state"
-            else first[Value(local_signal.place[0], local_signal.place[1], -1)],
+            else first[ClockedValue(local_signal.place[0], local_signal.place[1], -1)],
         )
         for local_signal in local_signals(kind, group.schedule)
         if local_signal.role in ("state", "output")
     ]
-    inputs = [Port(f"force on {push.part}", "N") for push in forces]
-    inputs += [Port(f"noise on {kind.states[place].name}", kind.states[place].unit) for place in noises]
-    return _Opened(
+    inputs = [ExportedSignal(f"force on {push.part}", "N") for push in forces]
+    inputs += [
+        ExportedSignal(f"noise on {kind.states[place].name}", kind.states[place].unit) for place in noises
+    ]
+    return _DrivenPeers(
         group=group.with_site(site, group.exact, full, frame.mapped(RADII.exact)),
         map=frame,
         signals=signals,
@@ -289,12 +293,14 @@ def _open(system: CompiledSystem, group: PeerGroup, cut: str, numbers: Numbers) 
     )
 
 
-def _remembering(group: PeerGroup) -> Schedule:
+def _remembering(group: PeerClass) -> Schedule:
     """Return a peer's frame with all that its clocks computed last among what it remembers."""
     schedule, kind = group.schedule, group.jacobians.kind
     at = _instants(schedule)
     values = [
-        Value(p, o, -1) for p in ticking_partitions(schedule) for o in range(len(kind.clocks[p].outputs))
+        ClockedValue(p, o, -1)
+        for p in ticking_partitions(schedule)
+        for o in range(len(kind.clocks[p].outputs))
     ]
     values = [value for value in values if value not in schedule.carried]
     names = [
@@ -319,7 +325,7 @@ def _instants(schedule: Schedule) -> dict[int, list[int]]:
     return result
 
 
-def _masses(system: CompiledSystem, group: PeerGroup) -> tuple[list[Push], list[str]]:
+def _masses(system: Model, group: PeerClass) -> tuple[list[ForceInput], list[str]]:
     """Return what of a peer has a mass, and so can be pushed, each axis by itself; and why what can't."""
     unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
     known: dict[str, Device | str | None] = {}
@@ -328,15 +334,15 @@ def _masses(system: CompiledSystem, group: PeerGroup) -> tuple[list[Push], list[
         for place, state in enumerate(group.jacobians.kind.states)
         if state.unit == "m"
     ]
-    pushes: dict[str, Push] = {}
+    pushes: dict[str, ForceInput] = {}
     for push in result:
-        if isinstance(push, Push):
+        if isinstance(push, ForceInput):
             pushes.setdefault(push.part, push)
     refused = dict.fromkeys(f"no force of its own: {text}" for text in result if isinstance(text, str))
     return list(pushes.values()), list(refused)
 
 
-def _measured(site: LinearSite) -> list[int]:
+def _measured(site: LinearSubsystem) -> list[int]:
     """Return the states that something samples."""
     looking = [
         values.any(axis=0) for values in (*(tick.x for tick in site.ticks), *(send.x for send in site.sends))
@@ -346,8 +352,11 @@ def _measured(site: LinearSite) -> list[int]:
 
 
 def _with_inputs(
-    site: LinearSite, forces: Sequence[Push], inverses: Sequence[Sequence[Any]], noises: Sequence[int]
-) -> LinearSite:
+    site: LinearSubsystem,
+    forces: Sequence[ForceInput],
+    inverses: Sequence[Sequence[Any]],
+    noises: Sequence[int],
+) -> LinearSubsystem:
     """Return a site with a hold for each force and for each noise, which is added to what is sampled.
 
     `inverses` are what each force does to each of its velocities, `noises` the states with noisy samples.
@@ -362,7 +371,7 @@ def _with_inputs(
     return wide
 
 
-def _link_of(system: CompiledSystem, cut: str) -> str:
+def _link_of(system: Model, cut: str) -> str:
     """Return the link that a cut names, "" for a coupler. Raises ApcError (E950) if it names neither."""
     links = [link.name for link in system.links]
     parts = {hold.name.rpartition(".")[0] for kind in system.kinds for hold in kind.holds}
@@ -373,11 +382,15 @@ def _link_of(system: CompiledSystem, cut: str) -> str:
         listed = ", ".join(known) or "it has none"
         what = f"{cut[:80]} is no link or coupler with ticks of {system.name} ({listed})"
         near = nearest(cut, known) or (known[0] if known else "")
-        raise ApcError(Mistake("E950", Place("--cut"), what, hint=f"--cut {near}" if near else ""))
+        raise ApcError(
+            Diagnostic("E950", SourceLocation("--cut"), what, hint=f"--cut {near}" if near else "")
+        )
     return ""
 
 
-def _cut_open(site: LinearSite, schedule: Schedule, cut: str) -> tuple[LinearSite, Schedule, Placed]:
+def _cut_open(
+    site: LinearSubsystem, schedule: Schedule, cut: str
+) -> tuple[LinearSubsystem, Schedule, Placed]:
     """Let the forces of a coupler come from outside at each tick; what the tick computes of them is in z."""
     kind = site.kind
     numbers = {partition.clock: p for p, partition in enumerate(kind.clocks)}
@@ -388,10 +401,12 @@ def _cut_open(site: LinearSite, schedule: Schedule, cut: str) -> tuple[LinearSit
     for partition, output in cuts:
         clock = kind.clocks[partition]
         times = [float(number * schedule.quantum * 1000) for number in at[partition]]
-        ports += [Port(f"{clock.outputs[output]} at {when:.6g} ms", clock.units[output]) for when in times]
+        ports += [
+            ExportedSignal(f"{clock.outputs[output]} at {when:.6g} ms", clock.units[output]) for when in times
+        ]
     if len(schedule.heard) + len(ports) > MOST_PACKETS:
         what = f"{len(ports):,} ticks a frame, each an input where it is cut, and {MOST_PACKETS} are the most"
-        raise ApcError(Mistake("E951", Place("--cut"), what, hint="--cut LINK"))
+        raise ApcError(Diagnostic("E951", SourceLocation("--cut"), what, hint="--cut LINK"))
     wide, whole = with_cuts(site, schedule, cuts)
     names = (*schedule.value_names, *(f"{port.name} computed" for port in ports))
     first = len(kind.states) + len(schedule.carried)
@@ -399,19 +414,19 @@ def _cut_open(site: LinearSite, schedule: Schedule, cut: str) -> tuple[LinearSit
     return wide, replace(whole, value_names=names), computed
 
 
-def _check_size(system: CompiledSystem, opened: Sequence[_Opened]) -> None:
+def _check_size(system: Model, opened: Sequence[_DrivenPeers]) -> None:
     """Refuse a scene whose matrix does not fit the memory: ApcError E951."""
     columns = sum(item.group.count * states_of(item.group.schedule, item.group.jacobians) for item in opened)
     peers = sum(item.group.count for item in opened)
     what = f"{columns:,} × {columns:,} numbers, the states and inputs of all {peers:,} peers together,"
     first = max(opened, key=lambda opened: opened.group.count).group
     hint = f"fewer peers: --set {system.groups[0].name if len(opened) == 1 else first.name}.count=10"
-    refuse_beyond(ENTRY * columns**2, "E951", Place(system.origin.topology), what, hint)
+    refuse_beyond(ENTRY * columns**2, "E951", SourceLocation(system.origin.topology), what, hint)
 
 
 def _closed(
-    loop: Loop,
-    sites: Sequence[_Opened],
+    loop: ModalSystem,
+    sites: Sequence[_DrivenPeers],
     *,
     link: str,
     cut: str,
@@ -442,7 +457,7 @@ def _closed(
     kept = np.delete(np.arange(n), np.concatenate([drawn, computed]))
     names = layout.names if len(sites) > 1 else tuple(f"{peers[0]}.{name}" for name in layout.names)
     units = {name: _units(site.group.jacobians.kind) for name, site in zip(peers, sites, strict=True)}
-    states = tuple(Port(name, _unit(units, name)) for name in map(names.__getitem__, kept))
+    states = tuple(ExportedSignal(name, _unit(units, name)) for name in map(names.__getitem__, kept))
     matrix, outer = whole.matrix, slice(n, None)
     if not cut:
         outputs, seen = spread([site.signals for site in sites])
@@ -467,13 +482,13 @@ def _from_outside(frame_map: FrameMap, rows: Sequence[int]) -> FrameMap:
     return replace(frame_map, q=q, d=d)
 
 
-def _named(port: Port, peer: str) -> Port:
+def _named(port: ExportedSignal, peer: str) -> ExportedSignal:
     """Return a peer's port, its name with the peer's: `force on left[2].cube`."""
     word, on, rest = port.name.rpartition(" on ")
     return replace(port, name=f"{word}{on}{peer}.{rest}")
 
 
-def _heard_ports(heard: Sequence[Heard], link: str, units: Mapping[str, str]) -> Placed:
+def _heard_ports(heard: Sequence[ReceivedSample], link: str, units: Mapping[str, str]) -> Placed:
     """Return what a peer hears over a link: of which packet of a frame, and how many frames ago."""
     heard = [what for what in heard if what.way.link == link]
     several = any(what.sent.slot for what in heard)
@@ -482,10 +497,10 @@ def _heard_ports(heard: Sequence[Heard], link: str, units: Mapping[str, str]) ->
         for what in heard
     ]
     listed = zip(named, heard, strict=True)
-    return [(Port(name, units[what.sent.channel]), 0) for name, what in listed]
+    return [(ExportedSignal(name, units[what.sent.channel]), 0) for name, what in listed]
 
 
-def _units(kind: Kind) -> dict[str, str]:
+def _units(kind: PeerType) -> dict[str, str]:
     """Return the units of what a peer has: of its states, of what is computed and sent, by their names."""
     result = {state.name: state.unit for state in kind.states}
     for clock in kind.clocks:

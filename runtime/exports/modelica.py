@@ -1,6 +1,6 @@
 """A scene as one flat model of Modelica 3.3, its clocks as clocked partitions (chapter 16).
 
-Takes: a `CompiledSystem`. Gives: `ModelicaModel`, `modelica`.
+Takes: a `Model`. Gives: `ModelicaModel`, `modelica`.
 Guarantees: the equations are those that `apc simulate` plays, not their slopes; a packet is heard, and a
 force acts, at the tick and the instant that the scene says; times are rationals. What Modelica has no words
 for is refused by name.
@@ -24,8 +24,8 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from apc.compiler.compiled import ClockPartition, CompiledSystem, Receive
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import ClockPartition, Model, Receive
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import write_text
 from apc.compiler.weights import exact_weight
 from apc.distribution import program_version
@@ -42,7 +42,7 @@ from apc.exports.identifiers import identifier as word
 from apc.exports.peer_step import computing, heard_of
 from apc.exports.texts import filled, quoted
 from apc.frame.ages import stamped
-from apc.frame.exchange import Exchange, build_exchange, check_mean
+from apc.frame.exchange import CommunicationGraph, build_exchange, check_mean
 from apc.frame.finite_equations import finite_equations
 from apc.frame.jacobians import jacobians
 from apc.frame.linearize import start_sends
@@ -83,7 +83,7 @@ def write_modelica(path: Path, modelica_model: ModelicaModel) -> None:
     write_text(path, modelica_model.text)
 
 
-def modelica(system: CompiledSystem) -> ModelicaModel:
+def modelica(system: Model) -> ModelicaModel:
     """Write a scene as a Modelica model.
 
     Parameters
@@ -97,16 +97,16 @@ def modelica(system: CompiledSystem) -> ModelicaModel:
         E955 what the scene says and Modelica has no words for; E801, E802 a mean that can't be.
     """
     with finite_equations(system.name):
-        return _Writer(stamped(system)).model()
+        return _ModelicaWriter(stamped(system)).model()
 
 
-class _Writer:
+class _ModelicaWriter:
     """Writes a model: declarations and equations as they are needed."""
 
-    def __init__(self, system: CompiledSystem) -> None:
+    def __init__(self, system: Model) -> None:
         self.system = system
         self.numbers = resolve(system)
-        self.exchange: Exchange = build_exchange(system, self.numbers.timings)
+        self.exchange: CommunicationGraph = build_exchange(system, self.numbers.timings)
         timing = self.numbers.timings
         self.grids = {clock.name: (timing[clock.period], timing[clock.phase]) for clock in system.clocks}
         self.clock_of = {link.name: link.clock for link in system.links}
@@ -315,7 +315,7 @@ class _Writer:
 class _Peer:
     """What one peer has in a model: its parameters `p`, states `x` and what its holds put out, `u`."""
 
-    def __init__(self, writer: _Writer, number: int, group: int) -> None:
+    def __init__(self, writer: _ModelicaWriter, number: int, group: int) -> None:
         self.writer, self.number, self.group = writer, number, writer.system.groups[group]
         system, numbers, exchange = writer.system, writer.numbers, writer.exchange
         self.kind, self.name = system.kinds[self.group.kind], exchange.peer_name(number)
@@ -439,7 +439,7 @@ class _Peer:
         return writer.let(f"{self.name}.{receive.name}", value or "0", unit)
 
 
-def _refuse_what_has_no_words(system: CompiledSystem, exchange: Exchange) -> None:
+def _refuse_what_has_no_words(system: Model, exchange: CommunicationGraph) -> None:
     """Refuse what the equations of a model can't say: ApcError E955."""
     for link, law in unreliable(system):
         what = f"{chance(link, law)}: luck that is drawn packet by packet"
@@ -459,8 +459,10 @@ def _refuse_what_has_no_words(system: CompiledSystem, exchange: Exchange) -> Non
         raise _refused(system, what, f"fewer peers: --set {system.groups[0].name}.count=10")
 
 
-def _refused(system: CompiledSystem, what: str, hint: str) -> ApcError:
-    return ApcError(Mistake("E955", Place(system.origin.topology), f"not in Modelica: {what}", hint=hint))
+def _refused(system: Model, what: str, hint: str) -> ApcError:
+    return ApcError(
+        Diagnostic("E955", SourceLocation(system.origin.topology), f"not in Modelica: {what}", hint=hint)
+    )
 
 
 def _grid(times: Sequence[Fraction]) -> Fraction:

@@ -1,8 +1,8 @@
 """One peer apart from the others: what it measures and hears, computes, sends, and moves by itself.
 
-Takes: a `CompiledSystem`, which of its peers, how its states move between events.
-Gives: `Peer`, `peer_of`, `sites_of`, `lines_of`, `first_packet`, `heard_of`, `has_edge`, `computing`,
-`refused`; its parts `Instant`, `Act`, `Line`, `Sender`, `Force`, `Move`.
+Takes: a `Model`, which of its peers, how its states move between events.
+Gives: `ExportedPeer`, `peer_of`, `sites_of`, `lines_of`, `first_packet`, `heard_of`, `has_edge`, `computing`,
+`refused`; its parts `Instant`, `ForceUpdate`, `PeerLink`, `Sender`, `Force`, `Move`.
 Guarantees: the functions, transitions and instants are those that `simulate` plays; what stands in no finite
 list of arithmetic is refused, by the name of what moves or is computed so.
 Does not: write anything (see `c_text`), or carry packets from peer to peer (see `scene_text`).
@@ -26,8 +26,8 @@ from typing import Any
 import casadi
 import numpy as np
 
-from apc.compiler.compiled import CompiledSystem, Kind
-from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.compiled import Model, PeerType
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
 from apc.compiler.interpolation import jacobian
 from apc.compiler.language.vectors import whole_and_index
 from apc.exports.identifiers import identifier, prefixed
@@ -35,8 +35,8 @@ from apc.frame import schedule as frames
 from apc.frame.devices import Device, coupled_directly, find_device, find_devices
 from apc.frame.discretize import moved_together
 from apc.frame.exact import evaluate_exact
-from apc.frame.exchange import Exchange
-from apc.frame.jacobians import SiteJacobians, edge_name, structural_pattern
+from apc.frame.exchange import CommunicationGraph
+from apc.frame.jacobians import SubsystemJacobians, edge_name, structural_pattern
 from apc.frame.linearize import start_arguments, start_values
 from apc.frame.parameters import exact_numbers
 from apc.frame.schedule import Schedule
@@ -45,7 +45,7 @@ from apc.simulation.program import timed_events
 from apc.simulation.propagate import rates, transition_rows
 from apc.simulation.settings import Method
 from apc.simulation.signals import LocalSignal, local_signals
-from apc.simulation.simulation import Plan
+from apc.simulation.simulation import SimulationPlan
 
 NO_DEVICE = "none"  # the word for a peer that moves nothing outside its computer
 MOST_HEARD = 20_000  # peers that one hears: each is a line of the text
@@ -53,7 +53,7 @@ STEPS = "--method rk4:0.1ms"  # a method that is arithmetic, whatever moves
 
 
 @dataclass(frozen=True, slots=True)
-class Act:
+class ForceUpdate:
     """Hold `hold` puts out what was computed for it `lag` ticks ago."""
 
     hold: int
@@ -69,7 +69,7 @@ class Instant:
 
     sends: tuple[int, ...]
     ticks: tuple[int, ...]
-    acts: tuple[Act, ...]
+    acts: tuple[ForceUpdate, ...]
     move: int
 
 
@@ -87,7 +87,7 @@ class Sender:
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class PacketEntry:
     """An entry of a packet: its channel's name, its unit, and what it is called in C."""
 
     name: str
@@ -96,7 +96,7 @@ class Entry:
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class PeerLink:
     """A link as one peer has it: what a packet holds, who is heard, whether it can miss a packet.
 
     In C the line is called `name`. `sending` is the peer's own send partition, −1 if it sends nothing there;
@@ -105,7 +105,7 @@ class Line:
 
     link: str
     name: str
-    packet: tuple[Entry, ...]
+    packet: tuple[PacketEntry, ...]
     sending: int
     senders: tuple[Sender, ...]
     missing: bool
@@ -139,7 +139,7 @@ class Move:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Peer:
+class ExportedPeer:
     """A peer. `number` counts from 0 over all groups; `parameters` (n_p,) are its kind's.
 
     In C it is called `identifier`. `outside` are the states that its computer does not move, `measured` those
@@ -149,17 +149,17 @@ class Peer:
     `settable` are the places of the parameters that only ticks read, see `_settable`.
     """
 
-    system: CompiledSystem
+    system: Model
     name: str
     identifier: str
     number: int
-    kind: Kind
+    kind: PeerType
     schedule: Schedule
     parameters: Any
     outside: frozenset[int]
     measured: dict[int, str]
     forces: dict[str, Force]
-    lines: tuple[Line, ...]
+    lines: tuple[PeerLink, ...]
     channels: dict[tuple[int, int], tuple[int, ...]]
     instants: tuple[Instant, ...]
     moves: tuple[Move, ...]
@@ -179,18 +179,18 @@ class Peer:
         )
 
     @property
-    def sending(self) -> tuple[Line, ...]:
+    def sending(self) -> tuple[PeerLink, ...]:
         """The lines over which it sends."""
         return tuple(line for line in self.lines if line.sending >= 0)
 
-    def line(self, link: str) -> Line:
+    def line(self, link: str) -> PeerLink:
         """Return what it has of a link."""
         return next(line for line in self.lines if line.link == link)
 
 
 def peer_of(
-    plan: Plan, number: int, method: Method, *, device: str | None = NO_DEVICE, name: str = ""
-) -> Peer:
+    plan: SimulationPlan, number: int, method: Method, *, device: str | None = NO_DEVICE, name: str = ""
+) -> ExportedPeer:
     """Take a peer out of its scene.
 
     Parameters
@@ -224,7 +224,7 @@ def peer_of(
     forces = _forces(system, label, site, vector, outside)
     pushed = prefixed("force", (force.name for force in forces))
     x, _, memories = start_values(site, [float(item) for item in vector])
-    return Peer(
+    return ExportedPeer(
         system=system,
         name=label,
         identifier=name or identifier(label),
@@ -245,14 +245,14 @@ def peer_of(
     )
 
 
-def _parameters(plan: Plan, number: int) -> Any:
+def _parameters(plan: SimulationPlan, number: int) -> Any:
     """Return a peer's vector (n_p,) of parameters."""
     group = plan.exchange.group_of(number)
     row = plan.numbers.rows[group][number - int(plan.exchange.starts[group])]
     return plan.numbers.parameters[group][int(row)]
 
 
-def _settable(kind: Kind) -> tuple[int, ...]:
+def _settable(kind: PeerType) -> tuple[int, ...]:
     """Return the places of the parameters that only ticks read: how states move, what they and packets start
     with, is the same whatever these are."""
     ticks = [
@@ -279,7 +279,7 @@ def _settable(kind: Kind) -> tuple[int, ...]:
     return tuple(place for place in places if kind.parameters[place] not in fixed)
 
 
-def sites_of(plan: Plan) -> tuple[int, ...]:
+def sites_of(plan: SimulationPlan) -> tuple[int, ...]:
     """Return of every peer the first one of its group and numbers that hears others by the same weights."""
     first: dict[Any, int] = {}
     numbers = []
@@ -294,12 +294,12 @@ def sites_of(plan: Plan) -> tuple[int, ...]:
     return tuple(numbers)
 
 
-def refused(system: CompiledSystem, what: str, hint: str = "", code: str = "E960") -> ApcError:
+def refused(system: Model, what: str, hint: str = "", code: str = "E960") -> ApcError:
     """Return the message of what can't be written as C."""
-    return ApcError(Mistake(code, Place(system.origin.topology), what, hint=hint))
+    return ApcError(Diagnostic(code, SourceLocation(system.origin.topology), what, hint=hint))
 
 
-def _refuse_what_iterates(system: CompiledSystem, name: str, kind: Kind) -> None:
+def _refuse_what_iterates(system: Model, name: str, kind: PeerType) -> None:
     """Refuse a peer of which something is solved by Newton's method."""
     for function, when, what, where in computing(kind):
         if not function.is_a("SXFunction"):
@@ -314,7 +314,7 @@ def _refuse_what_iterates(system: CompiledSystem, name: str, kind: Kind) -> None
 
 
 def _outside(
-    system: CompiledSystem, name: str, site: SiteJacobians, vector: Any, device: str | None
+    system: Model, name: str, site: SubsystemJacobians, vector: Any, device: str | None
 ) -> frozenset[int]:
     """Return the states that the peer's computer does not move."""
     kind = site.kind
@@ -360,19 +360,19 @@ def _outside(
     return frozenset(outside)
 
 
-def _is_position(kind: Kind, site: SiteJacobians, row: int) -> bool:
+def _is_position(kind: PeerType, site: SubsystemJacobians, row: int) -> bool:
     """Say whether a state is a place whose rate is another state, as of a mass."""
     return kind.states[row].unit == "m" and site.pattern.a[row].sum() == 1 and not site.pattern.b[row].any()
 
 
-def _read(kind: Kind) -> frozenset[int]:
+def _read(kind: PeerType) -> frozenset[int]:
     """Return the states that anything computed at an instant looks at."""
     reads = [structural_pattern(function.jac_sparsity(0, 0)).any(axis=0) for function, *_ in computing(kind)]
     return frozenset(np.flatnonzero(np.any(reads, axis=0)).tolist())
 
 
 def _forces(
-    system: CompiledSystem, name: str, site: SiteJacobians, vector: Any, outside: frozenset[int]
+    system: Model, name: str, site: SubsystemJacobians, vector: Any, outside: frozenset[int]
 ) -> tuple[Force, ...]:
     """Return what pushes the devices, as sums of what holds put out."""
     kind = site.kind
@@ -411,7 +411,7 @@ def _forces(
 
 
 def _moves(
-    plan: Plan,
+    plan: SimulationPlan,
     name: str,
     group: int,
     outside: frozenset[int],
@@ -463,12 +463,12 @@ def _instants(schedule: Schedule) -> tuple[tuple[Instant, ...], tuple[int, ...]]
         assert isinstance(move, frames.Propagate), "an instant is over when time goes on"
         ticks = tuple(tick.partition for tick in listed if isinstance(tick, frames.Tick))
         ticked.update(ticks)
-        acts = [(act.hold, act.value) for act in listed if isinstance(act, frames.Act)]
+        acts = [(act.hold, act.value) for act in listed if isinstance(act, frames.HoldUpdate)]
         instants.append(
             Instant(
-                tuple(send.partition for send in listed if isinstance(send, frames.Send)),
+                tuple(send.partition for send in listed if isinstance(send, frames.SendEvent)),
                 ticks,
-                tuple(Act(hold, ticked[value.partition] - 1 - value.index) for hold, value in acts),
+                tuple(ForceUpdate(hold, ticked[value.partition] - 1 - value.index) for hold, value in acts),
                 lengths.index(move.duration),
             )
         )
@@ -478,7 +478,9 @@ def _instants(schedule: Schedule) -> tuple[tuple[Instant, ...], tuple[int, ...]]
 # ---- what is heard
 
 
-def lines_of(plan: Plan, number: int) -> tuple[tuple[Line, ...], dict[tuple[int, int], tuple[int, ...]]]:
+def lines_of(
+    plan: SimulationPlan, number: int
+) -> tuple[tuple[PeerLink, ...], dict[tuple[int, int], tuple[int, ...]]]:
     """Return the links of a peer, and for every receive the places of its channels on its line."""
     system, exchange, group = plan.system, plan.exchange, plan.exchange.group_of(number)
     site, schedule = plan.sites[system.groups[group].kind], plan.schedules[group]
@@ -490,7 +492,7 @@ def lines_of(plan: Plan, number: int) -> tuple[tuple[Line, ...], dict[tuple[int,
         for place, rows in enumerate(event.heard)
         if rows
     }
-    lines: list[Line] = []
+    lines: list[PeerLink] = []
     places: dict[tuple[int, int], tuple[int, ...]] = {}
     for name, (link, declared) in zip(prefixed("link", exchange.links), exchange.links.items(), strict=True):
         sent = {sent.channel for sent in schedule.sent if sent.link == link}
@@ -515,10 +517,10 @@ def lines_of(plan: Plan, number: int) -> tuple[tuple[Line, ...], dict[tuple[int,
             raise refused(system, what, "fewer peers, or a graph that is not complete")
         law = declared.channel
         lines.append(
-            Line(
+            PeerLink(
                 link=link,
                 name=name,
-                packet=tuple(map(Entry, channels, [send_partition.units[i] for i in used], members)),
+                packet=tuple(map(PacketEntry, channels, [send_partition.units[i] for i in used], members)),
                 sending=place if sent else -1,
                 senders=tuple(
                     Sender(
@@ -533,7 +535,7 @@ def lines_of(plan: Plan, number: int) -> tuple[tuple[Line, ...], dict[tuple[int,
     return tuple(lines), places
 
 
-def first_packet(plan: Plan, link: str, number: int, channels: Sequence[str]) -> tuple[float, ...]:
+def first_packet(plan: SimulationPlan, link: str, number: int, channels: Sequence[str]) -> tuple[float, ...]:
     """Return what is heard of a peer over a link before any packet of it arrives, channel by channel."""
     site = plan.sites[plan.system.groups[plan.exchange.group_of(number)].kind]
     sent: dict[str, float] = {}
@@ -547,7 +549,7 @@ def first_packet(plan: Plan, link: str, number: int, channels: Sequence[str]) ->
 
 
 def heard_of(
-    system: CompiledSystem, exchange: Exchange, link: str, number: int
+    system: Model, exchange: CommunicationGraph, link: str, number: int
 ) -> Iterator[tuple[int, float]]:
     """Yield the peers that one hears over a link, with their weights, in the scene's order."""
     if exchange.is_complete(link):
@@ -561,7 +563,7 @@ def heard_of(
     return ((number, weight) for number, weight in listed if sends[exchange.group_of(number)])
 
 
-def computing(kind: Kind) -> list[tuple[Any, str, str, str]]:
+def computing(kind: PeerType) -> list[tuple[Any, str, str, str]]:
     """Return all that a peer computes at instants: each function, when, what it gives, over which link."""
     result = [
         (clock.tick, f"at a tick of {clock.clock} ", ", ".join(clock.outputs), "") for clock in kind.clocks
@@ -571,7 +573,7 @@ def computing(kind: Kind) -> list[tuple[Any, str, str, str]]:
     return [*result, *((send.send, "", ", ".join(send.channels), f" of {send.link}") for send in kind.sends)]
 
 
-def has_edge(kind: Kind, partition: int, receive: int) -> bool:
+def has_edge(kind: PeerType, partition: int, receive: int) -> bool:
     """Say whether a receive looks at each sender by itself."""
     clock = kind.clocks[partition]
     return bool(edge_name(clock, clock.receives[receive]))

@@ -1,6 +1,6 @@
 """A scene whose devices are pushed from outside: a force on each that stays as it was set.
 
-Takes: a `CompiledSystem`. Gives: `pushed`, `FORCE_ON`.
+Takes: a `Model`. Gives: `pushed`, `FORCE_ON`.
 Guarantees: without a push nothing moves otherwise; a push that is set before a tick of the fastest clock acts
 from that tick on. Along each axis of a device that moves along several there is a force of its own.
 Does not: say who sets it.
@@ -14,7 +14,7 @@ from typing import Any
 
 import casadi
 
-from apc.compiler.compiled import CompiledSystem, Hold, Kind, Parameter, Timing
+from apc.compiler.compiled import Hold, Model, Parameter, PeerType, Timing
 from apc.compiler.functions.scene_data import NO_DELAY
 from apc.frame.devices import Device, coupled_directly, find_devices, rewritten
 from apc.frame.jacobians import jacobians
@@ -23,7 +23,7 @@ from apc.frame.parameters import resolve
 FORCE_ON = "force on "  # and the device
 
 
-def pushed(system: CompiledSystem) -> CompiledSystem:
+def pushed(system: Model) -> Model:
     """Return a scene with a force on each device: a parameter that the fastest clock puts out.
 
     Parameters
@@ -56,7 +56,7 @@ def pushed(system: CompiledSystem) -> CompiledSystem:
     )
 
 
-def _pushed(kind: Kind, devices: dict[str, Device], fastest: int) -> Kind:
+def _pushed(kind: PeerType, devices: dict[str, Device], fastest: int) -> PeerType:
     """Return a kind with a force on each of its devices, by name, which a clock partition puts out."""
     before = kind.clocks[fastest]
     held, own, first = len(kind.holds), len(kind.parameters), len(before.outputs)

@@ -1,7 +1,7 @@
 """Several peers in one C text, and the packets between them; or one peer that hears from outside.
 
 Takes: what the peers of a scene do in a frame. Gives: `CScene`, `c_scene`, `one_peer`; `shared`;
-`Variable`.
+`CVariable`.
 Guarantees: time counts in whole quanta; of what happens at once all sends come first, then what is heard,
 then ticks, as everywhere; a value is looked at as it is just before an instant's ticks, as in a row of
 `simulate`. The luck of each packet is the one that `simulate` draws, from the scene's seed, and so is the
@@ -25,7 +25,7 @@ from apc.exports.c_text import memory, parameter_units
 from apc.exports.identifiers import identifier, prefixed
 from apc.exports.peer_step import (
     MOST_HEARD,
-    Peer,
+    ExportedPeer,
     first_packet,
     lines_of,
     peer_of,
@@ -34,15 +34,15 @@ from apc.exports.peer_step import (
 )
 from apc.exports.pushed import FORCE_ON
 from apc.network.channel import luck_key
-from apc.network.timetable import Luck, luck_of
+from apc.network.timetable import ArrivalProcess, luck_of
 from apc.simulation.settings import Method
-from apc.simulation.simulation import Plan
+from apc.simulation.simulation import SimulationPlan
 
 MOST_WAYS = 20_000  # from peer to peer in one text: each is a number of a table
 
 
 @dataclass(frozen=True, slots=True)
-class Variable:
+class CVariable:
     """What can be looked at: its name as `simulate` has it, unit, and the member of `model` that holds it.
 
     Its `role` is "input" or "flag" (0 or 1) of what comes from outside, and is `start` until something does;
@@ -62,7 +62,7 @@ class Variable:
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
+class CLink:
     """A link in a scene, called `name` in C: its period, phase and the channels of its packets.
 
     `ring` packets of each peer are kept; `start` (peers, channels) is what is heard before the first arrives.
@@ -80,7 +80,7 @@ class Link:
     start: tuple[tuple[float, ...], ...]
     ways: tuple[tuple[int, int], ...]
     delays: tuple[Fraction, ...]
-    luck: Luck | None
+    luck: ArrivalProcess | None
     key: tuple[int, int]
     kept: int
 
@@ -94,13 +94,13 @@ class CScene:
 
     name: str
     quantum: Fraction
-    codes: tuple[Peer, ...]
+    codes: tuple[ExportedPeer, ...]
     peers: tuple[tuple[int, int], ...]
-    links: tuple[Link, ...]
-    variables: tuple[Variable, ...]
+    links: tuple[CLink, ...]
+    variables: tuple[CVariable, ...]
 
 
-def one_peer(plan: Plan, number: int, method: Method) -> CScene:
+def one_peer(plan: SimulationPlan, number: int, method: Method) -> CScene:
     """Return one peer, its device with it, that hears from outside. Raises ApcError as `peer_of`."""
     peer = peer_of(plan, number, method)
     variables = []
@@ -108,14 +108,14 @@ def one_peer(plan: Plan, number: int, method: Method) -> CScene:
         for k, sender in enumerate(line.senders):
             label, member = f"{line.link}.{sender.name}", f"in0[0].{line.name}[{k}]"
             variables += [
-                Variable(f"{label}.{entry.name}", entry.unit, f"{member}.{entry.member}", "input", start)
+                CVariable(f"{label}.{entry.name}", entry.unit, f"{member}.{entry.member}", "input", start)
                 for entry, start in zip(line.packet, sender.start, strict=True)
             ]
             if line.missing:
-                flag = Variable(f"{label}.missing", "1", f"{member}.missing", "flag")
+                flag = CVariable(f"{label}.missing", "1", f"{member}.missing", "flag")
                 variables.append(flag)
     variables += [
-        Variable(f"{line.link}.{entry.name}", entry.unit, f"out0[0].{line.name}.{entry.member}")
+        CVariable(f"{line.link}.{entry.name}", entry.unit, f"out0[0].{line.name}.{entry.member}")
         for line in peer.sending
         for entry in line.packet
     ]
@@ -124,26 +124,26 @@ def one_peer(plan: Plan, number: int, method: Method) -> CScene:
     return CScene(peer.identifier, peer.schedule.quantum, (peer,), ((0, 0),), (), tuple(variables))
 
 
-def _looked_at(peer: Peer, member: str, prefix: str) -> list[Variable]:
+def _looked_at(peer: ExportedPeer, member: str, prefix: str) -> list[CVariable]:
     """Return what can be looked at of a peer that a member of `model` is."""
     variables = []
     for signal in peer.signals:
         began = ("state", peer.start[signal.place[0]]) if signal.role == "state" else ()
         own = f"{member}.{memory(peer, signal)}"
         if not signal.name.startswith(FORCE_ON):
-            variables.append(Variable(prefix + signal.name, signal.unit, own, *began))
+            variables.append(CVariable(prefix + signal.name, signal.unit, own, *began))
     units = parameter_units(peer)
     for k, place in enumerate(peer.settable):
         name, start, own = peer.kind.parameters[place], float(peer.parameters[place]), f"{member}.p[{k}]"
         if name.startswith(FORCE_ON):
             name = f"{FORCE_ON}{prefix}{name.removeprefix(FORCE_ON)}"
-            variables.append(Variable(name, "N", own, "input", start))
+            variables.append(CVariable(name, "N", own, "input", start))
         else:
-            variables.append(Variable(prefix + name, units[name], own, "parameter", start))
+            variables.append(CVariable(prefix + name, units[name], own, "parameter", start))
     return variables
 
 
-def c_scene(plan: Plan, method: Method) -> CScene:
+def c_scene(plan: SimulationPlan, method: Method) -> CScene:
     """Return a whole scene.
 
     Raises
@@ -178,7 +178,7 @@ def c_scene(plan: Plan, method: Method) -> CScene:
     return CScene(identifier(system.name), quantum, codes, tuple(peers), links, tuple(variables))
 
 
-def _links(plan: Plan, quantum: Fraction) -> tuple[Link, ...]:
+def _links(plan: SimulationPlan, quantum: Fraction) -> tuple[CLink, ...]:
     """Return the links of a scene; times count in quanta, in s."""
     exchange, timings = plan.exchange, plan.numbers.timings
     used: dict[str, dict[str, None]] = {}
@@ -204,7 +204,7 @@ def _links(plan: Plan, quantum: Fraction) -> tuple[Link, ...]:
         kept = max((luck.kept(route) for luck, route in lucks), default=0)
         latest = int(max(delays, default=Fraction(0)) / quantum)
         links.append(
-            Link(
+            CLink(
                 link=link,
                 name=f"sent_{name}",
                 period=period,

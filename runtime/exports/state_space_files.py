@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import write_file, write_text
-from apc.exports.identifiers import Port, identifier, words
+from apc.exports.identifiers import ExportedSignal, identifier, words
 from apc.exports.texts import filled
 from apc.optional import need
 
@@ -54,7 +54,7 @@ def write_mat(path: Path, state_space: StateSpace) -> None:
     """Write a MAT-file. Raises ApcError: E601 where it can't be, E951 where it is too large."""
     if max(matrix.nbytes for matrix in state_space.matrices) > LARGEST_MAT:
         what = "a variable of a MAT-file holds less than 2 GiB, and A is larger"
-        raise ApcError(Mistake("E951", Place(str(path)), what, hint="--to npz"))
+        raise ApcError(Diagnostic("E951", SourceLocation(str(path)), what, hint="--to npz"))
     from scipy.io import savemat
 
     variables = {
@@ -79,7 +79,7 @@ def write_npz(path: Path, state_space: StateSpace) -> None:
     write_file(path, write)
 
 
-def _named(state_space: StateSpace) -> list[tuple[str, tuple[Port, ...]]]:
+def _named(state_space: StateSpace) -> list[tuple[str, tuple[ExportedSignal, ...]]]:
     """Return what a state space has by names, under the word for it."""
     return [("states", state_space.states), ("inputs", state_space.inputs), ("outputs", state_space.outputs)]
 

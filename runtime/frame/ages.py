@@ -1,6 +1,6 @@
 """How old what is heard is, put into the equations: known at each tick, or told by stamps.
 
-Takes: a `CompiledSystem`, its timings.
+Takes: a `Model`, its timings.
 Gives: `aged`, `nominal`, `linear_sites`, `at_timings`, `stamped`.
 Guarantees: a scene that asks for no age is returned as it is. In `nominal`, where every packet arrives after
 its link's delay, an age is a number of each tick, the same in each frame: what multiplies it stays linear. In
@@ -21,11 +21,11 @@ from typing import Any
 
 import casadi
 
-from apc.compiler.compiled import ClockPartition, CompiledSystem, Kind, Receive, SendPartition
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import ClockPartition, Model, PeerType, Receive, SendPartition
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.multiples import common_multiple
-from apc.frame.exchange import Exchange, build_exchange
-from apc.frame.jacobians import SiteJacobians, jacobians
+from apc.frame.exchange import CommunicationGraph, build_exchange
+from apc.frame.jacobians import SubsystemJacobians, jacobians
 from apc.frame.schedule import ORDER
 
 # Kinds that are remembered with the ages of some timings.
@@ -36,12 +36,12 @@ STAMP = "time"  # the channel that tells when a packet was sent
 _Ages = tuple[tuple[str, Fraction], ...]  # of one tick, by link
 
 
-def aged(system: CompiledSystem) -> bool:
+def aged(system: Model) -> bool:
     """Say whether an equation of a scene asks how old what is heard is."""
     return any(map(_hears_ages, system.kinds))
 
 
-def _hears_ages(kind: Kind) -> bool:
+def _hears_ages(kind: PeerType) -> bool:
     return any(receive.age for partition in kind.clocks for receive in partition.receives)
 
 
@@ -49,30 +49,30 @@ def _hears_ages(kind: Kind) -> bool:
 
 
 def linear_sites(
-    system: CompiledSystem, timings: Mapping[str, Fraction] | None = None, order: Sequence[str] = ORDER
-) -> tuple[SiteJacobians, ...]:
+    system: Model, timings: Mapping[str, Fraction] | None = None, order: Sequence[str] = ORDER
+) -> tuple[SubsystemJacobians, ...]:
     """Return the Jacobians of each kind of `nominal`, with the system's own timings if none are given."""
     return tuple(jacobians(kind) for kind in nominal(system, timings, order).kinds)
 
 
-def of_one_delay(system: CompiledSystem) -> CompiledSystem:
+def of_one_delay(system: Model) -> Model:
     """Return a system in which all pairs have the delay of their link, so that each tick has one age."""
     return replace(system, links=tuple(replace(link, delays=()) for link in system.links))
 
 
 def at_timings(
-    system: CompiledSystem,
-    sites: tuple[SiteJacobians, ...],
+    system: Model,
+    sites: tuple[SubsystemJacobians, ...],
     timings: Mapping[str, Fraction],
     order: Sequence[str],
-) -> tuple[SiteJacobians, ...]:
+) -> tuple[SubsystemJacobians, ...]:
     """Return the Jacobians of each kind, those at hand unless ages follow from timings and order."""
     return linear_sites(system, timings, order) if aged(system) else sites
 
 
 def nominal(
-    system: CompiledSystem, timings: Mapping[str, Fraction] | None = None, order: Sequence[str] = ORDER
-) -> CompiledSystem:
+    system: Model, timings: Mapping[str, Fraction] | None = None, order: Sequence[str] = ORDER
+) -> Model:
     """Return the kinds of a linear analysis, with the ages that each tick finds on a nominal network.
 
     There every packet arrives after its link's delay.
@@ -105,8 +105,8 @@ def nominal(
 
 
 def _ages(
-    system: CompiledSystem,
-    exchange: Exchange,
+    system: Model,
+    exchange: CommunicationGraph,
     timings: Mapping[str, Fraction],
     number: int,
     partition: ClockPartition,
@@ -137,7 +137,7 @@ def _ages(
     return tuple(result)
 
 
-def _only_delay(system: CompiledSystem, exchange: Exchange, number: int, link: str) -> str:
+def _only_delay(system: Model, exchange: CommunicationGraph, number: int, link: str) -> str:
     """Return the timing of the delay with which all peers of a kind hear all others."""
     receivers = [place for place, group in enumerate(system.groups) if group.kind == number]
     delays = {
@@ -152,12 +152,12 @@ def _only_delay(system: CompiledSystem, exchange: Exchange, number: int, link: s
             f"the age of what peers of {system.kinds[number].name} hear over {link} differs from sender to "
             f"sender ({names}): that is not analysed; a simulation plays it"
         )
-        raise ApcError(Mistake("E811", Place(system.origin.topology), what, hint="apc simulate"))
+        raise ApcError(Diagnostic("E811", SourceLocation(system.origin.topology), what, hint="apc simulate"))
     return delays.pop() if delays else exchange.usual[link]
 
 
 @functools.lru_cache(maxsize=KEPT)
-def _nominal(kind: Kind, partitions: tuple[tuple[_Ages, ...], ...]) -> Kind:
+def _nominal(kind: PeerType, partitions: tuple[tuple[_Ages, ...], ...]) -> PeerType:
     """Return a kind with the ages of each clock's ticks put in."""
     clocks = [
         _with_ages(partition, ages) if ages else partition
@@ -234,7 +234,7 @@ def _at_age(receive: Receive, age: Fraction) -> Receive:
 # ---- every packet says when it was sent ----
 
 
-def stamped(system: CompiledSystem) -> CompiledSystem:
+def stamped(system: Model) -> Model:
     """Return a scene whose packets say when they were sent, where its ages follow from that.
 
     Beside a channel that is weighed by its age travels the same times the moment of sending.
@@ -254,7 +254,7 @@ def stamped(system: CompiledSystem) -> CompiledSystem:
 
 
 @functools.lru_cache(maxsize=KEPT)
-def _stamped(kind: Kind, wanted: tuple[tuple[str, tuple[str, ...]], ...]) -> Kind:
+def _stamped(kind: PeerType, wanted: tuple[tuple[str, tuple[str, ...]], ...]) -> PeerType:
     """Return a kind that stamps its packets: by link, the channels that are sent times their moment too."""
     asked = dict(wanted)
     sends = tuple(_stamping(send, asked[send.link]) if send.link in asked else send for send in kind.sends)

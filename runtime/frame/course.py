@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from apc.frame.discretize import exponential
 from apc.frame.lift import follow, followed
 from apc.frame.radius import FLOATS
-from apc.frame.schedule import Propagate, Schedule, Value
-from apc.frame.site import LinearSite, every_matrix, matrices_of
+from apc.frame.schedule import ClockedValue, Propagate, Schedule
+from apc.frame.site import LinearSubsystem, every_matrix, matrices_of
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -62,7 +62,7 @@ NEAR_ZERO = 1e-6
 
 
 def turns(
-    site: LinearSite,
+    site: LinearSubsystem,
     schedule: Schedule,
     start: Complexes,
     heard: Complexes,
@@ -123,7 +123,7 @@ def _real_where_real(start: Complexes, heard: Complexes, values: Complexes) -> t
     return begun, hears
 
 
-def _of_one(site: LinearSite) -> bool:
+def _of_one(site: LinearSubsystem) -> bool:
     """Say whether matrices (1, …) or (k, …) are those of one site."""
     return max(map(len, matrices_of(site))) == 1
 
@@ -139,7 +139,7 @@ def _some_of(places: Integers, matrix: Floats) -> Floats:
 
 
 def _courses(
-    site: LinearSite,
+    site: LinearSubsystem,
     schedule: Schedule,
     points: dict[int, int],
     start: Complexes,
@@ -164,7 +164,7 @@ def _courses(
         site = every_matrix(site, lambda matrix: matrix[0])
         steps = {duration: step[0] for duration, step in steps.items()}
     parts: list[NDArray[Any]] = []
-    computed: Mapping[Value, Floats] = {}
+    computed: Mapping[ClockedValue, Floats] = {}
 
     def rows_of(numbers: Complexes) -> Floats:
         return np.concatenate([numbers.real.T, numbers.imag.T], axis=1)
@@ -175,7 +175,7 @@ def _courses(
         halves = rows.reshape(len(rows), 2, count)
         return np.asarray(np.einsum("khn,nck->hck", matrix, halves).reshape(-1, 2 * count))
 
-    def watch(duration: int, moving: Floats, so_far: Mapping[Value, Floats]) -> None:
+    def watch(duration: int, moving: Floats, so_far: Mapping[ClockedValue, Floats]) -> None:
         nonlocal computed
         computed = so_far
         # Each mode's rows times its own columns: (points, k, 2).

@@ -1,7 +1,7 @@
 """The decisions in a peer's equations: comparisons, max, min, abs and sign of what moves.
 
-Takes: a kind of a `CompiledSystem`.
-Gives: `Decision`, `SwitchedKind`, `functions_of`, `find_switches`, `bound_kind`, `decided_kind`.
+Takes: a kind of a `Model`.
+Gives: `Decision`, `SwitchedPeerType`, `functions_of`, `find_switches`, `bound_kind`, `decided_kind`.
 Guarantees: found in the equations themselves: a comparison, an `if`, a `max`, `min`, `abs`, `sign` or `floor`
 of something that moves is a decision, whatever the part is called.
 Does not: know which pieces a motion can reach, or switch what depends on time and parameters alone.
@@ -22,7 +22,7 @@ from typing import Any
 
 import casadi
 
-from apc.compiler.compiled import Kind
+from apc.compiler.compiled import PeerType
 from apc.compiler.interpolation import Interpolation
 from apc.compiler.plain import LOOK, straight, symbolic, walk
 
@@ -55,7 +55,7 @@ class Decision:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Opened:
+class _DecidedFunction:
     """A function with its decisions as symbols: its location `where`, its inputs, its output column.
 
     `rows` name what its rows compute; a function of many variants computes them again and again.
@@ -73,15 +73,15 @@ class _Opened:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SwitchedKind:
+class SwitchedPeerType:
     """A kind with its decisions laid open. `walkable` is False where a nonlinear loop hides them.
 
     All functions share the symbols of `columns`, by name: x, u, p, t, and m, r and s of each clock and link.
     """
 
-    kind: Kind
+    kind: PeerType
     decisions: tuple[Decision, ...]
-    functions: tuple[_Opened, ...]
+    functions: tuple[_DecidedFunction, ...]
     walkable: bool
     columns: Mapping[str, Any]
 
@@ -188,14 +188,15 @@ def _branch(decision: Any, then: Any, otherwise: Any) -> Any:
 
 
 @functools.lru_cache(maxsize=KEPT)
-def find_switches(kind: Kind) -> SwitchedKind:
+def find_switches(kind: PeerType) -> SwitchedPeerType:
     """Lay a kind's decisions open."""
     functions = functions_of(kind)
     if not all(function.is_a("SXFunction") for _, function, _, _ in functions):
-        return SwitchedKind(kind, (), (), walkable=False, columns={})
+        return SwitchedPeerType(kind, (), (), walkable=False, columns={})
     opening = _Walk()
     opened = tuple(
-        _Opened(where, *opening.open(function, names), rows) for where, function, names, rows in functions
+        _DecidedFunction(where, *opening.open(function, names), rows)
+        for where, function, names, rows in functions
     )
     decisions = []
     for number, symbol in opening.symbols.items():
@@ -208,10 +209,10 @@ def find_switches(kind: Kind) -> SwitchedKind:
         guard, word = first - others[0] if others else first, opening.words[number]
         names = () if word == "eq" else tuple(changed)
         decisions.append(Decision(symbol, names, guard, word in _ABOVE, word == "eq"))
-    return SwitchedKind(kind, tuple(decisions), opened, walkable=True, columns=opening.columns)
+    return SwitchedPeerType(kind, tuple(decisions), opened, walkable=True, columns=opening.columns)
 
 
-def functions_of(kind: Kind) -> list[tuple[tuple[str, int, int], Any, tuple[str, ...], tuple[str, ...]]]:
+def functions_of(kind: PeerType) -> list[tuple[tuple[str, int, int], Any, tuple[str, ...], tuple[str, ...]]]:
     """Return a kind's functions: the location of each, itself, and the names of its arguments and rows."""
     states = tuple(state.name for state in kind.states)
     listed: list[tuple[tuple[str, int, int], Any, tuple[str, ...], tuple[str, ...]]] = [
@@ -231,7 +232,7 @@ def functions_of(kind: Kind) -> list[tuple[tuple[str, int, int], Any, tuple[str,
     return listed
 
 
-def _changed(kind: Kind, opened: _Opened, symbol: Any, operands: Sequence[Any]) -> list[str]:
+def _changed(kind: PeerType, opened: _DecidedFunction, symbol: Any, operands: Sequence[Any]) -> list[str]:
     """Return the names of what a decision changes in a function."""
     what, p, place = opened.where
     changed = opened.names(opened.output, symbol)
@@ -239,7 +240,7 @@ def _changed(kind: Kind, opened: _Opened, symbol: Any, operands: Sequence[Any]) 
         partition = kind.clocks[p]
         inputs = partition.tick.sx_in()
         computed = partition.tick(*inputs)
-        tick = _Opened(("tick", p, 0), tuple(inputs), computed, partition.outputs)
+        tick = _DecidedFunction(("tick", p, 0), tuple(inputs), computed, partition.outputs)
         return tick.names(computed, inputs[3][place])
     if what != "derivative":
         return changed
@@ -254,13 +255,13 @@ def _changed(kind: Kind, opened: _Opened, symbol: Any, operands: Sequence[Any]) 
     return [owner for owner in owners if owner and owner not in moving] or changed
 
 
-def bound_kind(switched: SwitchedKind, settings: Mapping[int, bool]) -> Kind:
+def bound_kind(switched: SwitchedPeerType, settings: Mapping[int, bool]) -> PeerType:
     """Return the kind with its decisions set to numbers; those left out are off."""
     numbers = [casadi.SX(float(settings.get(place, False))) for place in range(len(switched.decisions))]
     return decided_kind(switched, numbers)
 
 
-def decided_kind(switched: SwitchedKind, values: Sequence[Any]) -> Kind:
+def decided_kind(switched: SwitchedPeerType, values: Sequence[Any]) -> PeerType:
     """Return the kind with an expression (casadi.SX) in place of each decision's symbol."""
     symbols = casadi.vertcat(*(decision.symbol for decision in switched.decisions))
     result: dict[tuple[str, int, int], Any] = {}

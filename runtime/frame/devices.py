@@ -1,8 +1,8 @@
 """What a hand holds: a peer's device, found in its equations, and the peer with a hand on it.
 
-Takes: a kind's Jacobians and exact numbers; a `CompiledSystem`.
+Takes: a kind's Jacobians and exact numbers; a `Model`.
 Gives: `Device`, `find_device`, `find_devices`, `devices_of`, `coupled_directly`,
-`directions_of`; `no_device`; `Push`,
+`directions_of`; `no_device`; `ForceInput`,
 `find_push`; `HANDS`, `with_hands`, `without_hands`, `clamped`, `held`; `replaced_hands`; `refuse_hands`;
 `published`; `names_hand`, `refuse_numberless`; `OWN_MASS`, `UNHELD`.
 Guarantees: a scene that is clamped or held is a scene as any other: parameters, groups and clocks stay.
@@ -31,13 +31,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.cache import HANDS_CHANGE
-from apc.compiler.compiled import PEERS, CompiledSystem, Kind, Parameter, Ports, Receive
-from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.compiled import PEERS, ForcePorts, Model, Parameter, PeerType, Receive
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
 from apc.compiler.interpolation import jacobian
 from apc.compiler.language.vectors import whole_and_index
 from apc.frame.exact import evaluate_exact
-from apc.frame.jacobians import SiteJacobians, jacobians
-from apc.frame.linearize import Listening, start_arguments
+from apc.frame.jacobians import SubsystemJacobians, jacobians
+from apc.frame.linearize import InitialReception, start_arguments
 from apc.frame.overrides import apply, parse_override
 from apc.frame.parameters import exact_numbers, resolve
 
@@ -86,10 +86,10 @@ class Device:
 
 
 def find_device(
-    site: SiteJacobians,
+    site: SubsystemJacobians,
     parameters: NDArray[np.float64],
     unit_of: Mapping[str, str],
-    listening: Listening | None = None,
+    listening: InitialReception | None = None,
     *,
     part: str = "",
     direct: bool = False,
@@ -113,16 +113,16 @@ def find_device(
     return f"{text} ({kind.name})" if isinstance(text, str) else text
 
 
-def _is_plain(site: SiteJacobians) -> bool:
+def _is_plain(site: SubsystemJacobians) -> bool:
     """Return whether a site's equations can be walked through: they have no nonlinear loop."""
     return bool(site.walkable and site.kind.derivative.is_a("SXFunction"))
 
 
 def find_devices(
-    site: SiteJacobians,
+    site: SubsystemJacobians,
     parameters: NDArray[np.float64],
     unit_of: Mapping[str, str],
-    listening: Listening | None = None,
+    listening: InitialReception | None = None,
     *,
     part: str = "",
     direct: bool = False,
@@ -185,7 +185,7 @@ def find_devices(
 
 
 @functools.lru_cache(maxsize=64)
-def coupled_directly(kinds: tuple[Kind, ...]) -> bool:
+def coupled_directly(kinds: tuple[PeerType, ...]) -> bool:
     """Say whether devices are coupled directly: no mass is kept from the others, and some peers have no hand.
 
     Where some have a hand, each of the others has the part that it is joined to, and may be held there.
@@ -203,12 +203,12 @@ def coupled_directly(kinds: tuple[Kind, ...]) -> bool:
     return not all(gripped) and all(part & anywhere for part in parts if anywhere)
 
 
-def _grips(kind: Kind, part: str) -> bool:
+def _grips(kind: PeerType, part: str) -> bool:
     """Say whether a hand of the scene is joined to a part."""
     return any(part == text or part.startswith(f"{text}.") for text in kind.held)
 
 
-def _keeps_to_itself(site: SiteJacobians) -> bool:
+def _keeps_to_itself(site: SubsystemJacobians) -> bool:
     """Say whether a peer moves something that it tells nobody about."""
     told_of = _told_of(site)
     return any(
@@ -217,7 +217,7 @@ def _keeps_to_itself(site: SiteJacobians) -> bool:
     )
 
 
-def _told_of(site: SiteJacobians) -> set[str]:
+def _told_of(site: SubsystemJacobians) -> set[str]:
     """Return the parts whose positions others are told: as they are, or in what was computed to be sent."""
     kind = site.kind
     ticks = {tick.clock: tick for tick in site.pattern.ticks}
@@ -233,7 +233,7 @@ def _told_of(site: SiteJacobians) -> set[str]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Push:
+class ForceInput:
     """What a force at a part, or along an axis of it, does: so much to the rate of each of some velocities.
 
     `inverses` are exact, per newton, for the numbers it was found with; `symbolic` gives them for any, as a
@@ -247,13 +247,13 @@ class Push:
 
 
 def find_push(
-    site: SiteJacobians,
+    site: SubsystemJacobians,
     parameters: NDArray[np.float64],
     unit_of: Mapping[str, str],
-    listening: Listening | None,
+    listening: InitialReception | None,
     position: int,
     known: dict[str, Device | str | None] | None = None,
-) -> Push | str | None:
+) -> ForceInput | str | None:
     """Return what a force along a position of a peer does, None where nothing has a mass, or why not.
 
     Parameters
@@ -274,7 +274,7 @@ def find_push(
             known[part] = find_device(site, parameters, unit_of, listening, part=part)
         text = known[part]
         if isinstance(text, Device):
-            return Push(text.part, (text.velocity,), (text.inverse,), text.symbolic)
+            return ForceInput(text.part, (text.velocity,), (text.inverse,), text.symbolic)
         why = text
     driven = np.flatnonzero(site.pattern.a[position])
     masses = [
@@ -295,11 +295,13 @@ def find_push(
     shared = None if peers is None or p[peers] * by_peers[0][at] != slopes[at] else peers
     symbolic, moved = _column(kind, velocity, mass, at, shared)
     (inverses,) = evaluate_exact(symbolic, [x, u, p, t])
-    return Push(_part(name), moved, tuple(inverses), symbolic)
+    return ForceInput(_part(name), moved, tuple(inverses), symbolic)
 
 
 @functools.lru_cache(maxsize=64)
-def _column(kind: Kind, velocity: int, mass: int, at: int, peers: int | None) -> tuple[Any, tuple[int, ...]]:
+def _column(
+    kind: PeerType, velocity: int, mass: int, at: int, peers: int | None
+) -> tuple[Any, tuple[int, ...]]:
     """Return what a force at a velocity does to others' rates, from how slopes change with its mass."""
     x, u, p, t = kind.derivative.sx_in()
     rates = jacobian(kind.derivative(x, u, p, t), casadi.vertcat(x, u))[:, at]
@@ -316,13 +318,13 @@ def _part(name: str) -> str:
 
 
 @functools.lru_cache(maxsize=64)
-def _slopes(kind: Kind, velocity: int, masses: tuple[int, ...]) -> Any:
+def _slopes(kind: PeerType, velocity: int, masses: tuple[int, ...]) -> Any:
     """Return the slopes of a velocity's rate over states and holds, and how they change with each mass."""
     slopes, changes, inputs = _rates(kind, velocity, masses)
     return casadi.Function("slopes", inputs, [casadi.densify(item) for item in (slopes, *changes)])
 
 
-def _rates(kind: Kind, velocity: int, masses: Sequence[int]) -> tuple[Any, list[Any], list[Any]]:
+def _rates(kind: PeerType, velocity: int, masses: Sequence[int]) -> tuple[Any, list[Any], list[Any]]:
     """Return the same as expressions, and the symbols they are of."""
     x, u, p, t = kind.derivative.sx_in()
     rate = kind.derivative(x, u, p, t)[velocity]
@@ -331,7 +333,7 @@ def _rates(kind: Kind, velocity: int, masses: Sequence[int]) -> tuple[Any, list[
 
 
 @functools.lru_cache(maxsize=64)
-def _inverse(kind: Kind, velocity: int, mass: int, at: int, peers: int | None) -> Any:
+def _inverse(kind: PeerType, velocity: int, mass: int, at: int, peers: int | None) -> Any:
     """Return 1/m as a function of (x, u, p, t), from one slope and how it changes with a mass.
 
     Of a mass that peers share it is that of a copy: `peers` is where their number is among the parameters.
@@ -341,7 +343,7 @@ def _inverse(kind: Kind, velocity: int, mass: int, at: int, peers: int | None) -
     return casadi.Function("inverse_inertia", inputs, [casadi.simplify(-copies * change[at] / slopes[at])])
 
 
-def devices_of(system: CompiledSystem, *, option: str) -> dict[int, Device]:
+def devices_of(system: Model, *, option: str) -> dict[int, Device]:
     """Return the device of each kind of peer that has one; a server without any is not held.
 
     Parameters
@@ -365,7 +367,9 @@ def devices_of(system: CompiledSystem, *, option: str) -> dict[int, Device]:
         if isinstance(device, str):
             found = find_devices(site, numbers.parameters[place][0], unit_of, direct=direct)
             hint = _naming_what_is_held(system, site.kind, found)
-            raise ApcError(Mistake("E931", Place(system.origin.topology), f"{option}: {device}", hint=hint))
+            raise ApcError(
+                Diagnostic("E931", SourceLocation(system.origin.topology), f"{option}: {device}", hint=hint)
+            )
         if device is not None:
             result.setdefault(group.kind, device)
     if not result:
@@ -373,7 +377,7 @@ def devices_of(system: CompiledSystem, *, option: str) -> dict[int, Device]:
     return result
 
 
-def _naming_what_is_held(system: CompiledSystem, kind: Kind, found: Mapping[str, Device | str]) -> str:
+def _naming_what_is_held(system: Model, kind: PeerType, found: Mapping[str, Device | str]) -> str:
     """Return the entry of a hand at the first of several parts that a hand may hold, or nothing."""
     part = next((own for own, device in found.items() if isinstance(device, Device)), "")
     if kind.held or len(found) < 2 or not part or part.endswith("]"):
@@ -387,7 +391,7 @@ def _naming_what_is_held(system: CompiledSystem, kind: Kind, found: Mapping[str,
     return _HOLDS.format(part=part, at=at)
 
 
-def directions_of(system: CompiledSystem) -> dict[str, CompiledSystem]:
+def directions_of(system: Model) -> dict[str, Model]:
     """Return the scene once for each direction in which its devices move, held fast in all others.
 
     Nothing where each device moves along one line only.
@@ -410,7 +414,7 @@ def directions_of(system: CompiledSystem) -> dict[str, CompiledSystem]:
     return {axis: _along(system, [text for text in wanted if text != axis]) for axis in wanted}
 
 
-def _along(system: CompiledSystem, others: Sequence[str]) -> CompiledSystem:
+def _along(system: Model, others: Sequence[str]) -> Model:
     """Return a scene in which whatever moves along other axes is held where it starts."""
     kinds = []
     for kind in system.kinds:
@@ -428,23 +432,23 @@ def _along(system: CompiledSystem, others: Sequence[str]) -> CompiledSystem:
     return replace(system, kinds=tuple(kinds))
 
 
-def no_device(system: CompiledSystem, option: str) -> ApcError:
+def no_device(system: Model, option: str) -> ApcError:
     """Return the refusal of a scene in which nobody has a device."""
     names = ", ".join(group.name for group in system.groups)
     what = f"{option}: nothing can be held at {names}: each mass is a copy that others are told of"
-    return ApcError(Mistake("E931", Place(system.origin.topology), what, hint=OWN_MASS))
+    return ApcError(Diagnostic("E931", SourceLocation(system.origin.topology), what, hint=OWN_MASS))
 
 
-def refuse_hands(system: CompiledSystem, option: str) -> None:
+def refuse_hands(system: Model, option: str) -> None:
     """Refuse a scene that has hands already: ApcError E932."""
     for group in system.groups:
         for hand in system.kinds[group.kind].hands:
             what = f"{option}: {group.name} has a hand already, {hand}"
             hint = f"a scene without {hand}, or no {option}"
-            raise ApcError(Mistake("E932", Place(system.origin.topology), what, hint=hint))
+            raise ApcError(Diagnostic("E932", SourceLocation(system.origin.topology), what, hint=hint))
 
 
-def without_hands(system: CompiledSystem, option: str) -> CompiledSystem:
+def without_hands(system: Model, option: str) -> Model:
     """Return a scene without its hands, in the place of which others stand.
 
     Parameters
@@ -470,7 +474,7 @@ def without_hands(system: CompiledSystem, option: str) -> CompiledSystem:
 
 
 @functools.lru_cache(maxsize=64)
-def _without_hands(kind: Kind, units: tuple[str | None, ...]) -> Kind | None:
+def _without_hands(kind: PeerType, units: tuple[str | None, ...]) -> PeerType | None:
     """Return a kind whose hands have no mass, damping nor stiffness, None where more of them is left."""
     own = [
         place for place, name in enumerate(kind.parameters) if any(_is_of(name, hand) for hand in kind.hands)
@@ -498,13 +502,13 @@ def _is_of(name: str, hand: str) -> bool:
     return name.startswith(f"{hand}.") or _part(name) == hand
 
 
-def replaced_hands(system: CompiledSystem) -> tuple[str, ...]:
+def replaced_hands(system: Model) -> tuple[str, ...]:
     """Return what is said of hands of the scene in the place of which others stand."""
     names = [f"{hand} of {group.name}" for group in system.groups for hand in system.kinds[group.kind].hands]
     return (f"{', '.join(names)}: any passive hand stands there instead",) if names else ()
 
 
-def with_hands(system: CompiledSystem, hands: str) -> CompiledSystem:
+def with_hands(system: Model, hands: str) -> Model:
     """Return a scene with hands of a kind, its name saying so.
 
     Parameters
@@ -565,10 +569,10 @@ def refuse_numberless(hands: str, named: Iterable[str]) -> None:
     names = ", ".join(f"{HAND}.{name}" for name, _, _ in _NUMBERS)
     what, got = f"--hands {HELD}", "none, which is a free hand"
     hint = f"--hands {HELD} " + " ".join(f'--set "{HAND}.{name}={value}"' for name, value in _USUAL)
-    raise ApcError(Mistake("E930", Place("--hands"), what, f"a value for {names}", got, hint))
+    raise ApcError(Diagnostic("E930", SourceLocation("--hands"), what, f"a value for {names}", got, hint))
 
 
-def clamped(system: CompiledSystem, *, option: str = "--hands clamped") -> CompiledSystem:
+def clamped(system: Model, *, option: str = "--hands clamped") -> Model:
     """Return a scene whose devices are held fast where they start.
 
     Raises
@@ -587,7 +591,7 @@ def clamped(system: CompiledSystem, *, option: str = "--hands clamped") -> Compi
     return replace(system, kinds=tuple(kinds))
 
 
-def held(system: CompiledSystem, *, option: str) -> CompiledSystem:
+def held(system: Model, *, option: str) -> Model:
     """Return a scene with a hand on every device: mass, damping and stiffness are parameters, 0 at first.
 
     Raises
@@ -610,8 +614,8 @@ def held(system: CompiledSystem, *, option: str) -> CompiledSystem:
 
 @functools.lru_cache(maxsize=64)
 def _with_hand(
-    kind: Kind, position: int, velocity: int, inverse_inertia: Any, names: tuple[str, ...]
-) -> Kind:
+    kind: PeerType, position: int, velocity: int, inverse_inertia: Any, names: tuple[str, ...]
+) -> PeerType:
     """Return a kind whose device carries a hand: (m + m_h) v' = m v'₀ − b_h v − k_h (x − x₀)."""
     own = len(kind.parameters)
 
@@ -633,7 +637,7 @@ def _with_hand(
 
 
 @functools.lru_cache(maxsize=64)
-def _without(kind: Kind, position: int, velocity: int) -> Kind:
+def _without(kind: PeerType, position: int, velocity: int) -> PeerType:
     """Return a kind whose device stays where it starts, and is no state."""
     kept = [place for place in range(len(kind.states)) if place not in (position, velocity)]
     start = kind.parameters.index(kind.states[position].start)
@@ -655,22 +659,22 @@ def _without(kind: Kind, position: int, velocity: int) -> Kind:
     )
 
 
-def _with_linear(result: Kind, before: Kind, change: Callable[[Kind], Kind]) -> Kind:
+def _with_linear(result: PeerType, before: PeerType, change: Callable[[PeerType], PeerType]) -> PeerType:
     """Return a changed kind with the same change of the kind that represents it in a linear analysis."""
     return replace(result, linear=None if before.linear is None else change(before.linear))
 
 
-def analyzed(kind: Kind) -> Kind:
+def analyzed(kind: PeerType) -> PeerType:
     """Return the kind that represents a kind in a linear analysis."""
     return kind.linear or kind
 
 
 def rewritten(
-    kind: Kind,
-    before: Kind,
+    kind: PeerType,
+    before: PeerType,
     whole: Callable[[Any, Any], Any],
     rates: Callable[[Any, Any, Any, Any], Any],
-) -> Kind:
+) -> PeerType:
     """Return a kind of other states, parameters or more holds with its functions.
 
     Parameters
@@ -701,7 +705,7 @@ def rewritten(
         for clock in kind.clocks
     )
     sends = tuple(replace(send, send=again(send.send)) for send in kind.sends)
-    ports = None if kind.ports is None else Ports(kind.ports.parts, again(kind.ports.port))
+    ports = None if kind.ports is None else ForcePorts(kind.ports.parts, again(kind.ports.port))
     limits = tuple(
         limit if limit.value is None else replace(limit, value=again(limit.value)) for limit in kind.limits
     )
@@ -736,7 +740,7 @@ def published(name: str) -> dict[str, tuple[str, str, str]]:
         got = f"there are no hands {name[:40]!r}" if name.strip() else "no hands are named"
         what = f"{got} ({', '.join(listed)})"
         near = nearest(name, listed)
-        raise ApcError(Mistake("E930", Place("--hands"), what, hint=f"--hands {near or CLAMPED}"))
+        raise ApcError(Diagnostic("E930", SourceLocation("--hands"), what, hint=f"--hands {near or CLAMPED}"))
     return result[name]
 
 

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.frame.radius import FLOATS, RADII, UNIT, Arithmetic, radius_of, rounded, value_of, with_radius
 from apc.threads import load_pool
 
@@ -96,11 +96,11 @@ def discretize(a: Matrix, b: Matrix, durations: Sequence[Fraction]) -> tuple[Mat
     return tuple(steps)
 
 
-def refuse_many(states: int, place: Place) -> None:
+def refuse_many(states: int, place: SourceLocation) -> None:
     """Refuse more states of one peer than are exponentiated: ApcError E812."""
     if states > MOST_STATES:
         what = f"one peer has {states:,} states, and {MOST_STATES:,} are the most that are analysed"
-        raise ApcError(Mistake("E812", place, what, hint="smaller arrays, as count: 100"))
+        raise ApcError(Diagnostic("E812", place, what, hint="smaller arrays, as count: 100"))
 
 
 def _pieces(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> Iterator[tuple[Integers, Integers]]:
@@ -114,7 +114,7 @@ def _pieces(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> Iterator[tuple[Intege
     ApcError
         E812 too many states.
     """
-    refuse_many(len(a), Place("the scene"))
+    refuse_many(len(a), SourceLocation("the scene"))
     for states in moved_together(a):
         inputs = np.flatnonzero(b[states].any(axis=0))
         step = max(len(states), FEWEST_INPUTS)
@@ -148,7 +148,7 @@ def _steps(a: Matrix, b: Matrix, durations: Sequence[Fraction]) -> list[Matrix]:
                 f"them in a step, and {MOST_TOGETHER} such states are the most that are analysed"
             )
             hint = "smaller arrays, as count: 100, or shorter periods"
-            raise ApcError(Mistake("E812", Place("the scene"), what, hint=hint))
+            raise ApcError(Diagnostic("E812", SourceLocation("the scene"), what, hint=hint))
     generator = _generator(a, b)
     return [_step(generator * _rational(duration), len(a)) for duration in durations]
 
@@ -295,4 +295,4 @@ def _step(scaled: Any, n_x: int) -> Matrix:
                 return with_radius(middle, UNIT * np.abs(middle) + radius + least.reshape(middle.shape))
     finally:
         flint.ctx.prec = precision
-    raise ApcError(Mistake("E806", Place("the scene"), TOO_LARGE))
+    raise ApcError(Diagnostic("E806", SourceLocation("the scene"), TOO_LARGE))

@@ -1,6 +1,6 @@
 """In which unit people are shown a number that results hold in SI.
 
-Takes: a `Parameter`; a number in SI and its unit. Gives: `Unit`, `as_shown`.
+Takes: a `Parameter`; a number in SI and its unit. Gives: `DisplayUnit`, `as_shown`.
 Guarantees: plain data stays in SI.
 Does not: round.
 """
@@ -10,13 +10,13 @@ from __future__ import annotations
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
-from apc.compiler.errors import Place
+from apc.compiler.errors import SourceLocation
 
 if TYPE_CHECKING:
     from apc.compiler.compiled import Parameter
 
 
-class Unit(str):
+class DisplayUnit(str):
     """A unit in SI by its text, with the unit in which people are shown a value: the one the scene uses.
 
     Results hold values in SI and this unit, so that plain data is in SI; texts convert by `as_shown`.
@@ -24,14 +24,14 @@ class Unit(str):
 
     display: str
 
-    def __new__(cls, text: str, display: str = "") -> Unit:
+    def __new__(cls, text: str, display: str = "") -> DisplayUnit:
         """Return the unit; one without a unit for display is shown as it is."""
         unit = super().__new__(cls, text)
         unit.display = display
         return unit
 
     @classmethod
-    def of(cls, parameter: Parameter) -> Unit:
+    def of(cls, parameter: Parameter) -> DisplayUnit:
         """Return the unit of a parameter."""
         return cls(parameter.unit, parameter.display_unit)
 
@@ -46,5 +46,5 @@ def as_shown(value: float, unit: str) -> tuple[Fraction, str]:
         # Imported here: the language of quantities, which a scene in SI never needs.
         from apc.compiler.language.units import parse_unit
 
-        return 1 / parse_unit(display, Place("")).scale, display
+        return 1 / parse_unit(display, SourceLocation("")).scale, display
     return (Fraction(1000), "ms") if unit == "s" and 0 < abs(value) < 1 else (Fraction(1), unit)

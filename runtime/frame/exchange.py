@@ -1,7 +1,7 @@
 """Who hears whom, with what weight and how late: the links of a scene between its peers.
 
-Takes: a `CompiledSystem` and its timings.
-Gives: `Exchange`, `build_exchange`, `arcs`, `check_mean`.
+Takes: a `Model` and its timings.
+Gives: `CommunicationGraph`, `build_exchange`, `arcs`, `check_mean`.
 Guarantees: a complete graph, a ring and a star cost no more than their arcs.
 Does not: know what is sent, or when (see `scheduling`), or a graph's eigenvalues (see `graph_modes`).
 """
@@ -17,8 +17,8 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem, Graph, Link
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Graph, Link, Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -28,7 +28,7 @@ KEPT = 16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Exchange:
+class CommunicationGraph:
     """The links between the groups of a scene.
 
     `scene` is the file it stands in; `groups` are the groups' names (parts of one group have one name and
@@ -86,7 +86,7 @@ class Exchange:
         return f"{name}[{peer - int(self.starts[self.groups.index(name)]) + 1}]"
 
 
-def build_exchange(system: CompiledSystem, timings: Mapping[str, Fraction]) -> Exchange:
+def build_exchange(system: Model, timings: Mapping[str, Fraction]) -> CommunicationGraph:
     """Collect the links of a system, delays of equal value as one.
 
     Parameters
@@ -106,7 +106,7 @@ def _exchange(
     groups: tuple[tuple[str, int], ...],
     links: tuple[Link, ...],
     times: tuple[tuple[str, Fraction], ...],
-) -> Exchange:
+) -> CommunicationGraph:
     """Return what `build_exchange` does: of scenes that differ in other numbers only, the same object."""
     names, timings = tuple(name for name, _ in groups), dict(times)
     indices: dict[str, list[int]] = {}
@@ -120,7 +120,7 @@ def _exchange(
             if timing != link.delay:
                 pairs = itertools.product(indices[pair.sender], indices[pair.receiver])
                 late |= {(link.name, sender, receiver): timing for sender, receiver in pairs}
-    return Exchange(
+    return CommunicationGraph(
         scene=scene,
         groups=names,
         starts=np.cumsum([0] + [count for _, count in groups], dtype=np.int64),
@@ -147,7 +147,9 @@ def arcs(graph: Graph, peers: int) -> tuple[Integers, Floats]:
     return pairs, np.ones(len(pairs))
 
 
-def check_mean(exchange: Exchange, peer: int, link: str, operator: str, hears: bool, total: Fraction) -> None:
+def check_mean(
+    exchange: CommunicationGraph, peer: int, link: str, operator: str, hears: bool, total: Fraction
+) -> None:
     """Refuse a mean, maximum or minimum over nobody, or a mean whose weights add up to 0.
 
     Parameters
@@ -166,7 +168,7 @@ def check_mean(exchange: Exchange, peer: int, link: str, operator: str, hears: b
     name = exchange.peer_name(peer)
     if not hears:
         what = f"{name} hears nobody over {link}: there is no {operator} over nobody"
-        raise ApcError(Mistake("E801", Place(exchange.scene), what))
+        raise ApcError(Diagnostic("E801", SourceLocation(exchange.scene), what))
     if not total:
         what = f"the weights of what {name} hears over {link} add up to 0: there is no mean"
-        raise ApcError(Mistake("E802", Place(exchange.scene), what))
+        raise ApcError(Diagnostic("E802", SourceLocation(exchange.scene), what))

@@ -14,11 +14,11 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.source.nodes import Mapping
 from apc.compiler.source.source import parse_source
 
-SOMEWHERE = Place("the scene")  # of a mistake in numbers by themselves
+SOMEWHERE = SourceLocation("the scene")  # of a mistake in numbers by themselves
 
 _PART = re.compile(r"(?:^|\bder\(|\bslope of )(\w+)(?:[.\[]| of )")  # of what is not finite, or has a kink
 
@@ -44,7 +44,7 @@ def finite_equations(scene: str) -> Iterator[None]:
         yield
     except ApcError as error:
         raise ApcError(
-            replace(mistake, place=Place(scene)) if mistake.place == SOMEWHERE else mistake
+            replace(mistake, place=SourceLocation(scene)) if mistake.place == SOMEWHERE else mistake
             for mistake in error.mistakes
         ) from error
     except (ZeroDivisionError, OverflowError) as error:
@@ -55,7 +55,7 @@ def finite_equations(scene: str) -> Iterator[None]:
         raise
 
 
-def at_its_part(mistake: Mistake, topology: str, texts: Iterable[tuple[str, bytes]]) -> Mistake:
+def at_its_part(mistake: Diagnostic, topology: str, texts: Iterable[tuple[str, bytes]]) -> Diagnostic:
     """Return a mistake of a value that is not finite where the topology names the part of it.
 
     Parameters
@@ -74,7 +74,7 @@ def at_its_part(mistake: Mistake, topology: str, texts: Iterable[tuple[str, byte
         for key, _ in node.entries if isinstance(node, Mapping) else ():
             if key.text == part[1]:
                 return replace(mistake, place=key.place)
-    return replace(mistake, place=Place(topology))
+    return replace(mistake, place=SourceLocation(topology))
 
 
 def _mistake(scene: str) -> ApcError:
@@ -83,4 +83,4 @@ def _mistake(scene: str) -> ApcError:
         "a division by zero, a root or logarithm of a number below zero, or the like"
     )
     hint = "start values at which every equation can be evaluated"
-    return ApcError(Mistake("E808", Place(scene), what, hint=hint))
+    return ApcError(Diagnostic("E808", SourceLocation(scene), what, hint=hint))

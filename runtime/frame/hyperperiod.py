@@ -1,6 +1,6 @@
 """Exact time: the quantum that all times are multiples of, and the hyperperiod of the clocks, the frame.
 
-Takes: a `CompiledSystem`, its timings as exact rationals, what matters of its kinds.
+Takes: a `Model`, its timings as exact rationals, what matters of its kinds.
 Gives: `Times`, `ClockGrid`, `times_in_use`.
 Guarantees: every period, phase and delay in use is a whole number of quanta; what nobody uses takes no part.
 Does not: say what happens at an instant (see `scheduling`).
@@ -13,11 +13,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
-from apc.compiler.compiled import Clock, CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Clock, Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.multiples import common_divisor, common_multiple
-from apc.frame.liveness import Hearing, live_holds
-from apc.frame.site import LinearSite
+from apc.frame.liveness import ReceptionPattern, live_holds
+from apc.frame.site import LinearSubsystem
 
 MOST_TICKS = 20_000  # in a frame: each is a step of the lifting
 
@@ -50,11 +50,11 @@ class Times:
 
 
 def times_in_use(
-    system: CompiledSystem,
+    system: Model,
     timings: Mapping[str, Fraction],
-    patterns: Sequence[LinearSite],
+    patterns: Sequence[LinearSubsystem],
     live: Sequence[frozenset[tuple[int, int]]],
-    hearing: Sequence[Hearing],
+    hearing: Sequence[ReceptionPattern],
 ) -> Times:
     """Find the quantum of which every period, phase and delay in use is a multiple, and the frame.
 
@@ -90,7 +90,9 @@ def times_in_use(
     for name, delay in delays.items():
         if delay < 0:
             got = f"{float(delay):g} s"
-            raise ApcError(Mistake("E809", Place(system.origin.topology), name, "0 s or more", got))
+            raise ApcError(
+                Diagnostic("E809", SourceLocation(system.origin.topology), name, "0 s or more", got)
+            )
     if not clocks:  # nothing is sampled: any frame will do
         clocks = dict(clock_of) or {"": Clock("", "", "")}
     period = {name: timings[clock.period] if name else Fraction(1) for name, clock in clocks.items()}
@@ -110,7 +112,7 @@ def times_in_use(
 
 
 def _check_frame_length(
-    system: CompiledSystem,
+    system: Model,
     period: Mapping[str, Fraction],
     count: Mapping[str, int],
     frame: int,
@@ -132,8 +134,8 @@ def _check_frame_length(
             periods = (1000 * frame * quantum / ticks for ticks in fits)
             short = (f"{float(ms):g} ms" for ms in periods if Fraction(f"{float(ms):.3g}") == ms)
             hint = f"{fastest}: {next(short, f'{frame * quantum / fits[0]} s')}"
-        place = Place(system.origin.topology, odd.line, odd.column)
-        raise ApcError(Mistake("E805", place, what, hint=hint))
+        place = SourceLocation(system.origin.topology, odd.line, odd.column)
+        raise ApcError(Diagnostic("E805", place, what, hint=hint))
 
 
 def _fastest_that_fits(count: Mapping[str, int], frame: int) -> range:

@@ -1,7 +1,8 @@
 """A scene with numbers put in: what analyses of it share, and what one of them starts from.
 
-Takes: a `CompiledSystem`.
-Gives: `Prepared`, `prepare`, `prepared_at`, `starting`, `hangs_on_heard`; `Instance`, `instance`; `Peers`.
+Takes: a `Model`.
+Gives: `Prepared`, `prepare`, `prepared_at`, `starting`, `hangs_on_heard`; `Instance`, `instance`;
+`PeerIndices`.
 Guarantees: what does not follow from the numbers is built once for all of them.
 Does not: put peers together, or analyse (see `peers`).
 """
@@ -16,14 +17,14 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.frame.ages import at_timings, linear_sites
-from apc.frame.exchange import Exchange, build_exchange
-from apc.frame.jacobians import SiteJacobians
+from apc.frame.exchange import CommunicationGraph, build_exchange
+from apc.frame.jacobians import SubsystemJacobians
 from apc.frame.linearize import at_start, reaches_start, sends_nothing
-from apc.frame.names import Free
-from apc.frame.parameters import Numbers, resolve
+from apc.frame.names import ParameterRef
+from apc.frame.parameters import ResolvedNumbers, resolve
 from apc.frame.schedule import ORDER, Schedule
 from apc.frame.scheduling import build_schedules
 
@@ -39,7 +40,7 @@ class Prepared:
     `starting`).
     """
 
-    jacobians: tuple[SiteJacobians, ...]
+    jacobians: tuple[SubsystemJacobians, ...]
     schedules: tuple[Schedule, ...]
     timings: Mapping[str, Fraction]
     order: tuple[str, ...]
@@ -47,7 +48,7 @@ class Prepared:
 
 
 @dataclass(frozen=True, slots=True)
-class Peers:
+class PeerIndices:
     """Peers of a scene by number, in rising runs, each of a group: a billion equal peers take no memory."""
 
     runs: tuple[range, ...]
@@ -72,23 +73,23 @@ class Peers:
         return self.runs[-1][-1]
 
     @property
-    def others(self) -> Peers:
+    def others(self) -> PeerIndices:
         """All but the first of them."""
-        return Peers(tuple(run for run in (self.runs[0][1:], *self.runs[1:]) if run))
+        return PeerIndices(tuple(run for run in (self.runs[0][1:], *self.runs[1:]) if run))
 
 
 @dataclass(frozen=True, slots=True)
 class Instance:
     """A system at its numbers: Jacobians (one a kind), schedules (one a group), parameters, and the links."""
 
-    system: CompiledSystem
-    jacobians: tuple[SiteJacobians, ...]
+    system: Model
+    jacobians: tuple[SubsystemJacobians, ...]
     schedules: tuple[Schedule, ...]
-    numbers: Numbers
-    exchange: Exchange
+    numbers: ResolvedNumbers
+    exchange: CommunicationGraph
 
     @property
-    def sites(self) -> tuple[SiteJacobians, ...]:
+    def sites(self) -> tuple[SubsystemJacobians, ...]:
         """The Jacobians of each group's kind."""
         return tuple(self.jacobians[group.kind] for group in self.system.groups)
 
@@ -104,7 +105,7 @@ class Instance:
         return all(site.affine for site in self.sites)
 
 
-def prepare(system: CompiledSystem, sites: tuple[SiteJacobians, ...] | None = None) -> Prepared:
+def prepare(system: Model, sites: tuple[SubsystemJacobians, ...] | None = None) -> Prepared:
     """Do what analyses with different numbers can share.
 
     Parameters
@@ -124,7 +125,7 @@ def prepare(system: CompiledSystem, sites: tuple[SiteJacobians, ...] | None = No
     return _scheduled(system, sites, timings, ORDER)
 
 
-def instance(system: CompiledSystem, prepared: Prepared | None = None) -> Instance:
+def instance(system: Model, prepared: Prepared | None = None) -> Instance:
     """Return a system at the numbers that it has.
 
     Parameters
@@ -145,7 +146,7 @@ def instance(system: CompiledSystem, prepared: Prepared | None = None) -> Instan
     return Instance(system, prepared.jacobians, prepared.schedules, numbers, exchange)
 
 
-def prepared_at(system: CompiledSystem, prepared: Prepared, timings: Mapping[str, Fraction]) -> Prepared:
+def prepared_at(system: Model, prepared: Prepared, timings: Mapping[str, Fraction]) -> Prepared:
     """Return what was prepared for other timings: with their schedules, and with the ages they make.
 
     Raises
@@ -164,7 +165,7 @@ def prepared_at(system: CompiledSystem, prepared: Prepared, timings: Mapping[str
     return replace(_scheduled(system, sites, timings, prepared.order), starting=prepared.starting)
 
 
-def starting(system: CompiledSystem, prepared: Prepared, varied: Sequence[Free] = ()) -> Prepared | None:
+def starting(system: Model, prepared: Prepared, varied: Sequence[ParameterRef] = ()) -> Prepared | None:
     """Return what was prepared with every kind linearized where it starts, as its parameters say.
 
     None where what is heard at the start decides as well (see `linearize.at_start`), unless that is 0 from
@@ -184,8 +185,8 @@ def starting(system: CompiledSystem, prepared: Prepared, varied: Sequence[Free] 
 
 
 def _where_it_starts(
-    system: CompiledSystem, sites: tuple[SiteJacobians, ...], varied: Sequence[Free] = ()
-) -> tuple[SiteJacobians, ...] | None:
+    system: Model, sites: tuple[SubsystemJacobians, ...], varied: Sequence[ParameterRef] = ()
+) -> tuple[SubsystemJacobians, ...] | None:
     """Return the Jacobians of each kind where it starts, None where one's don't follow from parameters."""
     used = {group.kind for group in system.groups}
     silent = False
@@ -199,16 +200,16 @@ def _where_it_starts(
     return result if len(result) == len(sites) else None
 
 
-def hangs_on_heard(system: CompiledSystem) -> ApcError:
+def hangs_on_heard(system: Model) -> ApcError:
     """Return the refusal of a delay of a scene whose kinds' parameters don't say how these start."""
     what = "how the scene moves hangs on what is heard at the start: a delay can't be searched"
     hint = "apc critical of a stiffness or damping"
-    return ApcError(Mistake("E845", Place(system.origin.topology), what, hint=hint))
+    return ApcError(Diagnostic("E845", SourceLocation(system.origin.topology), what, hint=hint))
 
 
 def _scheduled(
-    system: CompiledSystem,
-    built: tuple[SiteJacobians, ...],
+    system: Model,
+    built: tuple[SubsystemJacobians, ...],
     timings: Mapping[str, Fraction],
     order: tuple[str, ...],
 ) -> Prepared:

@@ -1,7 +1,7 @@
 """The Jacobians of a kind, as one CasADi function of everything they may depend on; where one is not smooth.
 
-Takes: a kind of a `CompiledSystem`; CasADi expressions.
-Gives: `SiteJacobians` (built once a kind), `jacobians`, `with_equations`; `Edge`, `edge_name`;
+Takes: a kind of a `Model`; CasADi expressions.
+Gives: `SubsystemJacobians` (built once a kind), `jacobians`, `with_equations`; `EdgeJacobian`, `edge_name`;
 `structural_pattern`; `guards_of`, `lookups_of`, `nodes_of`.
 Guarantees: structural patterns come from CasADi, whatever the numbers; a kind that is called affine has the
 same Jacobians everywhere. Every comparison, max, min, abs, sign, floor, ceil and table that hangs on what
@@ -25,10 +25,10 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import ClockPartition, Kind, Receive
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import ClockPartition, PeerType, Receive
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.interpolation import Interpolation, function_of, jacobian, table_of
-from apc.frame.site import LinearSite, Matrix, assemble, with_own_parts
+from apc.frame.site import LinearSubsystem, Matrix, assemble, with_own_parts
 
 # Kinds whose Jacobians are remembered.
 KEPT = 64
@@ -92,7 +92,7 @@ def nodes_of(expression: Any) -> Iterator[Any]:
 
 
 @dataclass(frozen=True, slots=True)
-class Edge:
+class EdgeJacobian:
     """What a receive does with one sender: its edge function with its slopes.
 
     `function(x, u, m, s, p, t)` is a column: the value, then the slopes over x, u, m and s. `affine` says
@@ -105,25 +105,25 @@ class Edge:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SiteJacobians:
+class SubsystemJacobians:
     """The Jacobians of a kind as one CasADi function of (x, u, m, r, p, t); m and r of all clocks in a row.
 
-    The function's one output is every matrix of a `LinearSite`, in order, column-major, less what is zero by
-    structure; `shapes` cuts it.
-    `edges` are those of its receives by (clock partition, receive). `timed` says that some entry depends on
-    time, if only on whether something has switched (see `switches.varying_slopes`). `equations` is the kind
-    whose functions are differentiated: `kind`, or one of its pieces. `ties`, where the start values are put
-    in, is a function of the parameters that is above 0 at a tie (see `frame.kinks`).
+    The function's one output is every matrix of a `LinearSubsystem`, in order, column-major, less what is
+    zero by structure; `shapes` cuts it. `edges` are those of its receives by (clock partition, receive).
+    `timed` says that some entry depends on time, if only on whether something has switched (see
+    `switches.varying_slopes`). `equations` is the kind whose functions are differentiated: `kind`, or one of
+    its pieces. `ties`, where the start values are put in, is a function of the parameters that is above 0 at
+    a tie (see `frame.kinks`).
     """
 
-    kind: Kind
+    kind: PeerType
     function: Any  # casadi.Function
     shapes: tuple[tuple[int, int], ...]
-    pattern: LinearSite
+    pattern: LinearSubsystem
     affine: bool
     timed: bool
-    edges: Mapping[tuple[int, int], Edge]
-    equations: Kind
+    edges: Mapping[tuple[int, int], EdgeJacobian]
+    equations: PeerType
     ties: Any | None = None  # casadi.Function
 
     @property
@@ -141,7 +141,7 @@ class SiteJacobians:
 
 
 @functools.lru_cache(maxsize=KEPT)
-def jacobians(kind: Kind) -> SiteJacobians:
+def jacobians(kind: PeerType) -> SubsystemJacobians:
     """Build a kind's Jacobian functions, once for as long as it is remembered; `linearize` is then cheap.
 
     Raises
@@ -191,7 +191,7 @@ def jacobians(kind: Kind) -> SiteJacobians:
     listening = [_listening(kind, p, edges) for p in range(len(kind.clocks))]
     pattern = assemble(kind, affine, _patterns(kind, blocks), [heard for _, heard in listening])
     own = [parts for parts, _ in listening]
-    return SiteJacobians(
+    return SubsystemJacobians(
         kind=kind,
         function=casadi.Function("jacobians", [x, u, m_all, r_all, p, t], [flat]),
         shapes=tuple((int(block.size1()), int(block.size2())) for block in blocks),
@@ -203,7 +203,7 @@ def jacobians(kind: Kind) -> SiteJacobians:
     )
 
 
-def with_equations(base: SiteJacobians, kind: Kind) -> SiteJacobians:
+def with_equations(base: SubsystemJacobians, kind: PeerType) -> SubsystemJacobians:
     """Return the Jacobians of other equations of a kind: one of its pieces.
 
     Parameters
@@ -217,7 +217,7 @@ def with_equations(base: SiteJacobians, kind: Kind) -> SiteJacobians:
     return replace(jacobians(kind), kind=base.kind, pattern=base.pattern)
 
 
-def _patterns(kind: Kind, blocks: Sequence[Any]) -> list[NDArray[np.bool_]]:
+def _patterns(kind: PeerType, blocks: Sequence[Any]) -> list[NDArray[np.bool_]]:
     """Return the pattern of each block; of a clock's, of all its variants together."""
     heights = [0, 0, *(len(clock.outputs) for clock in kind.clocks for _ in range(4))]
     masks = []
@@ -250,12 +250,12 @@ def _depends(expression: Any, symbols: Any) -> bool:
     return bool(expression.numel() and casadi.depends_on(expression, symbols))
 
 
-def _functions(kind: Kind) -> list[Any]:
+def _functions(kind: PeerType) -> list[Any]:
     """Return the functions that a linearization is of, but for edges."""
     return [kind.derivative, *(clock.tick for clock in kind.clocks), *(send.send for send in kind.sends)]
 
 
-def _refuse_loop_with_edges(kind: Kind) -> None:
+def _refuse_loop_with_edges(kind: PeerType) -> None:
     """Refuse what neither the scalar walk nor the implicit function theorem covers yet."""
     heard = [receive for part in kind.clocks for receive in part.receives if edge_name(part, receive)]
     edges = [receive.edge for receive in heard if receive.edge is not None]
@@ -264,10 +264,10 @@ def _refuse_loop_with_edges(kind: Kind) -> None:
             "has a nonlinear loop and a reduction that looks at each sender by itself; "
             "together they can't be linearized"
         )
-        raise ApcError(Mistake("E807", Place(kind.name), what))
+        raise ApcError(Diagnostic("E807", SourceLocation(kind.name), what))
 
 
-def _edge(kind: Kind, partition: ClockPartition, receive: Receive) -> Edge:
+def _edge(kind: PeerType, partition: ClockPartition, receive: Receive) -> EdgeJacobian:
     """Build a receive's edge function with its slopes; without one, it is the channel itself."""
     symbol = casadi.SX.sym
     channels = next(
@@ -285,11 +285,11 @@ def _edge(kind: Kind, partition: ClockPartition, receive: Receive) -> Edge:
     smooth = receive.operator in ("sum", "mean") and not guards_of(value, casadi.vertcat(x, u, m, s))
     moves = _depends(slopes, casadi.vertcat(x, u, m, s, t))
     function = casadi.Function("edge", [x, u, m, s, p, t], [casadi.vertcat(casadi.densify(value), slopes)])
-    return Edge(function, smooth and not moves, _depends(slopes, t))
+    return EdgeJacobian(function, smooth and not moves, _depends(slopes, t))
 
 
 def _listening(
-    kind: Kind, p: int, edges: Mapping[tuple[int, int], Edge]
+    kind: PeerType, p: int, edges: Mapping[tuple[int, int], EdgeJacobian]
 ) -> tuple[list[Matrix | None], tuple[tuple[int, ...], ...]]:
     """Return, for each receive of a partition, the pattern of its own part and the channels it depends on."""
     partition = kind.clocks[p]

@@ -1,7 +1,8 @@
 """Kinks: points where an equation of a peer has different slopes on different sides.
 
-Takes: a kind of a `CompiledSystem`, a point at which it is linearized.
-Gives: `Point`, `Piece`, `pieces_at`, `one_sided`, `names_of`; `tie_indicators`, `refuse_kinks`, `at_a_kink`.
+Takes: a kind of a `Model`, a point at which it is linearized.
+Gives: `Point`, `LinearPiece`, `pieces_at`, `one_sided`, `names_of`; `tie_indicators`, `refuse_kinks`,
+`at_a_kink`.
 Guarantees: a piece is selected by some direction of motion away from the point, to first order: slopes that
 no side has are never returned. A one-sided kind has the values of the kind itself, and at the point the
 slopes of its piece.
@@ -24,10 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-from apc.compiler.compiled import Kind
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import PeerType
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.interpolation import jacobian
-from apc.frame.decisions import SwitchedKind, decided_kind, find_switches
+from apc.frame.decisions import SwitchedPeerType, decided_kind, find_switches
 
 # A guard of this size relative to its terms is zero: its evaluation rounds some ten times.
 TIE = 2.0**-46
@@ -47,11 +48,11 @@ _STILL = ("p", "t")  # columns that no motion changes
 
 Floats = NDArray[np.float64]
 Moving = tuple[tuple[str, tuple[float, ...]], ...]  # the columns that a motion changes, by name
-Point = Mapping[str, Sequence[float]]  # the columns of `SwitchedKind.columns` by name
+Point = Mapping[str, Sequence[float]]  # the columns of `SwitchedPeerType.columns` by name
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
+class LinearPiece:
     """A piece that meets a point: for each tied decision whether it is taken; `moving` is the point.
 
     `values` are those of all functions at the point, `slopes` over everything that moves.
@@ -72,7 +73,7 @@ class _Guards:
 
 
 @functools.lru_cache(maxsize=KEPT)
-def _guards(switched: SwitchedKind) -> _Guards:
+def _guards(switched: SwitchedPeerType) -> _Guards:
     """Return the functions of a kind that `pieces_at` evaluates."""
     columns = list(switched.columns.values())
     symbols = [decision.symbol for decision in switched.decisions]
@@ -90,7 +91,7 @@ def _guards(switched: SwitchedKind) -> _Guards:
     )
 
 
-def pieces_at(switched: SwitchedKind, point: Point, *, every: bool = False) -> tuple[Piece, ...]:
+def pieces_at(switched: SwitchedPeerType, point: Point, *, every: bool = False) -> tuple[LinearPiece, ...]:
     """Return the pieces that meet a point, those of equal slopes once; one without ties where it is smooth.
 
     Parameters
@@ -108,7 +109,7 @@ def pieces_at(switched: SwitchedKind, point: Point, *, every: bool = False) -> t
         E808 an equation that jumps at the point, or more than MOST_TIES ties.
     """
     if not switched.decisions:
-        return (Piece((), (), np.zeros(0), np.zeros((0, 0))),)
+        return (LinearPiece((), (), np.zeros(0), np.zeros((0, 0))),)
     functions, count = _guards(switched), len(switched.decisions)
     columns = [list(point.get(name, [0.0] * c.numel())) for name, c in switched.columns.items()]
     moving = tuple(
@@ -140,14 +141,14 @@ def pieces_at(switched: SwitchedKind, point: Point, *, every: bool = False) -> t
     follow([], {})
     # The value at the point itself, where it is compared with "==": elsewhere one of the sides has it.
     points = {place for place, decision in enumerate(switched.decisions) if decision.point}
-    result: list[Piece] = []
+    result: list[LinearPiece] = []
     for tied in leaves:
         symbols = _symbols(switched, functions, columns, tied)
         _, rows, _ = functions.guards(*columns, symbols)
         if not _reachable(switched, np.asarray(rows, dtype=np.float64), tied):
             continue
         values, slopes, sizes = map(np.asarray, functions.slopes(*columns, symbols))
-        piece = Piece(tuple(tied.items()), moving, values.ravel(), slopes)
+        piece = LinearPiece(tuple(tied.items()), moving, values.ravel(), slopes)
         # No number on one side alone, as of a root or logarithm there, is a jump too.
         beside = [result[0].values] if result else []
         if points & tied.keys():
@@ -161,7 +162,10 @@ def pieces_at(switched: SwitchedKind, point: Point, *, every: bool = False) -> t
 
 
 def _symbols(
-    switched: SwitchedKind, functions: _Guards, columns: Sequence[Sequence[float]], tied: Mapping[int, bool]
+    switched: SwitchedPeerType,
+    functions: _Guards,
+    columns: Sequence[Sequence[float]],
+    tied: Mapping[int, bool],
 ) -> list[float]:
     """Return the value of every decision's symbol on one side of the ties."""
     symbols: list[float] = [0.0] * len(switched.decisions)
@@ -171,7 +175,7 @@ def _symbols(
     return symbols
 
 
-def _reachable(switched: SwitchedKind, rows: Floats, tied: Mapping[int, bool]) -> bool:
+def _reachable(switched: SwitchedPeerType, rows: Floats, tied: Mapping[int, bool]) -> bool:
     """Return whether some direction of motion takes these sides of the ties, to first order.
 
     Parameters
@@ -214,7 +218,7 @@ def _small(values: Floats) -> float:
     return ROUNDED * float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
 
 
-def names_of(switched: SwitchedKind, places: Sequence[int]) -> tuple[str, ...]:
+def names_of(switched: SwitchedPeerType, places: Sequence[int]) -> tuple[str, ...]:
     """Return the names of what some decisions change, each once; of a held expression its part's."""
     return tuple(
         dict.fromkeys(
@@ -223,7 +227,7 @@ def names_of(switched: SwitchedKind, places: Sequence[int]) -> tuple[str, ...]:
     )
 
 
-def _refused(switched: SwitchedKind, places: Sequence[int], why: str) -> ApcError:
+def _refused(switched: SwitchedPeerType, places: Sequence[int], why: str) -> ApcError:
     names = names_of(switched, places)
     if not names:  # a comparison with "==" has no sides to name
         symbols = [switched.decisions[place].symbol for place in places]
@@ -235,10 +239,10 @@ def _refused(switched: SwitchedKind, places: Sequence[int], why: str) -> ApcErro
 def at_a_kink(where: str, what: str) -> ApcError:
     """Return the refusal of a point without a linearization."""
     text = f"{what}: there is no linearization at the start values, only on one side of it"
-    return ApcError(Mistake("E808", Place(where), text))
+    return ApcError(Diagnostic("E808", SourceLocation(where), text))
 
 
-def one_sided(switched: SwitchedKind, taken: Mapping[int, bool], moving: Moving) -> Kind:
+def one_sided(switched: SwitchedPeerType, taken: Mapping[int, bool], moving: Moving) -> PeerType:
     """Return a kind whose slopes at a point are those of one piece.
 
     The switching point of each tied decision is shifted by twice its tolerance, whatever the parameters are.
@@ -268,25 +272,25 @@ def one_sided(switched: SwitchedKind, taken: Mapping[int, bool], moving: Moving)
     return decided_kind(switched, expressions)
 
 
-def _guard(switched: SwitchedKind, earlier: Sequence[Any]) -> Any:
+def _guard(switched: SwitchedPeerType, earlier: Sequence[Any]) -> Any:
     """Return the guard of a decision with the expressions of all earlier ones."""
     symbols = [decision.symbol for decision in switched.decisions[: len(earlier)]]
     guard = switched.decisions[len(earlier)].guard
     return casadi.substitute(guard, casadi.vertcat(*symbols), casadi.vertcat(*earlier)) if earlier else guard
 
 
-def _terms(switched: SwitchedKind, guard: Any) -> Any:
+def _terms(switched: SwitchedPeerType, guard: Any) -> Any:
     """Return the sum of the magnitudes of the terms of a guard, which bounds its rounding."""
     everything = casadi.vertcat(*switched.columns.values())
     return casadi.fabs(jacobian(guard, everything)) @ casadi.fabs(everything)
 
 
 @functools.lru_cache(maxsize=KEPT)
-def tie_indicators(kind: Kind) -> Any | None:
+def tie_indicators(kind: PeerType) -> Any | None:
     """Return a function (x, u, m, r, p, t) -> (n,) that is above 0 where a decision is tied.
 
-    Its arguments are those of `SiteJacobians.function`. Not every tie is a kink: see `pieces_at`. None where
-    nothing depends on a decision, where a nonlinear loop hides the decisions, or where values of single
+    Its arguments are those of `SubsystemJacobians.function`. Not every tie is a kink: see `pieces_at`. None
+    where nothing depends on a decision, where a nonlinear loop hides the decisions, or where values of single
     senders decide.
     """
     switched = find_switches(kind)
@@ -315,7 +319,7 @@ def tie_indicators(kind: Kind) -> Any | None:
     return casadi.Function("ties", arguments, [casadi.densify(column)])
 
 
-def refuse_kinks(kind: Kind, where: str, point: Point) -> None:
+def refuse_kinks(kind: PeerType, where: str, point: Point) -> None:
     """Refuse a point at which slopes differ from side to side: ApcError E808."""
     switched = find_switches(kind)
     pieces = pieces_at(switched, point)

@@ -1,6 +1,6 @@
 """One frame of one site as one linear map.
 
-Takes: a `LinearSite` and its `Schedule`; or the matrices of many sites at once, with a leading axis (k).
+Takes: a `LinearSubsystem` and its `Schedule`; or the matrices of many sites at once, with a leading axis (k).
 Gives: `FrameMap`, `compose`; `lift`, `with_roundings`; `follow`, event by event, `followed`.
 Guarantees: `compose` and `follow` take numbers of any kind. `lift` propagates the continuous part by its
 exact exponential; every matrix comes with a bound on its rounding error, entry by entry.
@@ -22,17 +22,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import Kind
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import PeerType
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.frame.discretize import COEFFICIENT_ROUNDINGS, discretize
 from apc.frame.radius import FLOATS, RADII, Arithmetic, common_shape, rounded
-from apc.frame.schedule import HELD, Act, Event, Propagate, Repeats, Schedule, Send, Tick, Value, shifted
-from apc.frame.site import LinearSite, every_matrix, matrices_of
+from apc.frame.schedule import (
+    HELD,
+    ClockedValue,
+    Event,
+    HoldUpdate,
+    Propagate,
+    RepeatedEvents,
+    Schedule,
+    SendEvent,
+    Tick,
+    shifted,
+)
+from apc.frame.site import LinearSubsystem, every_matrix, matrices_of
 
 Matrix = NDArray[Any]
 
 # What is shown each step: its duration in quanta, what moves as it begins, and all computed until then.
-Watch = Callable[[int, Matrix, Mapping[Value, Matrix]], None]
+StepObserver = Callable[[int, Matrix, Mapping[ClockedValue, Matrix]], None]
 
 # Packets that a peer sends or hears in a frame, each a row or column of the frame's map and of the loop's.
 MOST_PACKETS = 1000
@@ -58,10 +69,10 @@ class FrameMap:
 
 
 def lift(
-    site: LinearSite,
+    site: LinearSubsystem,
     schedule: Schedule,
     *,
-    exact: LinearSite | None = None,
+    exact: LinearSubsystem | None = None,
 ) -> FrameMap:
     """Compose the events of a site, or of many, over one frame, with radii of what may be off.
 
@@ -94,7 +105,7 @@ def check_packets(schedule: Schedule) -> None:
     if most > MOST_PACKETS:
         what = f"{most:,} packets of one peer in a frame, and {MOST_PACKETS} are the most that are analysed"
         hint = "periods of clocks that are simple multiples of one another"
-        raise ApcError(Mistake("E805", Place("the scene"), what, hint=hint))
+        raise ApcError(Diagnostic("E805", SourceLocation("the scene"), what, hint=hint))
 
 
 def step_durations(schedule: Schedule) -> list[int]:
@@ -102,13 +113,13 @@ def step_durations(schedule: Schedule) -> list[int]:
     return sorted({event.duration for event in schedule.events if isinstance(event, Propagate)})
 
 
-def with_roundings(site: LinearSite) -> LinearSite:
+def with_roundings(site: LinearSubsystem) -> LinearSubsystem:
     """Return a site's matrices with their radii, those of what CasADi rounds."""
     return every_matrix(site, lambda matrix: rounded(matrix, COEFFICIENT_ROUNDINGS))
 
 
 def compose(
-    site: LinearSite,
+    site: LinearSubsystem,
     schedule: Schedule,
     steps: Mapping[int, Matrix],
     *,
@@ -152,7 +163,7 @@ def followed(course: Generator[tuple[int, Matrix], None, Matrix]) -> tuple[Matri
 def _play_again(
     playing: _Playing,
     schedule: Schedule,
-    again: Repeats,
+    again: RepeatedEvents,
     at: _Moment,
     numbers: Arithmetic,
     received: Matrix,
@@ -183,15 +194,15 @@ def _play_again(
         if isinstance(event, Tick):
             before[event.partition] += 1
 
-    def row_of(moment: _Moment, value: Value, later: int) -> Matrix:
+    def row_of(moment: _Moment, value: ClockedValue, later: int) -> Matrix:
         """Return a value that enters once so many times are over."""
         if value.partition == HELD:
             return moment.moving[..., n_x + value.output, :]
         return moment.value.get(named_at(value, later), moment.nothing)
 
-    def named_at(value: Value, later: int) -> Value:
+    def named_at(value: ClockedValue, later: int) -> ClockedValue:
         index = value.index + before[value.partition] + later * again.ticks[value.partition]
-        return Value(value.partition, value.output, index)
+        return ClockedValue(value.partition, value.output, index)
 
     unit = numbers.exact(np.eye(n + n_r))
     once = playing.at_rest(unit[..., :n_x, :])
@@ -236,14 +247,14 @@ def _often(step: Matrix, count: int, after: Callable[[Matrix, Matrix], Matrix]) 
 
 
 def follow(
-    site: LinearSite,
+    site: LinearSubsystem,
     schedule: Schedule,
     steps: Mapping[int, Matrix],
     start: Matrix,
     hear: Callable[[int], Matrix | None],
     *,
     numbers: Arithmetic = FLOATS,
-    watch: Watch | None = None,
+    watch: StepObserver | None = None,
 ) -> Generator[tuple[int, Matrix], None, Matrix]:
     """Follow a site, or many, through one frame, event by event, over numbers of any kind.
 
@@ -306,7 +317,7 @@ class _Moment:
     """
 
     moving: Matrix
-    value: dict[Value, Matrix]
+    value: dict[ClockedValue, Matrix]
     nothing: Matrix
 
 
@@ -314,7 +325,7 @@ class _Moment:
 class _Playing:
     """A site, or many, ready to be played: `sends` and `ticks` are its matrices side by side."""
 
-    kind: Kind
+    kind: PeerType
     sends: Sequence[Matrix]
     ticks: Sequence[Matrix]
     steps: Mapping[int, Matrix]
@@ -322,7 +333,7 @@ class _Playing:
     many: tuple[int, ...]  # of how many sites
     number: Any
     multiply: Callable[[Matrix, Matrix], Matrix]
-    watch: Watch | None
+    watch: StepObserver | None
 
     @property
     def states(self) -> int:
@@ -362,21 +373,21 @@ class _Playing:
                     if self.watch is not None:
                         self.watch(duration, moving, value)
                     moving[..., :n_x, :] = self.multiply(self.steps[duration][..., :n_x, :], moving)
-                case Act(hold, one):
+                case HoldUpdate(hold, one):
                     moving[..., n_x + hold, :] = value.get(one, at.nothing)
-                case Send(partition, rows):
+                case SendEvent(partition, rows):
                     everything = self.multiply(self.sends[partition], moving)
                     for channel, row in rows:
                         yield row, everything[..., channel, :]
                 case Tick(partition, index, rows_heard):
                     clock = self.kind.clocks[partition]
                     memories = clock.memories
-                    before = [value.get(Value(partition, o, index - 1), at.nothing) for o in memories]
+                    before = [value.get(ClockedValue(partition, o, index - 1), at.nothing) for o in memories]
                     received = yield from _received(rows_heard, hear, at.nothing)
                     slopes = self.ticks[partition][..., event.rows(len(clock.outputs)), :]
                     computed = self.multiply(slopes, _over(moving, [*before, *received]))
                     for output in range(computed.shape[-2]):
-                        value[Value(partition, output, index)] = computed[..., output, :]
+                        value[ClockedValue(partition, output, index)] = computed[..., output, :]
 
 
 def _beside(*blocks: Matrix) -> Matrix:

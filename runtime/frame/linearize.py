@@ -1,9 +1,9 @@
 """The matrices of a site where it starts: of one, or of many at once.
 
-Takes: a kind's `SiteJacobians`, a parameter vector or many, what the site hears at the start.
+Takes: a kind's `SubsystemJacobians`, a parameter vector or many, what the site hears at the start.
 Gives: `linearize`, `linearize_exact`, `linearize_rows`, `of_rows`; `site_of`, `site_of_entries`; what a site
 is and sends at the start (`start_values`, `start_sends`, `start_arguments`, `start_names`, `reaches_start`,
-`sends_nothing`, `at_start`); `Listening`.
+`sends_nothing`, `at_start`); `InitialReception`.
 Guarantees: a site that is not affine is linearized at its start values; holds put out zero there.
 Does not: decide when anything happens (see `scheduling`); ask who hears whom (see `peers`).
 """
@@ -21,21 +21,21 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import PEERS, CompiledSystem, Kind
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import PEERS, Model, PeerType
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.frame.exact import evaluate_exact
-from apc.frame.jacobians import SiteJacobians
+from apc.frame.jacobians import SubsystemJacobians
 from apc.frame.kinks import refuse_kinks, tie_indicators
-from apc.frame.names import Free
+from apc.frame.names import ParameterRef
 from apc.frame.parameters import exact_numbers, scope_of
-from apc.frame.site import LinearSite, assemble, cut, every_matrix, with_own_parts
+from apc.frame.site import LinearSubsystem, assemble, cut, every_matrix, with_own_parts
 
 # Kinds that are kept as they start, and functions of many sites.
 KEPT = 64
 
 
 @dataclass(frozen=True, slots=True)
-class Listening:
+class InitialReception:
     """What a site's receives (of all clocks in a row) are at the start, and their own parts.
 
     `values` (n_r,) are exact; `own` are the slopes over (x, u, m) of each receive, None for a plain one.
@@ -46,7 +46,7 @@ class Listening:
 
 
 def start_values(
-    site: SiteJacobians, parameters: Sequence[Any]
+    site: SubsystemJacobians, parameters: Sequence[Any]
 ) -> tuple[list[Any], list[Any], list[list[Any]]]:
     """Return x, u and every clock partition's m at the start, where holds put out zero."""
     place = {name: index for index, name in enumerate(site.kind.parameters)}
@@ -56,7 +56,7 @@ def start_values(
 
 
 def start_sends(
-    site: SiteJacobians, parameters: Sequence[Any], number: Callable[[float], Any] = Fraction
+    site: SubsystemJacobians, parameters: Sequence[Any], number: Callable[[float], Any] = Fraction
 ) -> dict[str, list[Any]]:
     """Return what a site sends at the start, by link."""
     x, u, _ = start_values(site, parameters)
@@ -72,23 +72,23 @@ def start_sends(
     return sent
 
 
-def start_names(system: CompiledSystem) -> set[str]:
+def start_names(system: Model) -> set[str]:
     """Return the parameters that are start values of states and of what clocks remember."""
     return {name for kind in system.kinds for name in _starts(kind)}
 
 
-def _starts(kind: Kind) -> list[str]:
+def _starts(kind: PeerType) -> list[str]:
     remembered = (name for clock in kind.clocks for name in clock.starts)
     return [*(state.start for state in kind.states), *remembered]
 
 
-def reaches_start(system: CompiledSystem, free: Free) -> bool:
+def reaches_start(system: Model, free: ParameterRef) -> bool:
     """Say whether where a scene starts is, or depends on, this parameter."""
     starts = start_names(system)
     return free.name in starts or free.name in scope_of(system).needed(sorted(starts))
 
 
-def sends_nothing(kind: Kind, rows: NDArray[np.float64]) -> bool:
+def sends_nothing(kind: PeerType, rows: NDArray[np.float64]) -> bool:
     """Say whether all that peers send at the start is 0, whatever their parameters but the start values.
 
     Parameters
@@ -114,7 +114,7 @@ def sends_nothing(kind: Kind, rows: NDArray[np.float64]) -> bool:
 
 
 @lru_cache(maxsize=KEPT)
-def at_start(site: SiteJacobians, *, silent: bool = False) -> SiteJacobians | None:
+def at_start(site: SubsystemJacobians, *, silent: bool = False) -> SubsystemJacobians | None:
     """Return a kind's Jacobians where it starts, which follow from its parameters alone.
 
     Start values are parameters, too. None where what is heard decides as well, or a nonlinear loop does;
@@ -145,10 +145,10 @@ def at_start(site: SiteJacobians, *, silent: bool = False) -> SiteJacobians | No
 
 
 def start_arguments(
-    site: SiteJacobians,
+    site: SubsystemJacobians,
     parameters: list[Any],
     number: Callable[[float], Any],
-    listening: Listening | None,
+    listening: InitialReception | None,
 ) -> list[list[Any]]:
     """Return (x, u, m, r, p, t) at the start: holds put out zero.
 
@@ -176,8 +176,8 @@ def start_arguments(
 
 
 def linearize(
-    site: SiteJacobians, parameters: NDArray[np.float64], listening: Listening | None = None
-) -> LinearSite:
+    site: SubsystemJacobians, parameters: NDArray[np.float64], listening: InitialReception | None = None
+) -> LinearSubsystem:
     """Return the matrices of a site, in floats.
 
     Parameters
@@ -185,7 +185,7 @@ def linearize(
     site
         The kind's Jacobians.
     parameters
-        The site's vector (n_p,), in the order of `Kind.parameters`.
+        The site's vector (n_p,), in the order of `PeerType.parameters`.
     listening
         What the site hears at the start. Left out, the others stand where this site stands; a site with edge
         functions can't do without.
@@ -198,8 +198,8 @@ def linearize(
 
 
 def linearize_exact(
-    site: SiteJacobians, parameters: NDArray[np.float64], listening: Listening | None = None
-) -> LinearSite:
+    site: SubsystemJacobians, parameters: NDArray[np.float64], listening: InitialReception | None = None
+) -> LinearSubsystem:
     """Return the same matrices as `linearize` in exact rationals, as object arrays of `Fraction`, and 0.
 
     Parameters
@@ -223,7 +223,7 @@ def linearize_exact(
 
 
 def _finite_slopes(
-    site: SiteJacobians, parameters: NDArray[np.float64], listening: Listening | None
+    site: SubsystemJacobians, parameters: NDArray[np.float64], listening: InitialReception | None
 ) -> NDArray[np.float64]:
     """Return the site's function at the start, in floats.
 
@@ -247,7 +247,9 @@ def _finite_slopes(
     return flat
 
 
-def _refuse_kinks(site: SiteJacobians, parameters: NDArray[np.float64], listening: Listening | None) -> None:
+def _refuse_kinks(
+    site: SubsystemJacobians, parameters: NDArray[np.float64], listening: InitialReception | None
+) -> None:
     """Refuse a point at which slopes differ from side to side."""
     ties = tie_indicators(site.equations)
     if ties is not None:
@@ -257,7 +259,7 @@ def _refuse_kinks(site: SiteJacobians, parameters: NDArray[np.float64], listenin
 
 
 def _start_point(
-    site: SiteJacobians, parameters: NDArray[np.float64], received: Sequence[float] | None = None
+    site: SubsystemJacobians, parameters: NDArray[np.float64], received: Sequence[float] | None = None
 ) -> dict[str, Sequence[float]]:
     """Return where a site starts, by the columns of `kinks.Point`; by default it receives zeros."""
     numbers = [float(value) for value in parameters]
@@ -270,7 +272,7 @@ def _start_point(
 
 
 def check_start(
-    site: SiteJacobians, parameters: NDArray[np.float64], listening: Listening | None = None
+    site: SubsystemJacobians, parameters: NDArray[np.float64], listening: InitialReception | None = None
 ) -> None:
     """Evaluate the site's equations at the start values.
 
@@ -299,7 +301,7 @@ def check_start(
         _check_finite([form.format(row) for row in rows], np.asarray(column).ravel(), "", kind.name)
 
 
-def _refuse_infinite(site: SiteJacobians, flat: NDArray[np.float64]) -> None:
+def _refuse_infinite(site: SubsystemJacobians, flat: NDArray[np.float64]) -> None:
     """Refuse a slope that is not finite, by name."""
     kind = site.kind
     if not np.isfinite(flat).all():
@@ -324,11 +326,13 @@ def _check_finite(rows: Sequence[str], values: NDArray[np.float64], what: str, w
             )
             hint = "start values at which every equation has a finite value and slope"
             raise ApcError(
-                Mistake("E808", Place(where), f"{text}a number below zero, or the like", hint=hint)
+                Diagnostic(
+                    "E808", SourceLocation(where), f"{text}a number below zero, or the like", hint=hint
+                )
             )
 
 
-def linearize_rows(site: SiteJacobians, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+def linearize_rows(site: SubsystemJacobians, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the matrices of an affine site without edges for many parameter vectors (k, n_p), as rows.
 
     The rows (k, …) hold what `site_of` makes a site of.
@@ -398,13 +402,13 @@ def of_rows(function: Any, given: Mapping[int, NDArray[np.float64]]) -> list[NDA
     return result
 
 
-def site_of(site: SiteJacobians, numbers: NDArray[Any]) -> LinearSite:
+def site_of(site: SubsystemJacobians, numbers: NDArray[Any]) -> LinearSubsystem:
     """Return the site of a row of `linearize_rows`, or of many (k, …) as one with a leading axis (k)."""
     channels = [tick.channels for tick in site.pattern.ticks]
     return assemble(site.kind, site.affine, cut(numbers, site.shapes), channels)
 
 
-def site_of_entries(site: SiteJacobians, result: Sequence[Any], zero: Any) -> LinearSite:
+def site_of_entries(site: SubsystemJacobians, result: Sequence[Any], zero: Any) -> LinearSubsystem:
     """Return the site of a function's output over another kind of number (see `exact`), with its zero."""
     sparsity = site.function.sparsity_out(0)
     entries = np.empty(sparsity.numel(), dtype=object)

@@ -1,7 +1,7 @@
 """What of a scene matters: what can reach the motion or the network, what that reads, and whom it hears.
 
-Takes: the structural patterns of a `CompiledSystem`'s kinds, the exchange.
-Gives: `live_outputs`, `live_holds`, `live_receives`; `Hearing`, `hearing_of`.
+Takes: the structural patterns of a `Model`'s kinds, the exchange.
+Gives: `live_outputs`, `live_holds`, `live_receives`; `ReceptionPattern`, `hearing_of`.
 Guarantees: structure alone decides; no number makes anything live or dead. A way for each delay among the
 senders; nobody who doesn't send is on one.
 Does not: know when anything happens, is sent or heard.
@@ -12,14 +12,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from fractions import Fraction
 
-from apc.compiler.compiled import CompiledSystem
-from apc.frame.exchange import Exchange, check_mean
+from apc.compiler.compiled import Model
+from apc.frame.exchange import CommunicationGraph, check_mean
 from apc.frame.jacobians import edge_name
-from apc.frame.schedule import Way
-from apc.frame.site import LinearSite
+from apc.frame.schedule import CouplingTerm
+from apc.frame.site import LinearSubsystem
 
 
-def live_outputs(pattern: LinearSite) -> frozenset[tuple[int, int]]:
+def live_outputs(pattern: LinearSubsystem) -> frozenset[tuple[int, int]]:
     """Return the (partition, output) pairs that can reach the motion or the network."""
     kind = pattern.kind
     clocks = {partition.clock: index for index, partition in enumerate(kind.clocks)}
@@ -38,7 +38,7 @@ def live_outputs(pattern: LinearSite) -> frozenset[tuple[int, int]]:
     return frozenset(live)
 
 
-def live_holds(pattern: LinearSite, live: frozenset[tuple[int, int]]) -> tuple[bool, ...]:
+def live_holds(pattern: LinearSubsystem, live: frozenset[tuple[int, int]]) -> tuple[bool, ...]:
     """Say of each hold whether anybody reads it."""
     return tuple(
         bool(
@@ -50,7 +50,7 @@ def live_holds(pattern: LinearSite, live: frozenset[tuple[int, int]]) -> tuple[b
     )
 
 
-def live_receives(pattern: LinearSite, live: frozenset[tuple[int, int]]) -> frozenset[tuple[int, int]]:
+def live_receives(pattern: LinearSubsystem, live: frozenset[tuple[int, int]]) -> frozenset[tuple[int, int]]:
     """Return the (partition, receive) pairs that a live output reads."""
     return frozenset(
         (partition, int(row))
@@ -60,16 +60,16 @@ def live_receives(pattern: LinearSite, live: frozenset[tuple[int, int]]) -> froz
 
 
 # For each clock partition and receive: the ways it hears, and the channel of the link on each.
-Hearing = tuple[tuple[tuple[tuple[Way, str], ...], ...], ...]
+ReceptionPattern = tuple[tuple[tuple[tuple[CouplingTerm, str], ...], ...], ...]
 
 
 def hearing_of(
-    system: CompiledSystem,
-    patterns: Sequence[LinearSite],
-    exchange: Exchange,
+    system: Model,
+    patterns: Sequence[LinearSubsystem],
+    exchange: CommunicationGraph,
     group: int,
     read: Sequence[frozenset[tuple[int, int]]],
-) -> Hearing:
+) -> ReceptionPattern:
     """Return what the receives of a group hear.
 
     Parameters
@@ -87,9 +87,9 @@ def hearing_of(
         E801 a mean, maximum or minimum over nobody.
     """
     pattern = patterns[system.groups[group].kind]
-    everybody: list[tuple[tuple[tuple[Way, str], ...], ...]] = []
+    everybody: list[tuple[tuple[tuple[CouplingTerm, str], ...], ...]] = []
     for p, (partition, tick) in enumerate(zip(pattern.kind.clocks, pattern.ticks, strict=True)):
-        own: list[tuple[tuple[Way, str], ...]] = []
+        own: list[tuple[tuple[CouplingTerm, str], ...]] = []
         for place, (receive, channels) in enumerate(zip(partition.receives, tick.channels, strict=True)):
             if (p, place) not in read[system.groups[group].kind] or not channels:
                 own.append(())
@@ -108,7 +108,7 @@ def hearing_of(
             own.append(
                 tuple(
                     (
-                        Way(
+                        CouplingTerm(
                             *(receive.operator, receive.link, delay, edge, names[c] if edge else ""),
                             before=receive.before,
                         ),
@@ -122,7 +122,7 @@ def hearing_of(
     return tuple(everybody)
 
 
-def _channels(system: CompiledSystem, group: int, link: str) -> tuple[str, ...]:
+def _channels(system: Model, group: int, link: str) -> tuple[str, ...]:
     """Return the names of a link's channels, as the group's own kind sends them, or else some other kind."""
     own = system.groups[group].kind
     kinds = [system.kinds[own], *system.kinds]

@@ -1,7 +1,7 @@
 """What a person calls a parameter or a timing, and what stands behind the name.
 
-Takes: a `CompiledSystem` and a name such as `contact.stiffness`, `right.hand.force` or `links.lan.delay`.
-Gives: `Free`, `Range`, `proposed_range`, `find`, `overlap`, `is_named`, `named_times`, `times_of`,
+Takes: a `Model` and a name such as `contact.stiffness`, `right.hand.force` or `links.lan.delay`.
+Gives: `ParameterRef`, `Range`, `proposed_range`, `find`, `overlap`, `is_named`, `named_times`, `times_of`,
 `parameter_of`, `value_now`, `unit_of`, `values_by_group`, `notes_for_all_groups`.
 Guarantees: a name that means nothing raises, with the nearest real one.
 Does not: read or change values.
@@ -17,15 +17,15 @@ from fractions import Fraction
 from apc.compiler.compiled import (
     COUNT,
     PEERS,
-    CompiledSystem,
+    Model,
     Parameter,
     Timing,
     counts_peers,
     group_count,
 )
-from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
 from apc.compiler.words import with_unit
-from apc.frame.display_units import Unit
+from apc.frame.display_units import DisplayUnit
 
 # The sections of a topology, which a name may start with.
 SECTIONS = ("clocks", "couplers", "hands", "links", "masses", "parameters")
@@ -40,11 +40,11 @@ MOST_LISTED = 20  # peers whose values are written out
 HELD = ("hand.mass", "hand.damping", "hand.stiffness")
 
 # Where a mistake in an override stands, when it came from no line of a file.
-OVERRIDE = Place("--set")
+OVERRIDE = SourceLocation("--set")
 
 
 @dataclass(frozen=True, slots=True)
-class Free:
+class ParameterRef:
     """A parameter or timing that a value is wanted of: of one group, or of all (`group` None)."""
 
     name: str
@@ -60,13 +60,13 @@ class Free:
 class Range:
     """What a box leaves open, or an axis of a region runs over: from `low` to `high`, exact, in SI."""
 
-    free: Free
+    free: ParameterRef
     unit: str
     low: Fraction
     high: Fraction
 
 
-def proposed_range(system: CompiledSystem, wanted: str = "", *, without: str = "") -> str:
+def proposed_range(system: Model, wanted: str = "", *, without: str = "") -> str:
     """Return a range of a stiffness or damping to propose, `NAME=LOW:HIGH`: the wanted one, if it is one."""
     units = {"N/m": 1000, "N*s/m": 10}
     named = [
@@ -81,18 +81,18 @@ def proposed_range(system: CompiledSystem, wanted: str = "", *, without: str = "
     return f"{first.name}=0 {first.unit}:{2 * first.value or units[first.unit]:g} {first.unit}"
 
 
-def given_ranges(system: CompiledSystem, others: Collection[Range] = ()) -> list[Range]:
+def given_ranges(system: Model, others: Collection[Range] = ()) -> list[Range]:
     """Return the ranges that a topology gives in the place of a number, but those of `others`, and these."""
     taken = {other.free.name for other in others}
     axes = (axis for axis in system.within if axis.parameter not in taken)
-    return [*(Range(Free(axis.parameter), "s", axis.low, axis.high) for axis in axes), *others]
+    return [*(Range(ParameterRef(axis.parameter), "s", axis.low, axis.high) for axis in axes), *others]
 
 
 # Numbers of a link that may be left out, and what they are then.
 UNWRITTEN = {"loss": "0 %", "jitter": "0 ms"}
 
 
-def find(system: CompiledSystem, name: str, place: Place = OVERRIDE, *, counts: bool = False) -> Free:
+def find(system: Model, name: str, place: SourceLocation = OVERRIDE, *, counts: bool = False) -> ParameterRef:
     """Return the parameter or timing a person's name means, of the group it names, if any.
 
     Parameters
@@ -128,47 +128,50 @@ def find(system: CompiledSystem, name: str, place: Place = OVERRIDE, *, counts: 
         what = f"{written} is a number of peers, which doesn't vary here"
         if counts:
             what, hint = f"{written} is the number of all peers, which follows from the groups'", sizes[0]
-        raise ApcError(Mistake("E623", place, what, hint=hint))
+        raise ApcError(Diagnostic("E623", place, what, hint=hint))
     if name.startswith(COUNT):
         what = f"{written} is how many peers are heard, by their weights: from {sizes[0]} and the graph"
-        raise ApcError(Mistake("E623", place, what))
+        raise ApcError(Diagnostic("E623", place, what))
     if name in HELD and not any(text.startswith("hand.") for text in known):
         what = f"{written} is of the hand that --hands held puts on each device"
-        raise ApcError(Mistake("E622", place, what, hint=f"--hands held --set {name}=…"))
+        raise ApcError(Diagnostic("E622", place, what, hint=f"--hands held --set {name}=…"))
     one_peer = _ONE_PEER.fullmatch(name)
     if one_peer is not None and one_peer["group"] in groups and one_peer["rest"] in parameters:
         raise _of_one_peer(system, one_peer, place)
     if name not in known and rest in UNWRITTEN and any(link.name == first for link in system.links):
         what = f"{written} is not written in the topology, and only what is written can be varied"
         raise ApcError(
-            Mistake("E622", place, what, hint=f"links: {{{first}: {{{rest}: {UNWRITTEN[rest]}}}}}")
+            Diagnostic("E622", place, what, hint=f"links: {{{first}: {{{rest}: {UNWRITTEN[rest]}}}}}")
         )
     if name not in known:
         near = nearest(name, sorted(known))
-        raise ApcError(Mistake("E622", place, f"{written} is no parameter of {system.name}", hint=near))
-    return Free(name, group)
+        raise ApcError(Diagnostic("E622", place, f"{written} is no parameter of {system.name}", hint=near))
+    return ParameterRef(name, group)
 
 
-def _not_of_the_group(system: CompiledSystem, name: str, group: str, written: str, place: Place) -> ApcError:
+def _not_of_the_group(system: Model, name: str, group: str, written: str, place: SourceLocation) -> ApcError:
     """Return the refusal of a group's time that the group does not set in the topology."""
     what = f"{written} is no parameter of {system.name}: {name} is one time for all groups"
     hint = name
     if len(system.groups) > 1:
         what += " that set none of their own"
-        value, number = value_now(system, Free(name)), next(g.count for g in system.groups if g.name == group)
+        value, number = (
+            value_now(system, ParameterRef(name)),
+            next(g.count for g in system.groups if g.name == group),
+        )
         setting = f"{{count: {number}, set: {{{name}: {1000 * value:.12g} ms}}}}"
         hint = f"{name}, or in the topology peers: {{{group}: {setting}}}"
-    return ApcError(Mistake("E622", place, what, hint=hint))
+    return ApcError(Diagnostic("E622", place, what, hint=hint))
 
 
-def overlap(system: CompiledSystem, free: Free, other: Free) -> bool:
+def overlap(system: Model, free: ParameterRef, other: ParameterRef) -> bool:
     """Return whether two names set one number of some group: a name without a group is that of all."""
     if free.name == other.name:
         return free.group == other.group or None in (free.group, other.group)
     return free.name in times_of(system, other.name) or other.name in times_of(system, free.name)
 
 
-def _of_one_peer(system: CompiledSystem, result: re.Match[str], place: Place) -> ApcError:
+def _of_one_peer(system: Model, result: re.Match[str], place: SourceLocation) -> ApcError:
     """Return what is told of a value for one peer of a group: `user[1].device.x`."""
     group, rest = next(group for group in system.groups if group.name == result["group"]), result["rest"]
     what = f"{result[0]} is of one peer, and a setting is of all or of one group: a list gives each its own"
@@ -179,7 +182,7 @@ def _of_one_peer(system: CompiledSystem, result: re.Match[str], place: Place) ->
     hint = f"peers: {{{group.name}: {{count: {group.count}, set: {{{rest}: [{', '.join(values)}]}}}}}}"
     if group.count > MOST_LISTED:
         hint = f"peers: {{{group.name}: {{table: users.csv}}}}, a row a peer, and a column of {rest}"
-    return ApcError(Mistake("E622", place, what, hint=hint))
+    return ApcError(Diagnostic("E622", place, what, hint=hint))
 
 
 def is_named(name: str) -> bool:
@@ -191,12 +194,12 @@ def is_named(name: str) -> bool:
     return not counts_peers(name) and " " not in name
 
 
-def named_times(system: CompiledSystem) -> list[Timing]:
+def named_times(system: Model) -> list[Timing]:
     """Return the timings that stand in the scene under a name of their own."""
     return [timing for timing in system.timings if is_named(timing.name)]
 
 
-def times_of(system: CompiledSystem, name: str) -> tuple[str, ...]:
+def times_of(system: Model, name: str) -> tuple[str, ...]:
     """Return the names of the timings that a name without a group sets.
 
     The timing of that name comes first, then those that groups set for themselves: of `contact.delay` also
@@ -207,7 +210,7 @@ def times_of(system: CompiledSystem, name: str) -> tuple[str, ...]:
     return tuple(text for text in names if text in timings)
 
 
-def parameter_of(system: CompiledSystem, free: Free) -> Parameter:
+def parameter_of(system: Model, free: ParameterRef) -> Parameter:
     """Return a free parameter as its group has it, or everybody."""
     for group in system.groups:
         for parameter in group.values:
@@ -216,18 +219,21 @@ def parameter_of(system: CompiledSystem, free: Free) -> Parameter:
     return next(parameter for parameter in system.parameters if parameter.name == free.name)
 
 
-def value_now(system: CompiledSystem, free: Free) -> float:
+def value_now(system: Model, free: ParameterRef) -> float:
     """Return the present value of a parameter or timing, in SI."""
     times = {timing.name: timing.value for timing in system.timings}
     return float(times[free.name]) if free.name in times else parameter_of(system, free).value
 
 
-def unit_of(system: CompiledSystem, name: str) -> Unit:
+def unit_of(system: Model, name: str) -> DisplayUnit:
     """Return the unit a parameter or timing wants."""
-    return next((Unit.of(parameter) for parameter in system.parameters if parameter.name == name), Unit("s"))
+    return next(
+        (DisplayUnit.of(parameter) for parameter in system.parameters if parameter.name == name),
+        DisplayUnit("s"),
+    )
 
 
-def values_by_group(system: CompiledSystem, free: Free) -> tuple[tuple[str, float | None], ...]:
+def values_by_group(system: Model, free: ParameterRef) -> tuple[tuple[str, float | None], ...]:
     """Return what each group has of a parameter, None where its peers differ; nothing where all are alike."""
     name, only = free.name, free.group
     several = {group.name for group in system.groups if name in {column.name for column in group.columns}}
@@ -237,12 +243,15 @@ def values_by_group(system: CompiledSystem, free: Free) -> tuple[tuple[str, floa
     if not several | own:
         return ()
     return tuple(
-        (group.name, None if group.name in several else parameter_of(system, Free(name, group.name)).value)
+        (
+            group.name,
+            None if group.name in several else parameter_of(system, ParameterRef(name, group.name)).value,
+        )
         for group in system.groups
     )
 
 
-def _beside_a_time(system: CompiledSystem, free: Free) -> Iterator[str]:
+def _beside_a_time(system: Model, free: ParameterRef) -> Iterator[str]:
     """Yield which groups and pairs of groups a link's or clock's time does not reach."""
     for link in system.links:
         others = [pair.delay for pair in link.delays]
@@ -260,7 +269,7 @@ def _beside_a_time(system: CompiledSystem, free: Free) -> Iterator[str]:
             yield f"{free.name} is of the clock {clock.name}, the clock of {', '.join(ticking)} only"
 
 
-def notes_for_all_groups(system: CompiledSystem, frees: Iterable[Free]) -> list[str]:
+def notes_for_all_groups(system: Model, frees: Iterable[ParameterRef]) -> list[str]:
     """Return what a name without a group replaces, or leaves as it is, where the groups differ."""
     notes: list[str] = []
     for free in frees:

@@ -1,6 +1,6 @@
 """Changing the numbers of a compiled system without compiling again.
 
-Takes: a `CompiledSystem` and overrides such as `contact.stiffness=800 N/m`.
+Takes: a `Model` and overrides such as `contact.stiffness=800 N/m`.
 Gives: `Override`, `parse_override`, `apply`; `check_bounds`.
 Guarantees: what depends on a changed parameter by a formula changes with it, in exact rationals; the rest
 keeps the very numbers it was compiled with. Every value out of what its component allows is told, all
@@ -17,14 +17,14 @@ from typing import TypeVar
 
 import numpy as np
 
-from apc.compiler.compiled import CompiledSystem, Group, Parameter, Timing, group_count
-from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
+from apc.compiler.compiled import Group, Model, Parameter, Timing, group_count
+from apc.compiler.errors import ApcError, Diagnostic, Mistakes, SourceLocation
 from apc.compiler.language.evaluation import exact_value
 from apc.compiler.peer_counts import peers_of, recounted
 from apc.compiler.words import with_unit
-from apc.frame.display_units import Unit, as_shown
-from apc.frame.names import GIVEN, OVERRIDE, Free, find, unit_of
-from apc.frame.parameters import Scope, columns_of, scope_of, with_times_of_groups
+from apc.frame.display_units import DisplayUnit, as_shown
+from apc.frame.names import GIVEN, OVERRIDE, ParameterRef, find, unit_of
+from apc.frame.parameters import ParameterScope, columns_of, scope_of, with_times_of_groups
 
 N = TypeVar("N", Parameter, Timing)
 
@@ -33,11 +33,11 @@ N = TypeVar("N", Parameter, Timing)
 class Override:
     """A new SI value for a parameter or timing."""
 
-    free: Free
+    free: ParameterRef
     value: Fraction
 
 
-def parse_override(system: CompiledSystem, text: str) -> Override:
+def parse_override(system: Model, text: str) -> Override:
     """Read `NAME=QUANTITY`; the name may start with a group, or with the section it stands in.
 
     Raises
@@ -53,7 +53,7 @@ def parse_override(system: CompiledSystem, text: str) -> Override:
     name, value = name.strip(), value.strip()
     if not (equals and name and value):
         form = "contact.stiffness=800 N/m"
-        raise ApcError(Mistake("E621", OVERRIDE, "an override", "NAME=VALUE", text[:80], form))
+        raise ApcError(Diagnostic("E621", OVERRIDE, "an override", "NAME=VALUE", text[:80], form))
     try:
         free = find(system, name, OVERRIDE, counts=True)
     except ApcError as error:  # of one peer, with the value that it was to have
@@ -71,7 +71,7 @@ def parse_override(system: CompiledSystem, text: str) -> Override:
     return Override(free, result.value)
 
 
-def apply(system: CompiledSystem, overrides: Sequence[Override]) -> CompiledSystem:
+def apply(system: Model, overrides: Sequence[Override]) -> Model:
     """Return the system with new values; a parameter set loses its formula, what depends on it follows.
 
     Raises
@@ -137,7 +137,7 @@ def apply(system: CompiledSystem, overrides: Sequence[Override]) -> CompiledSyst
     return compiled_system
 
 
-def _counts(system: CompiledSystem, everywhere: Mapping[str, Fraction]) -> dict[str, Fraction]:
+def _counts(system: Model, everywhere: Mapping[str, Fraction]) -> dict[str, Fraction]:
     """Return how many peers each group has with what is given, nothing if that changes none of them."""
     now = {group.name: Fraction(group.count) for group in system.groups}
     wanted = {group_count(name) for name in now}
@@ -149,7 +149,7 @@ def _counts(system: CompiledSystem, everywhere: Mapping[str, Fraction]) -> dict[
     return result if result != now else {}
 
 
-def _changed(scope: Scope, given: Mapping[str, Fraction]) -> dict[str, Fraction]:
+def _changed(scope: ParameterScope, given: Mapping[str, Fraction]) -> dict[str, Fraction]:
     """Return the values given and what follows from them, exactly."""
     return scope.follow(given, exact_value, lambda name: scope.holder[name].number)
 
@@ -164,9 +164,7 @@ def _renewed(item: N, changed: Mapping[str, Fraction], given: Collection[str]) -
     return replace(item, value=float(value), exact=value, formula=formula)
 
 
-def _check_times(
-    system: CompiledSystem, group: str, values: Sequence[Parameter], own: Mapping[str, Fraction]
-) -> None:
+def _check_times(system: Model, group: str, values: Sequence[Parameter], own: Mapping[str, Fraction]) -> None:
     """Refuse what a group sets for itself where a time for all groups depends on it.
 
     Parameters
@@ -183,10 +181,10 @@ def _check_times(
         if name in changed:
             what = f"{name} is {meant}, and depends on what is set for {group}"
             hint = "the same without the group, or a group with a set of its own"
-            raise ApcError(Mistake("E622", OVERRIDE, what, hint=hint))
+            raise ApcError(Diagnostic("E622", OVERRIDE, what, hint=hint))
 
 
-def _check_bounds(system: CompiledSystem) -> None:
+def _check_bounds(system: Model) -> None:
     """Raise the mistakes of every value that is out of its bounds."""
     mistakes = Mistakes()
     for parameter in system.parameters:
@@ -211,7 +209,7 @@ def _check_bounds(system: CompiledSystem) -> None:
 
 
 def check_bounds(
-    parameter: Parameter, name: str, mistakes: Mistakes, code: str = "E624", place: Place = OVERRIDE
+    parameter: Parameter, name: str, mistakes: Mistakes, code: str = "E624", place: SourceLocation = OVERRIDE
 ) -> None:
     """Record a value below the minimum or above the maximum of a parameter.
 
@@ -229,7 +227,7 @@ def check_bounds(
     low, high, value = parameter.minimum, parameter.maximum, parameter.value
 
     def shown(number: float) -> str:
-        by, unit = as_shown(number, Unit.of(parameter))
+        by, unit = as_shown(number, DisplayUnit.of(parameter))
         return with_unit(f"{number * by:g}", unit)
 
     def out(expected: str, number: float) -> None:
@@ -247,7 +245,7 @@ def _in_ms(seconds: Fraction) -> str:
     return f"{1000 * float(seconds):.9g} ms"
 
 
-def _check_columns(system: CompiledSystem, group: Group, mistakes: Mistakes) -> None:
+def _check_columns(system: Model, group: Group, mistakes: Mistakes) -> None:
     """Record the first peer's value that is out of its bounds, of each parameter that differs."""
     columns = columns_of(system, group)
     holder = {parameter.name: parameter for parameter in (*system.parameters, *group.values)}

@@ -1,8 +1,8 @@
 """The numbers with which a compiled system becomes matrices, what follows from others worked out with them.
 
-Takes: a `CompiledSystem`, and new values by name, in any kind of number.
-Gives: `Scope`, `scope_of`, the one resolver of what follows from what; `Numbers`, `resolve`, `exact_numbers`;
-`columns_of`; `free_rows`, `free_values`; `with_times_of_groups`.
+Takes: a `Model`, and new values by name, in any kind of number.
+Gives: `ParameterScope`, `scope_of`, the one resolver of what follows from what; `ResolvedNumbers`, `resolve`,
+`exact_numbers`; `columns_of`; `free_rows`, `free_values`; `with_times_of_groups`.
 Guarantees: what a value reaches by a formula is worked out with it, in the order settled when the scene was
 compiled; what none reaches keeps the very number it was compiled with. Peers with the same parameters share
 one row. Complex values are complex steps: the imaginary part is a derivative.
@@ -20,18 +20,18 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem, Formula, Group, Kind, Parameter, Timing
-from apc.compiler.errors import ApcError, Mistake
+from apc.compiler.compiled import Formula, Group, Model, Parameter, PeerType, Timing
+from apc.compiler.errors import ApcError, Diagnostic
 from apc.compiler.language.evaluation import computed
 from apc.frame.exact import ROWS
-from apc.frame.names import OVERRIDE, Free, times_of
+from apc.frame.names import OVERRIDE, ParameterRef, times_of
 
 Floats = NDArray[np.float64]
 V = TypeVar("V")
 
 
 @dataclass(frozen=True, slots=True)
-class Scope:
+class ParameterScope:
     """The numbers that a group of peers sees, or everybody: `holder` by name, `formulas` in their order."""
 
     holder: Mapping[str, Parameter | Timing]
@@ -75,8 +75,8 @@ class Scope:
 
 
 def scope_of(
-    system: CompiledSystem, own: Sequence[Parameter | Timing] = (), *, fixed: Collection[str] = ()
-) -> Scope:
+    system: Model, own: Sequence[Parameter | Timing] = (), *, fixed: Collection[str] = ()
+) -> ParameterScope:
     """Return the numbers of a scene as they are seen by a group of peers, or by everybody.
 
     Parameters
@@ -95,10 +95,10 @@ def scope_of(
         for name in system.followers
         if name in holder and name not in fixed and (formula := holder[name].formula) is not None
     }
-    return Scope(holder, formulas)
+    return ParameterScope(holder, formulas)
 
 
-def with_times_of_groups(system: CompiledSystem, given: Mapping[str, V]) -> dict[str, V]:
+def with_times_of_groups(system: Model, given: Mapping[str, V]) -> dict[str, V]:
     """Return values for all groups, and with each the timings that groups set for themselves.
 
     One value for all groups replaces a group's own. A timing of a group that is given itself keeps its value.
@@ -114,7 +114,7 @@ def _rows(name: str, formula: Formula, values: list[Any]) -> Any:
 
 
 def columns_of(
-    system: CompiledSystem, group: Group, wanted: Collection[str] | None = None, peer: int | None = None
+    system: Model, group: Group, wanted: Collection[str] | None = None, peer: int | None = None
 ) -> dict[str, Floats]:
     """Return the parameters of a group that differ from peer to peer, given or by a formula, (count,) each.
 
@@ -144,14 +144,14 @@ def columns_of(
         if len(wrong):
             where = f"{group.name}[{int(wrong[0]) + (peer or 0) + 1}]"
             what = f"{name} = {formula.text[:80]} has no finite value for {where}"
-            raise ApcError(Mistake("E331", OVERRIDE, what))
+            raise ApcError(Diagnostic("E331", OVERRIDE, what))
         return result
 
     return scope.follow(given, compute, lambda name: float(scope.holder[name].value), wanted)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Numbers:
+class ResolvedNumbers:
     """Everything a compiled system needs to become matrices.
 
     `parameters` holds one matrix (k, n_p) a group: its peers' different rows, in the order in which they come
@@ -164,17 +164,17 @@ class Numbers:
     timings: Mapping[str, Fraction]
 
 
-def resolve(system: CompiledSystem) -> Numbers:
+def resolve(system: Model) -> ResolvedNumbers:
     """Return the numbers of a system. Raises ApcError as `columns_of`."""
     pairs = [_different_rows(system, group) for group in system.groups]
-    return Numbers(
+    return ResolvedNumbers(
         parameters=tuple(parameters for parameters, _ in pairs),
         rows=tuple(rows for _, rows in pairs),
         timings={timing.name: timing.value for timing in system.timings},
     )
 
 
-def _different_rows(system: CompiledSystem, group: Group) -> tuple[Floats, NDArray[np.int64]]:
+def _different_rows(system: Model, group: Group) -> tuple[Floats, NDArray[np.int64]]:
     """Return a group's different parameter rows (k, n_p) and which of them each peer has (count,)."""
     names = system.kinds[group.kind].parameters
     holder = {parameter.name: parameter for parameter in (*system.parameters, *group.values)}
@@ -195,7 +195,7 @@ def _different_rows(system: CompiledSystem, group: Group) -> tuple[Floats, NDArr
     return parameters, rows
 
 
-def exact_numbers(kind: Kind, vector: Floats) -> list[Fraction]:
+def exact_numbers(kind: PeerType, vector: Floats) -> list[Fraction]:
     """Return a peer's parameters (n_p,) exactly: as the floats they are, or what these floats round.
 
     Parameters
@@ -203,7 +203,7 @@ def exact_numbers(kind: Kind, vector: Floats) -> list[Fraction]:
     kind
         Of the peer: knows what is rounded.
     vector
-        Its parameters (n_p,), in the order of `Kind.parameters`.
+        Its parameters (n_p,), in the order of `PeerType.parameters`.
     """
     numbers = [Fraction(value) for value in vector.tolist()]
     for place, rationals in kind.rounded:
@@ -214,7 +214,7 @@ def exact_numbers(kind: Kind, vector: Floats) -> list[Fraction]:
 
 
 def free_rows(
-    system: CompiledSystem, group: Group, peer: int, values: Mapping[Free, NDArray[Any]]
+    system: Model, group: Group, peer: int, values: Mapping[ParameterRef, NDArray[Any]]
 ) -> NDArray[Any]:
     """Return a peer's parameter vector for many values of some parameters, what depends on them included.
 
@@ -242,10 +242,10 @@ def free_rows(
 
 
 def free_values(
-    system: CompiledSystem,
+    system: Model,
     group: Group,
     peer: int,
-    values: Mapping[Free, Any],
+    values: Mapping[ParameterRef, Any],
     rule: Callable[[str], Callable[..., Any]],
 ) -> list[Any]:
     """Return a peer's parameters, those that a free one reaches in its kind of number, the others as floats.

@@ -1,7 +1,7 @@
 """A peer with ways in and out: values that come from outside in a frame, and what is read of it there.
 
-Takes: a `LinearSite` whose last holds are the ways in, and its `Schedule`.
-Gives: `Ports`, `with_holds`, `with_ports`; `with_cuts`, `OUTSIDE`.
+Takes: a `LinearSubsystem` whose last holds are the ways in, and its `Schedule`.
+Gives: `FrameInputs`, `with_holds`, `with_ports`; `with_cuts`, `OUTSIDE`.
 Guarantees: the peer moves as before; what comes in and what is read are entries of z, so that every step of
 the kernel takes them along.
 Does not: say what comes in, or lift.
@@ -20,9 +20,19 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import ClockPartition, Hold, Kind
-from apc.frame.schedule import Act, Event, Heard, Propagate, Schedule, Sent, Tick, Value, Way
-from apc.frame.site import LinearSite, LinearTick
+from apc.compiler.compiled import ClockPartition, Hold, PeerType
+from apc.frame.schedule import (
+    ClockedValue,
+    CouplingTerm,
+    Event,
+    HoldUpdate,
+    Propagate,
+    ReceivedSample,
+    Schedule,
+    SentSample,
+    Tick,
+)
+from apc.frame.site import LinearSubsystem, LinearTick
 
 Matrix = NDArray[Any]
 Places = NDArray[np.intp]
@@ -31,11 +41,11 @@ Places = NDArray[np.intp]
 INPUTS, READINGS = "what comes in", "what is read"
 
 # What comes from outside stands where packets do, and is of no link.
-OUTSIDE = Heard(Way("", "", ""), Sent("", "", 0), 0)
+OUTSIDE = ReceivedSample(CouplingTerm("", "", ""), SentSample("", "", 0), 0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Ports:
+class FrameInputs:
     """Where in z the ways in and out are: `drawn` (instants, inputs) and `read` (instants, readings).
 
     `added` are all entries of z that the peer has not by itself.
@@ -46,7 +56,7 @@ class Ports:
     added: range
 
 
-def with_holds(site: LinearSite, columns: Matrix) -> LinearSite:
+def with_holds(site: LinearSubsystem, columns: Matrix) -> LinearSubsystem:
     """Return a site with more holds, whose values nothing reads and that move states as the columns say.
 
     Parameters
@@ -73,8 +83,8 @@ def with_holds(site: LinearSite, columns: Matrix) -> LinearSite:
 
 
 def with_cuts(
-    site: LinearSite, schedule: Schedule, cuts: Sequence[tuple[int, int]]
-) -> tuple[LinearSite, Schedule]:
+    site: LinearSubsystem, schedule: Schedule, cuts: Sequence[tuple[int, int]]
+) -> tuple[LinearSubsystem, Schedule]:
     """Return a site some of whose computed values come from outside, and its schedule.
 
     What a tick would compute of such a value is one more output of its partition. Cut by cut and tick by
@@ -111,7 +121,7 @@ def with_cuts(
             clock, outputs=(*clock.outputs, f"followed {outputs}"), units=(*clock.units, "1")
         )
         rows.setdefault(partition, []).append(len(heard))
-        carried += [Value(partition, outputs, index - count) for index in range(count)]
+        carried += [ClockedValue(partition, outputs, index - count) for index in range(count)]
         heard += [OUTSIDE] * count
     events = tuple(
         replace(event, heard=(*event.heard, *((row + event.index,) for row in rows.get(event.partition, ()))))
@@ -125,13 +135,13 @@ def with_cuts(
 
 
 def with_ports(
-    sites: Sequence[LinearSite],
+    sites: Sequence[LinearSubsystem],
     schedule: Schedule,
     inputs: int,
     drawn_at: Sequence[int],
     readings: Sequence[Matrix],
     read_at: Sequence[int],
-) -> tuple[list[LinearSite], Schedule, Ports]:
+) -> tuple[list[LinearSubsystem], Schedule, FrameInputs]:
     """Return a site, in one kind of number or several, with ways in and out, and where these are.
 
     Parameters
@@ -164,11 +174,13 @@ def with_ports(
     )
     count, taken = len(drawn_at), len(read_at)
     carries = bool(count and drawn_at[0] > 0)  # the last value of a frame acts on in the next
-    drawn = [Value(clock, index, number - count) for number in range(count) for index in range(inputs)]
-    before = [Value(clock, inputs + index, -1) for index in range(inputs)] if carries else []
-    read = [Value(clock + 1, index, number - taken) for number in range(taken) for index in range(outputs)]
+    drawn = [ClockedValue(clock, index, number - count) for number in range(count) for index in range(inputs)]
+    before = [ClockedValue(clock, inputs + index, -1) for index in range(inputs)] if carries else []
+    read = [
+        ClockedValue(clock + 1, index, number - taken) for number in range(taken) for index in range(outputs)
+    ]
     acts: dict[int, list[Event]] = {
-        instant: [Act(first + index, drawn[number * inputs + index]) for index in range(inputs)]
+        instant: [HoldUpdate(first + index, drawn[number * inputs + index]) for index in range(inputs)]
         for number, instant in enumerate(drawn_at)
     }
     taking = {instant: Tick(clock + 1, number, ()) for number, instant in enumerate(read_at)}
@@ -198,7 +210,7 @@ def with_ports(
         repeats=None,
     )
     behind = start + len(drawn) + len(before)
-    ports = Ports(
+    ports = FrameInputs(
         drawn=np.arange(start, start + len(drawn)).reshape(count, inputs),
         read=np.arange(behind, behind + len(read)).reshape(taken, outputs),
         added=range(start, behind + len(read)),
@@ -207,7 +219,7 @@ def with_ports(
     return made, full, ports
 
 
-def _with_clocks(site: LinearSite, kind: Kind, inputs: int, readings: Matrix) -> LinearSite:
+def _with_clocks(site: LinearSubsystem, kind: PeerType, inputs: int, readings: Matrix) -> LinearSubsystem:
     """Return a site with the clocks of ways in and out."""
     *many, n_x, n_u = site.b.shape
     number = site.b.dtype

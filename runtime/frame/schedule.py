@@ -1,13 +1,13 @@
 """What one frame of a peer is made of: its events in their order, and what is remembered between frames.
 
 Takes: what `scheduling` found out.
-Gives: `Schedule` and its events, `Event`; `Repeats`, `HELD`; the names of what is computed, sent and heard;
-`shifted`, `remembered`; `tick_by_tick`; `ORDER`.
+Gives: `Schedule` and its events, `Event`; `RepeatedEvents`, `HELD`; the names of what is computed, sent and
+heard; `shifted`, `remembered`; `tick_by_tick`; `ORDER`.
 Guarantees: exact time (integers of one quantum).
 Does not: find out what happens when (see `scheduling`).
 
-Every value a clock computes is one symbol, `Value(partition, output, index)`: what output `output` was at the
-tick `index`, counted from the frame's first tick of that clock; a negative index is an earlier frame.
+Every value a clock computes is one symbol, `ClockedValue(partition, output, index)`: what output `output` was
+at the tick `index`, counted from the frame's first tick of that clock; a negative index is an earlier frame.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ ORDER = ("send", "deliver", "tick", "act")
 
 
 @dataclass(frozen=True, slots=True, order=True)
-class Value:
+class ClockedValue:
     """Output `output` of clock partition `partition` as computed at tick `index` of the frame."""
 
     partition: int
@@ -29,18 +29,18 @@ class Value:
     index: int
 
 
-def shifted(value: Value, ticks: Sequence[int]) -> Value:
+def shifted(value: ClockedValue, ticks: Sequence[int]) -> ClockedValue:
     """Return the value that is called `value` one frame on; `ticks` are of a frame, by clock partition."""
-    return Value(value.partition, value.output, value.index + ticks[value.partition])
+    return ClockedValue(value.partition, value.output, value.index + ticks[value.partition])
 
 
-def remembered(values: Iterable[Value], ticks: Sequence[int]) -> tuple[Value, ...]:
+def remembered(values: Iterable[ClockedValue], ticks: Sequence[int]) -> tuple[ClockedValue, ...]:
     """Return those of some values that are of earlier frames, and what they were called until they came.
 
     A value read at index −j is, one frame before, the value of index n − j; if that is negative too, it is
     remembered as well.
     """
-    result: set[Value] = set()
+    result: set[ClockedValue] = set()
     for value in values:
         while value.index < 0:
             result.add(value)
@@ -49,7 +49,7 @@ def remembered(values: Iterable[Value], ticks: Sequence[int]) -> tuple[Value, ..
 
 
 @dataclass(frozen=True, slots=True, order=True)
-class Sent:
+class SentSample:
     """A channel of a link as sent at the link clock's tick `slot` of a frame."""
 
     link: str
@@ -58,7 +58,7 @@ class Sent:
 
 
 @dataclass(frozen=True, slots=True, order=True)
-class Way:
+class CouplingTerm:
     """A way from peer to peer, one weight for each pair of peers: `operator` over a link, delayed `delay`.
 
     Only those pairs of peers are on it whose delay is the timing `delay`. A receive that weighs every sender
@@ -75,22 +75,22 @@ class Way:
 
 
 @dataclass(frozen=True, slots=True, order=True)
-class Heard:
+class ReceivedSample:
     """What a site hears on `way`: the other peers' `sent`, of `lag` frames ago (0: this frame)."""
 
-    way: Way
-    sent: Sent
+    way: CouplingTerm
+    sent: SentSample
     lag: int
 
 
 @dataclass(frozen=True, slots=True, order=True)
-class Selected:
+class UncertainSample:
     """What tick `tick` of `clock` hears of a channel on a way that loses or delays packets: one that is kept.
 
     With `gap` it is not what is heard but the weight of what is missed.
     """
 
-    way: Way
+    way: CouplingTerm
     channel: str
     clock: str
     tick: int
@@ -105,7 +105,7 @@ class Propagate:
 
 
 @dataclass(frozen=True, slots=True)
-class Send:
+class SendEvent:
     """The site's send partition `partition` sends; `rows` are (channel, row of s) pairs."""
 
     partition: int
@@ -132,22 +132,22 @@ class Tick:
 
 
 @dataclass(frozen=True, slots=True)
-class Act:
+class HoldUpdate:
     """Hold `hold` switches to `value`."""
 
     hold: int
-    value: Value
+    value: ClockedValue
 
 
-Event = Propagate | Send | Tick | Act
+Event = Propagate | SendEvent | Tick | HoldUpdate
 
 
-# The partition of what a hold puts out, where that is named like a value: `Value(HELD, hold, −1)`.
+# The partition of what a hold puts out, where that is named like a value: `ClockedValue(HELD, hold, −1)`.
 HELD = -1
 
 
 @dataclass(frozen=True, slots=True)
-class Repeats:
+class RepeatedEvents:
     """Events that come again and again: `count` times `length` of them, from event `first` on.
 
     `ticks` are of one time, by clock partition. `entering` is what one time needs of those before, or what is
@@ -159,8 +159,8 @@ class Repeats:
     length: int
     count: int
     ticks: tuple[int, ...]
-    entering: tuple[Value, ...]
-    staying: tuple[Value, ...]
+    entering: tuple[ClockedValue, ...]
+    staying: tuple[ClockedValue, ...]
 
     @property
     def end(self) -> int:
@@ -183,18 +183,18 @@ class Schedule:
     quantum: Fraction
     frame: int
     events: tuple[Event, ...]
-    acting: tuple[Value | None, ...]
-    carried: tuple[Value, ...]
-    heard: tuple[Heard, ...]
-    sent: tuple[Sent, ...]
+    acting: tuple[ClockedValue | None, ...]
+    carried: tuple[ClockedValue, ...]
+    heard: tuple[ReceivedSample, ...]
+    sent: tuple[SentSample, ...]
     depths: tuple[int, ...]
     ticks: tuple[int, ...]
     marks: tuple[int, ...]
     value_names: tuple[str, ...]
     sent_names: tuple[str, ...]
     sent_times: tuple[int, ...]  # in quanta from the frame's start
-    selected: tuple[Selected, ...] = ()
-    repeats: Repeats | None = None
+    selected: tuple[UncertainSample, ...] = ()
+    repeats: RepeatedEvents | None = None
 
     @property
     def frame_s(self) -> Fraction:
@@ -202,11 +202,11 @@ class Schedule:
         return self.frame * self.quantum
 
     @property
-    def received(self) -> tuple[Heard | Selected, ...]:
+    def received(self) -> tuple[ReceivedSample | UncertainSample, ...]:
         """All that is received, by the rows of r."""
         return self.heard + self.selected
 
-    def ways(self, partition: int, receive: int) -> tuple[tuple[Way, str], ...]:
+    def ways(self, partition: int, receive: int) -> tuple[tuple[CouplingTerm, str], ...]:
         """Return the ways and channels a receive of a clock partition hears, whatever the tick."""
         ticks = [event for event in self.events if isinstance(event, Tick) and event.partition == partition]
         heard = [self.heard[row] for tick in ticks for row in tick.heard[receive]]
@@ -218,5 +218,7 @@ def tick_by_tick(schedule: Schedule) -> Schedule:
 
     Its rows of r are those of `schedule.selected`, in order.
     """
-    heard = tuple(Heard(row.way, Sent(row.way.link, row.channel, 0), 0) for row in schedule.selected)
+    heard = tuple(
+        ReceivedSample(row.way, SentSample(row.way.link, row.channel, 0), 0) for row in schedule.selected
+    )
     return replace(schedule, heard=heard, selected=())

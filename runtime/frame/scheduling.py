@@ -1,6 +1,6 @@
 """When what happens in one frame, in what order, and what must be remembered from frame to frame.
 
-Takes: a `CompiledSystem`, its timings as exact rationals, the structural patterns of its kinds.
+Takes: a `Model`, its timings as exact rationals, the structural patterns of its kinds.
 Gives: `build_schedules`, `newest`.
 Guarantees: the state at the start of a frame is what is demanded and nothing else: a hold that acts at once
 adds none, a link adds a sender's packets that are still to be heard.
@@ -16,31 +16,31 @@ from fractions import Fraction
 
 import numpy as np
 
-from apc.compiler.compiled import Clock, CompiledSystem, Kind, Link
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Clock, Link, Model, PeerType
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.words import no_more
-from apc.frame.exchange import Exchange, build_exchange
+from apc.frame.exchange import CommunicationGraph, build_exchange
 from apc.frame.hyperperiod import ClockGrid, Times, times_in_use
-from apc.frame.liveness import Hearing, hearing_of, live_holds, live_outputs, live_receives
+from apc.frame.liveness import ReceptionPattern, hearing_of, live_holds, live_outputs, live_receives
 from apc.frame.schedule import (
     HELD,
     ORDER,
-    Act,
+    ClockedValue,
+    CouplingTerm,
     Event,
-    Heard,
+    HoldUpdate,
     Propagate,
-    Repeats,
+    ReceivedSample,
+    RepeatedEvents,
     Schedule,
-    Selected,
-    Send,
-    Sent,
+    SendEvent,
+    SentSample,
     Tick,
-    Value,
-    Way,
+    UncertainSample,
     remembered,
     shifted,
 )
-from apc.frame.site import LinearSite
+from apc.frame.site import LinearSubsystem
 
 # Schedules of scenes that are remembered.
 KEPT = 16
@@ -59,13 +59,13 @@ MOST_HELD = (
 # the propagation there.
 _Happening = tuple[int, int, Event | None]
 # What each receive of a clock partition hears at each of its ticks, by (partition, tick).
-_Rows = dict[tuple[int, int], tuple[tuple[Heard | Selected, ...], ...]]
+_Rows = dict[tuple[int, int], tuple[tuple[ReceivedSample | UncertainSample, ...], ...]]
 
 
 def build_schedules(
-    system: CompiledSystem,
+    system: Model,
     timings: Mapping[str, Fraction],
-    patterns: Sequence[LinearSite],
+    patterns: Sequence[LinearSubsystem],
     *,
     order: Sequence[str] = ORDER,
     kept: Mapping[str, int] | None = None,
@@ -79,7 +79,7 @@ def build_schedules(
     timings
         Seconds by the name of the timing.
     patterns
-        The structural pattern of each kind (`SiteJacobians.pattern`).
+        The structural pattern of each kind (`SubsystemJacobians.pattern`).
     order
         The order of coincident events, a permutation of `ORDER`. With "act" before "tick", a value that acts
         at once misses the switch and acts a tick later; likewise "deliver" before "send" for packets, and
@@ -120,14 +120,14 @@ class _Timed:
 
     clocks: tuple[Clock, ...]
     links: tuple[Link, ...]
-    kinds: tuple[Kind, ...]
+    kinds: tuple[PeerType, ...]
     groups: tuple[tuple[str, int, int], ...]
     timings: tuple[tuple[str, Fraction], ...]
     order: tuple[str, ...]
     kept: tuple[tuple[str, int], ...]
     known: tuple[int, ...]
-    system: CompiledSystem = field(compare=False)
-    patterns: tuple[LinearSite, ...] = field(compare=False)
+    system: Model = field(compare=False)
+    patterns: tuple[LinearSubsystem, ...] = field(compare=False)
 
 
 @functools.lru_cache(maxsize=KEPT)
@@ -142,17 +142,17 @@ def _schedules(of: _Timed) -> tuple[Schedule, ...]:
     times = times_in_use(system, timings, patterns, live, hearing)
 
     _check_held(system, patterns, live, times)
-    known: dict[tuple[int, Hearing], _Rows] = {}
-    depth: dict[Sent, int] = {}
+    known: dict[tuple[int, ReceptionPattern], _Rows] = {}
+    depth: dict[SentSample, int] = {}
     for group, own in zip(system.groups, hearing, strict=True):
         if (group.kind, own) not in known:
             heard = _heard_at_ticks(patterns[group.kind], exchange, live[group.kind], own, times, rank, kept)
             known[group.kind, own] = heard
             for item in (item for row in heard.values() for receive in row for item in receive):
-                if isinstance(item, Selected):
+                if isinstance(item, UncertainSample):
                     link = item.way.link
                     slots = times.frame // times.clocks[exchange.links[link].clock].period
-                    depth |= {Sent(link, item.channel, k): kept[link] for k in range(slots)}
+                    depth |= {SentSample(link, item.channel, k): kept[link] for k in range(slots)}
                 else:
                     depth[item.sent] = max(depth.get(item.sent, 0), item.lag)
     _check_depth(system, depth)
@@ -164,8 +164,8 @@ def _schedules(of: _Timed) -> tuple[Schedule, ...]:
 
 
 def _check_held(
-    system: CompiledSystem,
-    patterns: Sequence[LinearSite],
+    system: Model,
+    patterns: Sequence[LinearSubsystem],
     live: Sequence[frozenset[tuple[int, int]]],
     times: Times,
 ) -> None:
@@ -189,10 +189,10 @@ def _check_held(
         most = no_more(seconds * left / held[longest], 3)
         fits = f"{longest.rpartition('.')[2]}: {most} s, or a slower clock" if left > 0 else ""
         hint = fits or "shorter delays of all forces, or a slower clock"
-        raise ApcError(Mistake("E805", Place(system.origin.topology), what, hint=hint))
+        raise ApcError(Diagnostic("E805", SourceLocation(system.origin.topology), what, hint=hint))
 
 
-def _check_depth(system: CompiledSystem, depth: Mapping[Sent, int]) -> None:
+def _check_depth(system: Model, depth: Mapping[SentSample, int]) -> None:
     """Refuse delays so long that nobody can have meant them."""
     packets = sum(depth.values())
     if packets > MOST_PACKETS:
@@ -202,17 +202,20 @@ def _check_depth(system: CompiledSystem, depth: Mapping[Sent, int]) -> None:
             f"at most {MOST_PACKETS:,} can be named"
         )
         raise ApcError(
-            Mistake(
-                "E805", Place(system.origin.topology), what, hint="a shorter delay, or a slower link clock"
+            Diagnostic(
+                "E805",
+                SourceLocation(system.origin.topology),
+                what,
+                hint="a shorter delay, or a slower link clock",
             )
         )
 
 
 def _heard_at_ticks(
-    pattern: LinearSite,
-    exchange: Exchange,
+    pattern: LinearSubsystem,
+    exchange: CommunicationGraph,
     live: frozenset[tuple[int, int]],
-    hearing: Hearing,
+    hearing: ReceptionPattern,
     times: Times,
     rank: Mapping[str, int],
     kept: Mapping[str, int],
@@ -220,11 +223,13 @@ def _heard_at_ticks(
     """Return, for every (partition, tick) of the frame, what each receive of the partition hears."""
     heard: _Rows = {}
 
-    def rows(way: Way, channel: str, clock: str, index: int) -> tuple[Heard | Selected, ...]:
+    def rows(
+        way: CouplingTerm, channel: str, clock: str, index: int
+    ) -> tuple[ReceivedSample | UncertainSample, ...]:
         if way.link not in kept:
             instant = times.clocks[clock].at(index - way.before)
             return (newest(way, channel, exchange.links[way.link], instant, times, rank),)
-        row = Selected(way, channel, clock, index)
+        row = UncertainSample(way, channel, clock, index)
         law = exchange.links[way.link].channel
         return (row, replace(row, gap=True)) if law is not None and law.on_loss == "zero" else (row,)
 
@@ -238,7 +243,9 @@ def _heard_at_ticks(
     return heard
 
 
-def newest(way: Way, channel: str, link: Link, instant: int, times: Times, rank: Mapping[str, int]) -> Heard:
+def newest(
+    way: CouplingTerm, channel: str, link: Link, instant: int, times: Times, rank: Mapping[str, int]
+) -> ReceivedSample:
     """Return the newest packet on a way that a tick at an instant sees.
 
     Parameters
@@ -256,15 +263,15 @@ def newest(way: Way, channel: str, link: Link, instant: int, times: Times, rank:
     missed = 1 if delay == 0 and rank["deliver"] < rank["send"] else 0
     number = grid.newest(instant - delay, strictly=rank["tick"] < rank["deliver"]) - missed
     frames, slot = divmod(number, times.frame // grid.period)  # a negative number is of an earlier frame
-    return Heard(way, Sent(way.link, channel, slot), -frames)
+    return ReceivedSample(way, SentSample(way.link, channel, slot), -frames)
 
 
 def _build(
-    pattern: LinearSite,
-    system: CompiledSystem,
+    pattern: LinearSubsystem,
+    system: Model,
     live: frozenset[tuple[int, int]],
     heard_at: _Rows,
-    depth: Mapping[Sent, int],
+    depth: Mapping[SentSample, int],
     times: Times,
     rank: Mapping[str, int],
 ) -> Schedule:
@@ -272,8 +279,8 @@ def _build(
     kind = pattern.kind
     grid_of = {link.name: times.clocks.get(link.clock) for link in system.links}
     every = {item for row in heard_at.values() for receive in row for item in receive}
-    heard = tuple(sorted(heard for heard in every if isinstance(heard, Heard)))
-    selected = tuple(sorted(selected for selected in every if isinstance(selected, Selected)))
+    heard = tuple(sorted(heard for heard in every if isinstance(heard, ReceivedSample)))
+    selected = tuple(sorted(selected for selected in every if isinstance(selected, UncertainSample)))
     channels = {sending.link: sending.channels for sending in kind.sends}
     sent = tuple(sorted(sent for sent in depth if sent.channel in channels.get(sent.link, ())))
     acting, switches = _switches(pattern, live, times, rank)
@@ -331,9 +338,9 @@ def _in_order(happenings: Sequence[_Happening]) -> tuple[Event, ...]:
 
 
 def _computations(
-    pattern: LinearSite,
+    pattern: LinearSubsystem,
     heard_at: _Rows,
-    received: Sequence[Heard | Selected],
+    received: Sequence[ReceivedSample | UncertainSample],
     times: Times,
     rank: int,
 ) -> Iterator[_Happening]:
@@ -347,7 +354,11 @@ def _computations(
 
 
 def _sendings(
-    pattern: LinearSite, grid_of: Mapping[str, ClockGrid | None], sent: Sequence[Sent], frame: int, rank: int
+    pattern: LinearSubsystem,
+    grid_of: Mapping[str, ClockGrid | None],
+    sent: Sequence[SentSample],
+    frame: int,
+    rank: int,
 ) -> Iterator[_Happening]:
     """Yield when a site sends what in a frame."""
     for p, sending in enumerate(pattern.kind.sends):
@@ -360,16 +371,16 @@ def _sendings(
             )
             if rows:
                 assert grid is not None
-                yield grid.at(slot), rank, Send(p, rows)
+                yield grid.at(slot), rank, SendEvent(p, rows)
 
 
 def _switches(
-    pattern: LinearSite, live: frozenset[tuple[int, int]], times: Times, rank: Mapping[str, int]
-) -> tuple[list[Value | None], list[_Happening]]:
+    pattern: LinearSubsystem, live: frozenset[tuple[int, int]], times: Times, rank: Mapping[str, int]
+) -> tuple[list[ClockedValue | None], list[_Happening]]:
     """Return what each hold holds as the frame begins, None if nobody feels it, and when it switches."""
     kind = pattern.kind
     partition_of = {partition.clock: index for index, partition in enumerate(kind.clocks)}
-    acting: list[Value | None] = []
+    acting: list[ClockedValue | None] = []
     happenings: list[_Happening] = []
     for h, (hold, used) in enumerate(zip(kind.holds, live_holds(pattern, live), strict=True)):
         if not used:
@@ -378,14 +389,14 @@ def _switches(
         grid, delay, p = times.clocks[hold.clock], times.delays[hold.delay], partition_of[hold.clock]
         missed = 1 if delay == 0 and rank["act"] < rank["tick"] else 0
         first = grid.newest(-delay, strictly=True)  # switched before the frame begins
-        acting.append(Value(p, hold.output, first - missed))
+        acting.append(ClockedValue(p, hold.output, first - missed))
         for index in range(first + 1, grid.newest(times.frame - delay, strictly=True) + 1):
-            switch = Act(h, Value(p, hold.output, index - missed))
+            switch = HoldUpdate(h, ClockedValue(p, hold.output, index - missed))
             happenings.append((grid.at(index) + delay, rank["act"], switch))
     return acting, happenings
 
 
-def _slot_time(sent: Sent, grid_of: Mapping[str, ClockGrid | None]) -> int:
+def _slot_time(sent: SentSample, grid_of: Mapping[str, ClockGrid | None]) -> int:
     """Return when a slot is sent, in quanta from the frame's start."""
     grid = grid_of[sent.link]
     assert grid is not None
@@ -393,26 +404,26 @@ def _slot_time(sent: Sent, grid_of: Mapping[str, ClockGrid | None]) -> int:
 
 
 def _carried(
-    pattern: LinearSite,
+    pattern: LinearSubsystem,
     live: frozenset[tuple[int, int]],
     events: Sequence[Event],
-    acting: Sequence[Value | None],
+    acting: Sequence[ClockedValue | None],
     ticks: Sequence[int],
-) -> tuple[Value, ...]:
+) -> tuple[ClockedValue, ...]:
     """Return the values of earlier frames that this frame reads, and those still to be read later."""
     return remembered(_demanded(pattern, live, events, acting), ticks)
 
 
 def _demanded(
-    pattern: LinearSite,
+    pattern: LinearSubsystem,
     live: frozenset[tuple[int, int]],
     events: Sequence[Event],
-    acting: Sequence[Value | None],
-) -> set[Value]:
+    acting: Sequence[ClockedValue | None],
+) -> set[ClockedValue]:
     """Return the values that events read."""
     kind = pattern.kind
     now = list(acting)
-    demanded: set[Value] = set()
+    demanded: set[ClockedValue] = set()
     felt = np.flatnonzero(pattern.b.any(axis=0)).tolist()
     sent = [[channel.nonzero()[0].tolist() for channel in send.u] for send in pattern.sends]
     computed, recalled = [], []
@@ -426,27 +437,27 @@ def _demanded(
 
     for event in events:
         match event:
-            case Act(hold, value):
+            case HoldUpdate(hold, value):
                 now[hold] = value
             case Propagate():
                 read(felt)
-            case Send(partition, rows):
+            case SendEvent(partition, rows):
                 for channel, _ in rows:
                     read(sent[partition][channel])
             case Tick(partition, index):
                 read(computed[partition])
                 memories = kind.clocks[partition].memories
-                demanded.update(Value(partition, memories[m], index - 1) for m in recalled[partition])
+                demanded.update(ClockedValue(partition, memories[m], index - 1) for m in recalled[partition])
     return demanded
 
 
 def _repeats(
-    pattern: LinearSite,
+    pattern: LinearSubsystem,
     live: frozenset[tuple[int, int]],
     events: Sequence[Event],
-    carried: Sequence[Value],
+    carried: Sequence[ClockedValue],
     ticks: Sequence[int],
-) -> Repeats | None:
+) -> RepeatedEvents | None:
     """Return the longest row of events that come again and again, as of a clock's ticks between packets."""
     counted = [*_counted(events, len(ticks))]
     first, length, count = _longest_run([_form(*pair) for pair in zip(events, counted, strict=False)])
@@ -455,7 +466,7 @@ def _repeats(
         return None
     begin, again, end = (counted[first + length * times] for times in (0, 1, count))
     own = tuple(after - before for before, after in zip(begin, again, strict=True))
-    holds = [Value(HELD, hold, -1) for hold in range(pattern.b.shape[1])]
+    holds = [ClockedValue(HELD, hold, -1) for hold in range(pattern.b.shape[1])]
     once = (*own, 1)  # what a hold puts out is of the time before: its partition is the last
     body = [_moved(event, begin) for event in events[first : first + length]]
     rest = [_moved(event, end) for event in events[first + length * count :]]
@@ -464,14 +475,14 @@ def _repeats(
         *_demanded(pattern, live, rest, holds),
         *(_earlier(shifted(value, ticks), end) for value in carried),
     }
-    switched = {event.hold for event in body if isinstance(event, Act)}
+    switched = {event.hold for event in body if isinstance(event, HoldUpdate)}
     stays = {
         value
         for value in needed
         if (value.output not in switched if value.partition == HELD else not own[value.partition])
     }
     staying = tuple(sorted(value for value in stays if value.index < 0))
-    return Repeats(first, length, count, own, remembered(needed - stays, once), staying)
+    return RepeatedEvents(first, length, count, own, remembered(needed - stays, once), staying)
 
 
 def _counted(events: Sequence[Event], clocks: int) -> Iterator[tuple[int, ...]]:
@@ -489,7 +500,7 @@ def _form(event: Event, by: Sequence[int]) -> Hashable:
     match event:
         case Tick(partition, index, heard, variant):
             return "tick", partition, index - by[partition], heard, variant
-        case Act(hold, value):
+        case HoldUpdate(hold, value):
             return "act", hold, value.partition, value.output, value.index - by[value.partition]
         case Propagate(duration):
             return duration
@@ -501,13 +512,13 @@ def _moved(event: Event, by: Sequence[int]) -> Event:
     match event:
         case Tick(partition, index):
             return replace(event, index=index - by[partition])
-        case Act(hold, value):
-            return Act(hold, _earlier(value, by))
+        case HoldUpdate(hold, value):
+            return HoldUpdate(hold, _earlier(value, by))
     return event
 
 
-def _earlier(value: Value, by: Sequence[int]) -> Value:
-    return Value(value.partition, value.output, value.index - by[value.partition])
+def _earlier(value: ClockedValue, by: Sequence[int]) -> ClockedValue:
+    return ClockedValue(value.partition, value.output, value.index - by[value.partition])
 
 
 def _longest_run(forms: Sequence[Hashable]) -> tuple[int, int, int]:
@@ -530,7 +541,7 @@ def _longest_run(forms: Sequence[Hashable]) -> tuple[int, int, int]:
     return result
 
 
-def _value_name(pattern: LinearSite, value: Value, times: Times) -> str:
+def _value_name(pattern: LinearSubsystem, value: ClockedValue, times: Times) -> str:
     """Return `name(-1 ms)`: a value as it was at a time before the frame."""
     partition = pattern.kind.clocks[value.partition]
     seconds = times.clocks[partition.clock].at(value.index) * times.quantum

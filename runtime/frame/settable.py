@@ -1,6 +1,6 @@
 """What may be set of a compiled scene: every number by its name, with its value, unit and limits.
 
-Takes: a `CompiledSystem`. Gives: `Settable`, `Parameters`, `parameters`.
+Takes: a `Model`. Gives: `Settable`, `Parameters`, `parameters`.
 Guarantees: what is listed is what `--set` takes, or says why it does not; a number of which a group has its
 own has a row for each group, though without the group it is set for all.
 Does not: change a value (see `overrides`), or list words such as a part's type, which are decided as the
@@ -15,15 +15,15 @@ from typing import ClassVar
 
 from apc.compiler.compiled import (
     LARGEST_COUNT,
-    CompiledSystem,
     Group,
+    Model,
     Parameter,
     Timing,
     counts_peers,
     group_count,
 )
-from apc.frame.display_units import Unit
-from apc.frame.names import Free, is_named, named_times, parameter_of, times_of, values_by_group
+from apc.frame.display_units import DisplayUnit
+from apc.frame.names import ParameterRef, is_named, named_times, parameter_of, times_of, values_by_group
 from apc.frame.parameters import columns_of
 from apc.result import Result
 
@@ -59,21 +59,21 @@ class Parameters(Result):
     shown_by: ClassVar[str] = "vary_output:parameters"
 
 
-def parameters(system: CompiledSystem) -> Parameters:
+def parameters(system: Model) -> Parameters:
     """List what may be set of a scene, with its value, unit and limits."""
     return Parameters(system.name, tuple(_rows(system)))
 
 
-def _rows(system: CompiledSystem) -> Iterator[Settable]:
+def _rows(system: Model) -> Iterator[Settable]:
     times = {timing.name for timing in system.timings}
     for parameter in system.parameters:
         if not is_named(parameter.name) or parameter.name in times:
             continue
-        if not values_by_group(system, Free(parameter.name)):
+        if not values_by_group(system, ParameterRef(parameter.name)):
             yield _number(parameter, parameter.name, parameter.value, parameter.value)
             continue
         for group in system.groups:
-            own = parameter_of(system, Free(parameter.name, group.name))
+            own = parameter_of(system, ParameterRef(parameter.name, group.name))
             yield _number(own, f"{group.name}.{parameter.name}", *_span(system, group, own))
     for timing in named_times(system):
         yield _time(system, timing)
@@ -81,7 +81,7 @@ def _rows(system: CompiledSystem) -> Iterator[Settable]:
         yield _count(system, group)
 
 
-def _count(system: CompiledSystem, group: Group) -> Settable:
+def _count(system: Model, group: Group) -> Settable:
     """Return how many peers a group has: to be set where they are alike and no graph names them."""
     parameter = next(
         parameter for parameter in system.parameters if parameter.name == group_count(group.name)
@@ -105,7 +105,7 @@ def _count(system: CompiledSystem, group: Group) -> Settable:
     )
 
 
-def _span(system: CompiledSystem, group: Group, parameter: Parameter) -> tuple[float, float]:
+def _span(system: Model, group: Group, parameter: Parameter) -> tuple[float, float]:
     values = columns_of(system, group).get(parameter.name)
     return (parameter.value, parameter.value) if values is None else (float(min(values)), float(max(values)))
 
@@ -116,7 +116,7 @@ def _number(parameter: Parameter, name: str, low: float, high: float) -> Settabl
         name,
         low,
         high,
-        Unit.of(parameter),
+        DisplayUnit.of(parameter),
         parameter.minimum,
         parameter.open_minimum,
         parameter.maximum,
@@ -126,7 +126,7 @@ def _number(parameter: Parameter, name: str, low: float, high: float) -> Settabl
     )
 
 
-def _time(system: CompiledSystem, timing: Timing) -> Settable:
+def _time(system: Model, timing: Timing) -> Settable:
     """Return a period, which is above 0 s, a phase, which is below its period, or a delay."""
     values = [item.value for item in system.timings if item.name in times_of(system, timing.name)]
     about = ""

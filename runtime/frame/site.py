@@ -1,7 +1,7 @@
 """The linear equations of one site as matrices, and what can be done to all of them alike.
 
 Takes: a kind, and matrices of floats, exact rationals, truth values or any other kind of number.
-Gives: `LinearSite`, `LinearTick`, `LinearSend`; `matrices_of`, `assemble`, `cut`; `every_matrix`,
+Gives: `LinearSubsystem`, `LinearTick`, `LinearSend`; `matrices_of`, `assemble`, `cut`; `every_matrix`,
 `entrywise`, `rational_floats`, `with_own_parts`.
 Guarantees: every matrix says what its rows and columns are, whatever kind of number it holds.
 Does not: compute a number of them (see `linearize`); keep offsets: constant forces move the equilibrium, not
@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import Kind
+from apc.compiler.compiled import PeerType
 
 Matrix = NDArray[Any]
 
@@ -52,14 +52,14 @@ class LinearSend:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LinearSite:
+class LinearSubsystem:
     """The matrices of one site, in floats, exact rationals, or truth values (a structural pattern).
 
     `affine` says that the site's own equations are affine, so that the matrices hold everywhere;
     otherwise they are the Jacobians at the start values.
     """
 
-    kind: Kind
+    kind: PeerType
     affine: bool
     a: Matrix  # (n_x, n_x)
     b: Matrix  # (n_x, n_u)
@@ -67,7 +67,7 @@ class LinearSite:
     sends: tuple[LinearSend, ...]  # in the order of Kind.sends
 
 
-def matrices_of(site: LinearSite) -> list[Matrix]:
+def matrices_of(site: LinearSubsystem) -> list[Matrix]:
     """List a site's matrices in the order `jacobians` writes them."""
     listed = [site.a, site.b]
     for tick in site.ticks:
@@ -78,11 +78,11 @@ def matrices_of(site: LinearSite) -> list[Matrix]:
 
 
 def assemble(
-    kind: Kind,
+    kind: PeerType,
     affine: bool,
     matrices: Sequence[Matrix],
     channels: Sequence[tuple[tuple[int, ...], ...]],
-) -> LinearSite:
+) -> LinearSubsystem:
     """Put a list of matrices, in the order of `matrices_of`, into a site."""
     rest = iter(matrices)
     a, b = next(rest), next(rest)
@@ -91,7 +91,7 @@ def assemble(
         for partition, heard in zip(kind.clocks, channels, strict=True)
     )
     sends = tuple(LinearSend(sending.link, next(rest), next(rest)) for sending in kind.sends)
-    return LinearSite(kind, affine, a, b, ticks, sends)
+    return LinearSubsystem(kind, affine, a, b, ticks, sends)
 
 
 def cut(flat: Matrix, shapes: Sequence[tuple[int, int]]) -> list[Matrix]:
@@ -104,13 +104,15 @@ def cut(flat: Matrix, shapes: Sequence[tuple[int, int]]) -> list[Matrix]:
     return matrices
 
 
-def every_matrix(site: LinearSite, change: Callable[[Matrix], Matrix]) -> LinearSite:
+def every_matrix(site: LinearSubsystem, change: Callable[[Matrix], Matrix]) -> LinearSubsystem:
     """Return the site with every matrix changed, a leading axis or none."""
     channels = [tick.channels for tick in site.ticks]
     return assemble(site.kind, site.affine, [change(matrix) for matrix in matrices_of(site)], channels)
 
 
-def entrywise(site: LinearSite, change: Callable[[Any], Any], kind_of_number: type = object) -> LinearSite:
+def entrywise(
+    site: LinearSubsystem, change: Callable[[Any], Any], kind_of_number: type = object
+) -> LinearSubsystem:
     """Return the site with every entry changed, in arrays of another kind of number."""
     channels = [tick.channels for tick in site.ticks]
     changed = []
@@ -121,17 +123,17 @@ def entrywise(site: LinearSite, change: Callable[[Any], Any], kind_of_number: ty
     return assemble(site.kind, site.affine, changed, channels)
 
 
-def rational_floats(site: LinearSite) -> LinearSite:
+def rational_floats(site: LinearSubsystem) -> LinearSubsystem:
     """Return the site with every float as the rational it is."""
     return entrywise(site, Fraction)
 
 
 def with_own_parts(
-    site: LinearSite,
+    site: LinearSubsystem,
     own: Sequence[Sequence[Matrix | None]],
     add: Callable[[Matrix, Matrix], Matrix],
     multiply: Callable[[Matrix, Matrix], Matrix],
-) -> LinearSite:
+) -> LinearSubsystem:
     """Return the site with each receive's own part over (x, u, m) in its ticks."""
     ticks = []
     for tick, parts in zip(site.ticks, own, strict=True):

@@ -1,6 +1,6 @@
 """Whether the equations of a scene have values where it starts, and its frame a finite map.
 
-Takes: a `CompiledSystem`. Gives: `check_values`.
+Takes: a `Model`. Gives: `check_values`.
 Guarantees: what compiles can be linearized and lifted, or the message says what has no value.
 Does not: bound the map's error (see `lift`).
 """
@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.timings import part
 from apc.frame.ages import linear_sites, of_one_delay
 from apc.frame.discretize import TOO_LARGE, refuse_many
@@ -26,7 +26,7 @@ MOST_CHECKED = 3
 
 
 @part("check of values")
-def check_values(system: CompiledSystem) -> None:
+def check_values(system: Model) -> None:
     """Linearize and lift the first few sites of each kind; refuse the scene if a number is not finite.
 
     A kind whose slopes depend on what is heard is left to the analysis, which knows where the scene starts.
@@ -39,7 +39,7 @@ def check_values(system: CompiledSystem) -> None:
         E806 a frame leaves the range of floats; E808 an equation has no finite value at the start values;
         E812 a peer has too many states.
     """
-    place = Place(system.origin.topology)
+    place = SourceLocation(system.origin.topology)
     for kind in system.kinds:
         refuse_many(len(kind.states), place)
     numbers = resolve(system)
@@ -53,4 +53,4 @@ def check_values(system: CompiledSystem) -> None:
                 check_start(sites[group.kind], parameters)
                 frame = lift(linearize(sites[group.kind], parameters), schedule)
                 if not all(np.isfinite(block).all() for block in (frame.p, frame.q, frame.s, frame.d)):
-                    raise ApcError(Mistake("E806", place, TOO_LARGE))
+                    raise ApcError(Diagnostic("E806", place, TOO_LARGE))

@@ -12,13 +12,13 @@ from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from typing import Any
 
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.weights import exact_weight
 from apc.frame.exact import evaluate_exact
 from apc.frame.exchange import check_mean
-from apc.frame.instance import Instance, Peers
+from apc.frame.instance import Instance, PeerIndices
 from apc.frame.jacobians import edge_name
-from apc.frame.linearize import Listening, start_sends, start_values
+from apc.frame.linearize import InitialReception, start_sends, start_values
 from apc.frame.parameters import exact_numbers
 
 # What a receive weighs each sender's channel by, by (edge, channel): one for all senders, or one a group.
@@ -28,7 +28,7 @@ Gains = Mapping[tuple[str, str], tuple[Fraction, ...]]
 class StartClasses:
     """Classes of peers that start alike at the start of time, each hearing the others where they start."""
 
-    def __init__(self, instance: Instance, classes: Sequence[Peers]) -> None:
+    def __init__(self, instance: Instance, classes: Sequence[PeerIndices]) -> None:
         self.exchange = exchange = instance.exchange
         self.counts = list(map(len, classes))
         self.peers = [peers.first for peers in classes]
@@ -72,7 +72,7 @@ class StartClasses:
         """Return what each different sender that class g receives from sends over a link at the start."""
         return [self.sent[h][link] for h, _, _ in self._senders(link, g)]
 
-    def listen(self, g: int) -> tuple[Listening, Gains]:
+    def listen(self, g: int) -> tuple[InitialReception, Gains]:
         """Return what class g hears at the start, and what its edge functions weigh each sender by."""
         site, schedule = self.sites[g], self.schedules[g]
         values: list[Fraction] = []
@@ -105,7 +105,7 @@ class StartClasses:
                         )
                         distinct = {listed[h] for h, _, _ in senders}
                         gains[name, channel] = tuple(distinct) if len(distinct) == 1 else listed
-        return Listening(tuple(values), tuple(own)), gains
+        return InitialReception(tuple(values), tuple(own)), gains
 
     def _norm(
         self, operator: str, g: int, link: str, senders: Sequence[tuple[int, Fraction, int]]
@@ -163,5 +163,5 @@ class StartClasses:
             peer = self.exchange.peer_name(self.peers[g])
             what = f"{name} of {peer}: {operator} over equal peers has no linearization"
             hint = "start values that differ from peer to peer"
-            raise ApcError(Mistake("E803", Place(self.exchange.scene), what, hint=hint))
+            raise ApcError(Diagnostic("E803", SourceLocation(self.exchange.scene), what, hint=hint))
         return winners[0][0]

@@ -1,6 +1,6 @@
 """How peers answer a push at one of them, put together from the answers of modes.
 
-Takes: a `CompiledSystem` with what `instance.prepare` made of it, and two devices.
+Takes: a `Model` with what `instance.prepare` made of it, and two devices.
 Gives: `Responses`, `responses`; `Weights`; `held_names`.
 Guarantees: an answer is exact for the sampled, held and sent signals of the scene, with a bound on its
 rounding.
@@ -21,20 +21,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import lifted_groups
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.language.vectors import whole_and_index
-from apc.eigen.closing import Loop
+from apc.eigen.closing import ModalSystem
 from apc.eigen.modes import arrange, dense_loop
-from apc.eigen.peers import MOST_STATES, PeerGroup
+from apc.eigen.peers import MOST_STATES, PeerClass
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.devices import OWN_MASS, Device, coupled_directly, find_device, find_devices
-from apc.frame.exchange import Exchange
+from apc.frame.exchange import CommunicationGraph
 from apc.frame.instance import Prepared
 from apc.frame.parameters import resolve
 from apc.frame.radius import RADII, UNIT, with_radius
-from apc.hands.asked import Port
-from apc.hands.response import Pushed, open_site, pushed_loop, spectra
+from apc.hands.asked import DevicePort
+from apc.hands.response import DrivenMode, open_site, pushed_loop, spectra
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -54,7 +54,7 @@ MOST_TOGETHER = 2000
 MOST_KICKS = 4000
 
 
-def responses(system: CompiledSystem, prepared: Prepared, port: Port, other: Port) -> Responses:
+def responses(system: Model, prepared: Prepared, port: DevicePort, other: DevicePort) -> Responses:
     """Return the answers to a push of one device, at it and at another.
 
     Parameters
@@ -93,7 +93,9 @@ def responses(system: CompiledSystem, prepared: Prepared, port: Port, other: Por
     if (states := sum(len(site.z_names) for site in common.sites)) > MOST_TOGETHER:
         what = f"{len(common.sites):,} peers that differ have {states:,} states and readings in a frame"
         hint = f"fewer peers that differ: {MOST_TOGETHER:,} at most"
-        raise ApcError(Mistake("E933", Place(system.origin.topology), f"apc feel: {what}", hint=hint))
+        raise ApcError(
+            Diagnostic("E933", SourceLocation(system.origin.topology), f"apc feel: {what}", hint=hint)
+        )
     here, there = (
         next(place for place, site in enumerate(common.sites) if item.peer in site.peers)
         for item in (port, other)
@@ -115,7 +117,7 @@ def responses(system: CompiledSystem, prepared: Prepared, port: Port, other: Por
 
 
 def _held_device(
-    system: CompiledSystem, prepared: Prepared, group: PeerGroup, part: str, unit_of: Mapping[str, str]
+    system: Model, prepared: Prepared, group: PeerClass, part: str, unit_of: Mapping[str, str]
 ) -> Device:
     """Return the device of a group that a hand holds, the only one if no part is named; or refuse it."""
     direct = coupled_directly(system.kinds)
@@ -128,10 +130,10 @@ def _held_device(
     names = held_names(system, prepared)
     own = [name for name in names if name.startswith(f"{group.name}[")]
     hint = f'--at "{(own or names)[0]}"' if names else "" if device else OWN_MASS
-    raise ApcError(Mistake("E931", Place(system.origin.topology), what, hint=hint))
+    raise ApcError(Diagnostic("E931", SourceLocation(system.origin.topology), what, hint=hint))
 
 
-def held_names(system: CompiledSystem, prepared: Prepared) -> list[str]:
+def held_names(system: Model, prepared: Prepared) -> list[str]:
     """Return what hands may hold, of the first peer of each group: `left[1].device`."""
     unit_of, numbers = {parameter.name: parameter.unit for parameter in system.parameters}, resolve(system)
     direct = coupled_directly(system.kinds)
@@ -145,16 +147,18 @@ def held_names(system: CompiledSystem, prepared: Prepared) -> list[str]:
     ]
 
 
-def _check_kicks(system: CompiledSystem, group: PeerGroup) -> None:
+def _check_kicks(system: Model, group: PeerClass) -> None:
     """Refuse a peer of too many events and states in a frame: ApcError E933."""
     kicks = len(group.schedule.events) * len(group.site.a)
     if kicks > MOST_KICKS:
         what = f"a frame of {group.name} has too many events and states: {kicks:,} together"
         hint = f"{MOST_KICKS:,} at most"
-        raise ApcError(Mistake("E933", Place(system.origin.topology), what, hint=hint))
+        raise ApcError(Diagnostic("E933", SourceLocation(system.origin.topology), what, hint=hint))
 
 
-def _arranged(system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange) -> tuple[Loop, ...]:
+def _arranged(
+    system: Model, groups: Sequence[PeerClass], exchange: CommunicationGraph
+) -> tuple[ModalSystem, ...]:
     """Return one loop of all classes of equal peers, and one of each class apart; or all peers in one."""
     arranged = arrange(groups, exchange)
     first, *apart = arranged.loops
@@ -164,11 +168,13 @@ def _arranged(system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exc
     if states > MOST_STATES:
         what = f"{exchange.peers:,} peers on such a graph make one system of {states:,} states and readings"
         hint = f"peers on complete graphs, or {MOST_STATES:,} in all"
-        raise ApcError(Mistake("E933", Place(system.origin.topology), f"apc feel: {what}", hint=hint))
+        raise ApcError(
+            Diagnostic("E933", SourceLocation(system.origin.topology), f"apc feel: {what}", hint=hint)
+        )
     return (dense_loop(groups, exchange),)
 
 
-def _by_classes(common: Loop, apart: Sequence[Loop]) -> bool:
+def _by_classes(common: ModalSystem, apart: Sequence[ModalSystem]) -> bool:
     """Say whether each other loop is all there is of one class apart: a ring has more of them, one a wave."""
     many = {site.name: site.count - 1 for site in common.sites}
     return all(len(loop.sites) == 1 and loop.multiplicity == many.get(loop.sites[0].name) for loop in apart)
@@ -188,11 +194,11 @@ class Responses:
     that of the other, `same` whether both are one peer. `exchange` are the links.
     """
 
-    exchange: Exchange
+    exchange: CommunicationGraph
     device: Device
     other: Device
-    loops: tuple[Pushed, ...]
-    plain: tuple[Loop, ...]
+    loops: tuple[DrivenMode, ...]
+    plain: tuple[ModalSystem, ...]
     members: tuple[int, ...]
     own: int
     to: int
@@ -310,7 +316,7 @@ class Responses:
         }
 
 
-def _copy_of(group: PeerGroup, device: Device) -> tuple[str, int] | None:
+def _copy_of(group: PeerClass, device: Device) -> tuple[str, int] | None:
     """Return what a peer tells others the position of, and which state that is; None if nothing.
 
     Of a position with several axes it is the one along that of the device that is pushed.

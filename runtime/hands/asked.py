@@ -1,7 +1,7 @@
 """What is asked of a scene's hands: a device by its name, and frequencies.
 
-Takes: a `CompiledSystem`, texts.
-Gives: `Port`, `find_port`, `next_peer`; `read_frequencies`, `check_frequencies`, `ticks_in`.
+Takes: a `Model`, texts.
+Gives: `DevicePort`, `find_port`, `next_peer`; `read_frequencies`, `check_frequencies`, `ticks_in`.
 Guarantees: nothing is folded: a frequency beyond half the fastest clock is refused.
 Does not: ask whether the part named is a device.
 """
@@ -15,8 +15,8 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
 from apc.compiler.language.vectors import whole_and_index
 from apc.compiler.words import no_more
 from apc.frame.parameters import resolve
@@ -29,7 +29,7 @@ HIGHEST = 60.0
 
 
 @dataclass(frozen=True, slots=True)
-class Port:
+class DevicePort:
     """A device: its peer, counted from 0 over all groups, and the part, "" for the only one there is."""
 
     peer: int
@@ -39,7 +39,7 @@ class Port:
 _PORT = re.compile(r"(?:(?P<group>[^.\[\]]+)\[(?P<number>[0-9]{1,9})\])?\.?(?P<part>.*)\Z")
 
 
-def find_port(system: CompiledSystem, text: str, option: str) -> Port:
+def find_port(system: Model, text: str, option: str) -> DevicePort:
     """Return the device that a name such as `left[1].device` means.
 
     Parameters
@@ -73,23 +73,21 @@ def find_port(system: CompiledSystem, text: str, option: str) -> Port:
         what = f"{option}: no group of peers is called {group[:40]}"
         hint = nearest(group, names)
         hint = f'{option} "{hint}[{number}].{named}"' if hint else example
-        raise ApcError(Mistake("E936", Place(system.origin.topology), what, hint=hint))
+        raise ApcError(Diagnostic("E936", SourceLocation(system.origin.topology), what, hint=hint))
     place = 0 if group is None else names.index(group)
     peer = int(number or 1)
     if not 1 <= peer <= counts[place]:
         example = f'{option} "{names[place]}[{counts[place]}].{named}"'
         what = f"{option}: {names[place]} has {counts[place]:,} peers, counted from 1; there is no {peer}"
-        raise ApcError(Mistake("E936", Place(system.origin.topology), what, hint=example))
+        raise ApcError(Diagnostic("E936", SourceLocation(system.origin.topology), what, hint=example))
     if own and own not in parts:
         what = f"{option}: nothing that moves is called {own[:40]}"
         hint = f'{option} "{names[place]}[{peer}].{nearest(own, parts) or named}"'
-        raise ApcError(Mistake("E936", Place(system.origin.topology), what, hint=hint))
-    return Port(starts[place] + peer - 1, own)
+        raise ApcError(Diagnostic("E936", SourceLocation(system.origin.topology), what, hint=hint))
+    return DevicePort(starts[place] + peer - 1, own)
 
 
-def read_frequencies(
-    system: CompiledSystem, text: str | None, low: str, high: str | None, points: int
-) -> Floats:
+def read_frequencies(system: Model, text: str | None, low: str, high: str | None, points: int) -> Floats:
     """Return the frequencies that options name, in Hz: those listed, or points between two at equal ratios.
 
     Parameters
@@ -122,16 +120,16 @@ def read_frequencies(
         if first > 0 and high is None:
             what = f"{first:.6g} Hz is not below {last:.6g} Hz, where it ends without --to"
             hint = f'--from "{first:.6g} Hz" --to "{_fastest(system) / 2:.6g} Hz"'
-        raise ApcError(Mistake("E935", Place("--from"), what, hint=hint))
+        raise ApcError(Diagnostic("E935", SourceLocation("--from"), what, hint=hint))
     return np.geomspace(first, last, points)
 
 
-def _fastest(system: CompiledSystem) -> float:
+def _fastest(system: Model) -> float:
     """Return the rate of the fastest clock in Hz."""
     return float(1 / _fastest_clock(system)[0])
 
 
-def _fastest_clock(system: CompiledSystem) -> tuple[Fraction, Fraction]:
+def _fastest_clock(system: Model) -> tuple[Fraction, Fraction]:
     """Return the period and phase of the fastest clock that anything uses, in seconds."""
     timings = resolve(system).timings
     used = {part.clock for kind in system.kinds for part in kind.clocks} | {
@@ -141,30 +139,30 @@ def _fastest_clock(system: CompiledSystem) -> tuple[Fraction, Fraction]:
     if not clocks:
         what = "the scene has nothing that ticks, and what is felt is told of samples and held forces"
         hint = "a coupler with a clock, as SampledSpringDamper"
-        raise ApcError(Mistake("E935", Place(system.origin.topology), what, hint=hint))
+        raise ApcError(Diagnostic("E935", SourceLocation(system.origin.topology), what, hint=hint))
     clock = min(clocks, key=lambda clock: timings[clock.period])
     return timings[clock.period], timings[clock.phase]
 
 
-def next_peer(system: CompiledSystem, port: Port) -> int:
+def next_peer(system: Model, port: DevicePort) -> int:
     """Return the peer after one, itself if it is alone."""
     return (port.peer + 1) % sum(group.count for group in system.groups)
 
 
-def check_frequencies(system: CompiledSystem, values: Floats) -> None:
+def check_frequencies(system: Model, values: Floats) -> None:
     """Refuse frequencies that no response is told of: ApcError E935."""
     most = _fastest(system) / 2
-    place = Place(system.origin.topology)
+    place = SourceLocation(system.origin.topology)
     hint = f"{no_more(most)} Hz at most"
     if not values.size or not np.isfinite(values).all() or values.min() <= 0:
         got = "none" if not values.size else f"{values.min():.6g} Hz"
-        raise ApcError(Mistake("E935", place, "a frequency", "above 0 Hz", got, "0.1 Hz"))
+        raise ApcError(Diagnostic("E935", place, "a frequency", "above 0 Hz", got, "0.1 Hz"))
     if values.max() > most:
         what = f"{values.max():.6g} Hz is beyond half the fastest clock: samples take it for a slower one"
-        raise ApcError(Mistake("E935", place, what, hint=hint))
+        raise ApcError(Diagnostic("E935", place, what, hint=hint))
 
 
-def ticks_in(system: CompiledSystem, frame: float) -> list[Fraction] | None:
+def ticks_in(system: Model, frame: float) -> list[Fraction] | None:
     """Return when in a frame the fastest clock ticks, None where a frame does not begin with a tick."""
     period, phase = _fastest_clock(system)
     if phase % period:

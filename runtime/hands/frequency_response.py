@@ -1,7 +1,7 @@
 """What a hand feels: how its device answers a force, and how a push arrives at another hand.
 
-Takes: a `CompiledSystem`, a device, frequencies.
-Gives: `Feel`, `feel`; `Slow`, `Extremes`, `Noise`.
+Takes: a `Model`, a device, frequencies.
+Gives: `Transparency`, `feel`; `QuasiStaticImpedance`, `HinfGains`, `H2Gains`.
 Guarantees: at each frequency the answer is exact for the sampled, held and sent signals of the scene, with a
 bound on its rounding; nothing is folded: a frequency beyond half the fastest clock is refused.
 Does not: look at how a hand answers back (see `passivity`), or at packets that are lost or late.
@@ -20,18 +20,18 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import analyze as judge
 from apc.analysis.analysis import near_start
 from apc.analysis.elements import is_linear
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.timings import part
 from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, prepare
 from apc.frame.radius import UNIT
 from apc.hands.answers import AROUND, Responses, Weights, held_names, responses
-from apc.hands.asked import Port, check_frequencies, find_port, next_peer, ticks_in
+from apc.hands.asked import DevicePort, check_frequencies, find_port, next_peer, ticks_in
 from apc.hands.system_norms import Peak, noise_variance, sampled_data_peak, tick_peak
-from apc.hands.viscosity import Viscosity, network_viscosity
+from apc.hands.viscosity import NetworkDamping, network_viscosity
 from apc.network.nominal import left_out
-from apc.result import Look, Result
+from apc.result import PlotStyle, Result
 from apc.threads import single_threaded
 
 Floats = NDArray[np.float64]
@@ -57,7 +57,7 @@ SETTLED = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
-class Slow:
+class QuasiStaticImpedance:
     """What is felt of slow motions, down to some 1e-3 a second: mass, damping, stiffness in SI, ± `errors`.
 
     Z = stiffness/s + damping + mass · s + …; the errors are in the order of the fields.
@@ -70,7 +70,7 @@ class Slow:
 
 
 @dataclass(frozen=True, slots=True)
-class Extremes:
+class HinfGains:
     """H∞ norms of one mode: of the velocity of devices, and of how far a copy is from the mean, a newton.
 
     `on_ticks` with forces held, and motions read, at the instants at which something happens; `sampled_data`
@@ -87,7 +87,7 @@ class Extremes:
 
 
 @dataclass(frozen=True, slots=True)
-class Noise:
+class H2Gains:
     """Root mean squares at the ticks of a frame, for noise of each peer's own, white from tick to tick.
 
     Motion between ticks is not included.
@@ -104,7 +104,7 @@ class Noise:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Feel(Result):
+class Transparency(Result):
     """What is felt at a device, and what of a push there arrives at another, at frequencies (k,) in Hz.
 
     `impedance` in N·s/m is force by velocity, where hands push and others are free; `transmitted_admittance`
@@ -129,17 +129,18 @@ class Feel(Result):
     bound: Floats
     transmitted_bound: Floats
     error_bound: Floats
-    low_frequency: Slow | None
-    network_viscosity: Viscosity | None
-    hinf: tuple[Extremes, ...]
-    h2: tuple[Noise, ...]
+    low_frequency: QuasiStaticImpedance | None
+    network_viscosity: NetworkDamping | None
+    hinf: tuple[HinfGains, ...]
+    h2: tuple[H2Gains, ...]
     stable: bool | None
     linearized: bool
     left_out: tuple[str, ...]
     notes: tuple[str, ...]
 
-    def plot(self, ax: Any = None, *, kind: str = "bode", **look: Unpack[Look]) -> Any:
-        """Draw Bode's plot or Nyquist's, as `look` says (see `result.Look`); return the matplotlib Figure.
+    def plot(self, ax: Any = None, *, kind: str = "bode", **look: Unpack[PlotStyle]) -> Any:
+        """Draw Bode's plot or Nyquist's, as `look` says (see `result.PlotStyle`); return the matplotlib
+        Figure.
 
         Parameters
         ----------
@@ -153,7 +154,7 @@ class Feel(Result):
 
 @part("feel")
 def feel(
-    system: CompiledSystem,
+    system: Model,
     frequencies: Sequence[float] | Floats,
     *,
     at: str = "",
@@ -161,7 +162,7 @@ def feel(
     unstable: bool = False,
     beside: Collection[str] = BESIDE,
     prepared: Prepared | None = None,
-) -> Feel:
+) -> Transparency:
     """Say what a hand feels.
 
     Parameters
@@ -190,7 +191,7 @@ def feel(
     prepared = prepared or prepare(system)
     named = [] if at else held_names(system, prepared)
     port = find_port(system, at or next(iter(named), ""), "--at")
-    other = find_port(system, between, "--between") if between else Port(next_peer(system, port), "")
+    other = find_port(system, between, "--between") if between else DevicePort(next_peer(system, port), "")
     check_frequencies(system, result)
     verdict = judge(system, prepared=prepared)
     if verdict.stable is False and not unstable:
@@ -226,7 +227,7 @@ def feel(
         COUPLED: "hinf" in beside and bool(answers.error[0]),
         "what noise does is not told: the fastest clock has a phase": steady and not h2 and "h2" in beside,
     }
-    return Feel(
+    return Transparency(
         topology=system.name,
         at=here,
         between="" if there == here else there,
@@ -250,26 +251,28 @@ def feel(
     )
 
 
-def _viscosity(system: CompiledSystem, slow: Slow, port: Port, other: Port) -> Viscosity | None:
+def _viscosity(
+    system: Model, slow: QuasiStaticImpedance, port: DevicePort, other: DevicePort
+) -> NetworkDamping | None:
     """Return what of the damping felt of slow motions comes of the network."""
 
-    def damping_of(changed: CompiledSystem) -> tuple[float, float] | None:
+    def damping_of(changed: Model) -> tuple[float, float] | None:
         slow = _slow(responses(changed, prepare(changed), port, other))
         return None if slow is None else (slow.damping, slow.errors[1])
 
     return network_viscosity(system, (slow.damping, slow.errors[1]), damping_of)
 
 
-def _unstable(system: CompiledSystem, radius: float) -> ApcError:
+def _unstable(system: Model, radius: float) -> ApcError:
     what = (
         f"the scene is unstable (spectral radius {radius:.6g}): what a push makes of it grows, and it has no "
         "response in time"
     )
     hint = "--unstable, for that of the map from force to motion"
-    return ApcError(Mistake("E934", Place(system.origin.topology), what, hint=hint))
+    return ApcError(Diagnostic("E934", SourceLocation(system.origin.topology), what, hint=hint))
 
 
-def _slow(felt: Responses) -> Slow | None:
+def _slow(felt: Responses) -> QuasiStaticImpedance | None:
     """Return mass, damping and stiffness at low frequency, None where they can't be told.
 
     Notes
@@ -279,7 +282,7 @@ def _slow(felt: Responses) -> Slow | None:
     With a pole within, means against negative powers don't vanish.
     """
     before, radius = None, RADIUS
-    best: Slow | None = None
+    best: QuasiStaticImpedance | None = None
     least = SETTLED
     for _ in range(HALVINGS):
         s = radius * np.exp(2j * np.pi * (np.arange(AROUND) + 0.5) / AROUND)
@@ -294,12 +297,12 @@ def _slow(felt: Responses) -> Slow | None:
             share = float((off * powers).max() / np.abs(result * powers).max())
             if share < least and inside <= DOUBTED * doubt:
                 least, (k, b, m), (off_k, off_b, off_m) = share, result.tolist(), off.tolist()
-                best = Slow(m, b, k, (off_m, off_b, off_k))
+                best = QuasiStaticImpedance(m, b, k, (off_m, off_b, off_k))
         before, radius = result, radius / 2
     return best
 
 
-def _extremes(felt: Responses, frequency_hz: Floats) -> tuple[Extremes, ...]:
+def _extremes(felt: Responses, frequency_hz: Floats) -> tuple[HinfGains, ...]:
     """Return the H∞ norms, and gains at frequencies (k,), of the modes that the pushed peer is in."""
     result, copy = [], felt.copies[felt.own]
     for number, site, _ in felt.parts:
@@ -309,11 +312,11 @@ def _extremes(felt: Responses, frequency_hz: Floats) -> tuple[Extremes, ...]:
             rows.append(("error", copy[1]))
         for name, row in rows:
             own = (loop, site, site, row, basis)
-            result.append(Extremes(loop.name, name, tick_peak(*own), *sampled_data_peak(*own, frequency_hz)))
+            result.append(HinfGains(loop.name, name, tick_peak(*own), *sampled_data_peak(*own, frequency_hz)))
     return tuple(result)
 
 
-def _noise(system: CompiledSystem, felt: Responses) -> tuple[Noise, ...]:
+def _noise(system: Model, felt: Responses) -> tuple[H2Gains, ...]:
     """Return what white noise at all peers does to the pushed peer."""
     ticks = ticks_in(system, felt.frame)
     if ticks is None:
@@ -323,7 +326,7 @@ def _noise(system: CompiledSystem, felt: Responses) -> tuple[Noise, ...]:
         velocity = _variance(felt, ticks, felt.velocity, sensors=sensors)
         error = _variance(felt, ticks, felt.error, sensors=sensors)
         (error_m, error_off), (velocity_m_s, velocity_off) = map(_rms, (error, velocity))
-        noises.append(Noise(source, error_m, velocity_m_s, (error_off, velocity_off)))
+        noises.append(H2Gains(source, error_m, velocity_m_s, (error_off, velocity_off)))
     return tuple(noises)
 
 

@@ -1,7 +1,7 @@
 """Is a scene stable with every passive hand at every device?
 
-Takes: a `CompiledSystem`.
-Gives: `PassiveHands`, `PassiveMode`, `passive_hands`; `passive_growth`, `loop_growths`; `circulates`,
+Takes: a `Model`.
+Gives: `AbsoluteStability`, `PassiveMode`, `passive_hands`; `passive_growth`, `loop_growths`; `circulates`,
 `frequency_of`.
 Guarantees: no grid of frequencies decides anything; a verdict is proved, or it is undecided. Hands may be
 anything that gives back no more energy than it was given, each by itself, or, where devices feel each other
@@ -23,8 +23,8 @@ from apc.analysis.analysis import Analysis, analyze, lifted_groups, near_start
 from apc.analysis.contact_modes import contact_modes
 from apc.analysis.elements import is_linear
 from apc.analysis.sides import Side, severity, sides
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.timings import part
 from apc.eigen.dissipation import least_real, proves_positive
 from apc.eigen.modes import split
@@ -34,11 +34,11 @@ from apc.frame.instance import Prepared, prepare
 from apc.frame.radius import RADII, UNIT, radius_of, solve, value_of, with_radius
 from apc.hands.port import PortLoop, port_loops
 from apc.hands.published_limits import published_limits
-from apc.moments.network_verdict import Growth
+from apc.moments.network_verdict import StabilityMeasure
 from apc.network.nominal import left_out
 from apc.result import Result
 from apc.threads import load_pool, single_threaded
-from apc.unserved import UnservedError
+from apc.unserved import NotSupportedError
 
 Complexes = NDArray[np.complex128]
 
@@ -91,7 +91,7 @@ class PassiveMode:
 
 
 @dataclass(frozen=True, slots=True)
-class PassiveHands(Result):
+class AbsoluteStability(Result):
     """Whether a scene is stable whatever passive hands hold its devices.
 
     `clamped_radius` ± `clamped_error` is the spectral radius with all devices held fast, the hardest of
@@ -131,8 +131,8 @@ class PassiveHands(Result):
 
 @part("passive hands")
 def passive_hands(
-    system: CompiledSystem, prepared: Prepared | None = None, *, certify: bool = False
-) -> PassiveHands:
+    system: Model, prepared: Prepared | None = None, *, certify: bool = False
+) -> AbsoluteStability:
     """Say whether a scene is stable with every passive hand at every device.
 
     Parameters
@@ -172,13 +172,13 @@ def passive_hands(
     return replace(worst, left_out=(*replaced_hands(of_scene), *_limitations(system, prepared)))
 
 
-def _missing(hands: PassiveHands) -> float:
+def _missing(hands: AbsoluteStability) -> float:
     """Return the damping that the worst mode lacks."""
     worst = hands.worst
     return -math.inf if worst is None else math.inf if worst.more is None else worst.more
 
 
-def _limitations(system: CompiledSystem, prepared: Prepared) -> tuple[str, ...]:
+def _limitations(system: Model, prepared: Prepared) -> tuple[str, ...]:
     linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
     return (
         *near_start(system, prepared),
@@ -189,12 +189,12 @@ def _limitations(system: CompiledSystem, prepared: Prepared) -> tuple[str, ...]:
 
 
 def _one_sided_hands(
-    system: CompiledSystem,
+    system: Model,
     prepared: Prepared,
     fixed: Analysis,
     *,
     certify: bool,
-) -> PassiveHands:
+) -> AbsoluteStability:
     """Return the verdict of a topology without kinks, in which devices move along a line.
 
     `fixed` is the analysis with its devices clamped.
@@ -204,7 +204,7 @@ def _one_sided_hands(
         unserved = ""
         try:
             loops = port_loops(system, prepared, option=OPTION)
-        except UnservedError as why:
+        except NotSupportedError as why:
             unserved = str(why)
         modes = tuple(_judge(loop) for loop in loops)
         never = unserved or (CIRCULATES if any(map(circulates, loops)) else "")
@@ -221,7 +221,7 @@ def _one_sided_hands(
     proof = "" if stable is None else f"{PROVED}{of}"
     if certify and fixed.stable is False and not never:
         proof = f"with its devices clamped it is unstable: {fixed.proof or PROVED}{of}"
-    return PassiveHands(
+    return AbsoluteStability(
         topology=system.name,
         verdict=NEVER if never else verdict,
         stable=stable,
@@ -237,7 +237,7 @@ def _one_sided_hands(
     )
 
 
-def _directions(system: CompiledSystem, prepared: Prepared) -> dict[str, CompiledSystem]:
+def _directions(system: Model, prepared: Prepared) -> dict[str, Model]:
     """Return the scene along each direction of its devices, none where they move along a line.
 
     Raises
@@ -255,11 +255,11 @@ def _directions(system: CompiledSystem, prepared: Prepared) -> dict[str, Compile
                 of.setdefault(str(part_), set()).add(axis)
         if any(len(axes) > 1 for axes in of.values()):
             what = f"{OPTION}: devices move along {', '.join(along)}, which act on one another"
-            raise ApcError(Mistake("E933", Place(system.origin.topology), what))
+            raise ApcError(Diagnostic("E933", SourceLocation(system.origin.topology), what))
     return along
 
 
-def _together(parts: Mapping[str, PassiveHands], replaced: tuple[str, ...]) -> PassiveHands:
+def _together(parts: Mapping[str, AbsoluteStability], replaced: tuple[str, ...]) -> AbsoluteStability:
     """Return what is said of all directions together, which don't act on one another."""
     verdicts = [part.stable for part in parts.values()]
     stable = False if False in verdicts else None if None in verdicts else True
@@ -271,7 +271,7 @@ def _together(parts: Mapping[str, PassiveHands], replaced: tuple[str, ...]) -> P
     return replace(deciding, modes=modes, joined=joined, left_out=(*replaced, *deciding.left_out))
 
 
-def _as_at_start(system: CompiledSystem, prepared: Prepared, *, linear: bool) -> tuple[str, ...]:
+def _as_at_start(system: Model, prepared: Prepared, *, linear: bool) -> tuple[str, ...]:
     """Say which contacts the answer takes as they are at the start, though hands may open and close them."""
     if linear:
         return ()
@@ -287,7 +287,7 @@ def _as_at_start(system: CompiledSystem, prepared: Prepared, *, linear: bool) ->
     return (text,)
 
 
-def passive_growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool = True) -> Growth:
+def passive_growth(system: Model, prepared: Prepared, *, bounded: bool = True) -> StabilityMeasure:
     """Return a number below 1 where a scene is stable with every passive hand, and above it elsewhere.
 
     With n the damping needed at each device and b the largest there is, it is e^{2 (n − b)/(n + b)}. n grows
@@ -303,10 +303,10 @@ def passive_growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool 
     """
     each = loop_growths(system, prepared, bounded=bounded)
     radius, low, high = (max(getattr(growth, name) for growth in each) for name in ("radius", "low", "high"))
-    return Growth(radius, low, high, exact=True, proved=True)
+    return StabilityMeasure(radius, low, high, exact=True, proved=True)
 
 
-def loop_growths(system: CompiledSystem, prepared: Prepared, *, bounded: bool = True) -> list[Growth]:
+def loop_growths(system: Model, prepared: Prepared, *, bounded: bool = True) -> list[StabilityMeasure]:
     """Return the same of each closed loop by itself: the largest is that of the scene.
 
     Parameters
@@ -324,7 +324,7 @@ def loop_growths(system: CompiledSystem, prepared: Prepared, *, bounded: bool = 
         return [growth for part in parts for growth in part]
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         result, scale = [(-np.inf, -np.inf, -np.inf)], 1.0
-        with suppress(UnservedError):
+        with suppress(NotSupportedError):
             loops = [
                 loop
                 for side in sides(system, prepared)
@@ -346,14 +346,14 @@ def loop_growths(system: CompiledSystem, prepared: Prepared, *, bounded: bool = 
     return [_growth(scale, *item) for item in result]
 
 
-def _growth(scale: float, *spare: float) -> Growth:
+def _growth(scale: float, *spare: float) -> StabilityMeasure:
     """Return e^{2 (n − b)/(n + b)}, b the largest damping and b − n what is spare, at least, at most."""
     needed = [scale - value for value in spare]
     logs = [np.sign(value) if np.isinf(value) else (value - scale) / (abs(value) + scale) for value in needed]
     radius, high, low = (float(np.exp(2 * log)) for log in logs)
     if spare[1] >= 0:  # passive, if only just
         high = min(high, float(np.nextafter(1.0, 0.0)))
-    return Growth(radius, low, high, exact=True, proved=True)
+    return StabilityMeasure(radius, low, high, exact=True, proved=True)
 
 
 def _judge(loop: PortLoop) -> PassiveMode:

@@ -1,6 +1,6 @@
 """What devices are pushed by, while hands move them as they like: one map a mode.
 
-Takes: a `CompiledSystem`.
+Takes: a `Model`.
 Gives: `PortLoop`, `port_loops`; `reciprocal`.
 Guarantees: exact for any motion of the hands: where nothing samples a device and no force on it switches,
 only how far it went counts, and the least that its damping takes of that. Matrices carry the radius of their
@@ -28,21 +28,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import lifted_groups
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
-from apc.eigen.closing import Loop, close_loop
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
+from apc.eigen.closing import ModalSystem, close_loop
 from apc.eigen.modes import arrange, dense_loop
-from apc.eigen.peers import MOST_STATES, PeerGroup, states_of
+from apc.eigen.peers import MOST_STATES, PeerClass, states_of
 from apc.eigen.relative import relative_coordinates, relative_rows, with_doubt
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.devices import Device, coupled_directly, find_device, no_device
-from apc.frame.exchange import Exchange
+from apc.frame.exchange import CommunicationGraph
 from apc.frame.instance import Prepared
-from apc.frame.ports import Ports, with_holds, with_ports
+from apc.frame.ports import FrameInputs, with_holds, with_ports
 from apc.frame.radius import RADII, UNIT, radius_of, solve, value_of, with_radius
-from apc.frame.schedule import Act, Propagate, Schedule, Send, Tick
-from apc.frame.site import LinearSite
-from apc.unserved import UnservedError
+from apc.frame.schedule import HoldUpdate, Propagate, Schedule, SendEvent, Tick
+from apc.frame.site import LinearSubsystem
+from apc.unserved import NotSupportedError
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
@@ -65,10 +65,10 @@ class _Touched:
     in z.
     """
 
-    group: PeerGroup
+    group: PeerClass
     damping: Fraction
     seconds: tuple[Fraction, ...]
-    ports: Ports
+    ports: FrameInputs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,7 +98,7 @@ class PortLoop:
     frame_s: float
 
 
-def port_loops(system: CompiledSystem, prepared: Prepared, *, option: str) -> tuple[PortLoop, ...]:
+def port_loops(system: Model, prepared: Prepared, *, option: str) -> tuple[PortLoop, ...]:
     """Return the modes of a scene in which hands move all devices.
 
     Parameters
@@ -113,12 +113,12 @@ def port_loops(system: CompiledSystem, prepared: Prepared, *, option: str) -> tu
     ApcError
         E931 no device, or none that can be cut out; E933 too many intervals or states, or a motion that
         nothing holds back.
-    UnservedError
+    NotSupportedError
         Why no device is ever passive.
     """
     groups, exchange = lifted_groups(system, prepared=prepared)
     place, unit_of = (
-        Place(system.origin.topology),
+        SourceLocation(system.origin.topology),
         {parameter.name: parameter.unit for parameter in system.parameters},
     )
     heard = {
@@ -131,19 +131,19 @@ def port_loops(system: CompiledSystem, prepared: Prepared, *, option: str) -> tu
     }
     direct = coupled_directly(system.kinds)
     touched: dict[int, _Touched] = {}
-    ported: list[PeerGroup] = []
+    ported: list[PeerClass] = []
     for group in groups:
         device = find_device(group.jacobians, group.parameters, unit_of, group.listening, direct=direct)
         if device is None:  # a server, say: it is not held
             ported.append(group)
             continue
         if isinstance(device, str):
-            raise ApcError(Mistake("E931", place, f"{option}: {device}"))
+            raise ApcError(Diagnostic("E931", place, f"{option}: {device}"))
         if felt := _felt_velocity(group, device, heard):
-            raise UnservedError(felt)
+            raise NotSupportedError(felt)
         if touch := _other_touch(group, device):
             why, hint = touch
-            raise ApcError(Mistake("E933", place, f"{option}: {why}", hint=hint))
+            raise ApcError(Diagnostic("E933", place, f"{option}: {why}", hint=hint))
         own = _touched(group, device)
         touched[id(own.group.schedule)] = own
         ported.append(own.group)
@@ -159,7 +159,7 @@ def port_loops(system: CompiledSystem, prepared: Prepared, *, option: str) -> tu
     return tuple(result)
 
 
-def _felt_velocity(group: PeerGroup, device: Device, heard: Set[tuple[str, int]]) -> str:
+def _felt_velocity(group: PeerClass, device: Device, heard: Set[tuple[str, int]]) -> str:
     """Say what samples a device's velocity, "" if nothing does: of what is sent, the channels heard count."""
     kind = group.jacobians.kind
     for partition, tick in zip(kind.clocks, group.exact.ticks, strict=True):
@@ -176,7 +176,7 @@ def _felt_velocity(group: PeerGroup, device: Device, heard: Set[tuple[str, int]]
     return ""
 
 
-def _other_touch(group: PeerGroup, device: Device) -> tuple[str, str] | None:
+def _other_touch(group: PeerClass, device: Device) -> tuple[str, str] | None:
     """Say what touches a device otherwise than by samples and held forces, and what to write instead."""
     a, own = group.exact.a, [device.position, device.velocity]
     others = [place for place in range(len(a)) if place not in own]
@@ -192,7 +192,7 @@ def _other_touch(group: PeerGroup, device: Device) -> tuple[str, str] | None:
     return None
 
 
-def _touched(group: PeerGroup, device: Device) -> _Touched:
+def _touched(group: PeerClass, device: Device) -> _Touched:
     """Return a group whose device is moved from outside."""
     schedule = group.schedule
     at = _boundaries(group.exact, schedule, device)
@@ -208,7 +208,7 @@ def _touched(group: PeerGroup, device: Device) -> _Touched:
     return _Touched(group.with_site(site, exact, full), damping, seconds, ports)
 
 
-def _boundaries(site: LinearSite, schedule: Schedule, device: Device) -> list[int]:
+def _boundaries(site: LinearSubsystem, schedule: Schedule, device: Device) -> list[int]:
     """Return the instants, in quanta, at which a device is sampled or a force on it switches, and 0."""
     numbers, now, counts = {0}, 0, False
     for event in schedule.events:
@@ -217,16 +217,16 @@ def _boundaries(site: LinearSite, schedule: Schedule, device: Device) -> list[in
                 now += duration
             case Tick(partition, _, _):
                 counts = bool(site.ticks[partition].x[:, device.position].astype(np.bool_).any())
-            case Send(partition, _):
+            case SendEvent(partition, _):
                 counts = bool(site.sends[partition].x[:, device.position].astype(np.bool_).any())
-            case Act(hold, _):
+            case HoldUpdate(hold, _):
                 counts = bool(site.b[device.velocity, hold])
         if not isinstance(event, Propagate) and counts and now < schedule.frame:
             numbers.add(now)
     return sorted(numbers)
 
 
-def _driven(site: LinearSite, device: Device) -> LinearSite:
+def _driven(site: LinearSubsystem, device: Device) -> LinearSubsystem:
     """Return a site without a device's states: a hold, the last, says where the device is."""
     kept = np.delete(np.arange(len(site.a)), [device.position, device.velocity])
     smaller = replace(
@@ -246,8 +246,8 @@ def _driven(site: LinearSite, device: Device) -> LinearSite:
 
 
 def _loops(
-    system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange, *, option: str
-) -> tuple[tuple[Loop, ...], bool]:
+    system: Model, groups: Sequence[PeerClass], exchange: CommunicationGraph, *, option: str
+) -> tuple[tuple[ModalSystem, ...], bool]:
     """Return loops that share no energy, and whether a site of them stands for as many peers as it counts."""
     used = {heard.way.link for group in groups for heard in group.schedule.heard}
     if all(exchange.links[link].graph.shape in ORTHOGONAL for link in used):
@@ -258,12 +258,14 @@ def _loops(
     if states > MOST_STATES:
         what = f"{exchange.peers:,} peers on such a graph make one system of {states:,} states and intervals"
         hint = f"equal peers on complete graphs or rings, or {MOST_STATES:,} in all"
-        raise ApcError(Mistake("E933", Place(system.origin.topology), f"{option}: {what}", hint=hint))
+        raise ApcError(
+            Diagnostic("E933", SourceLocation(system.origin.topology), f"{option}: {what}", hint=hint)
+        )
     return (dense_loop(groups, exchange),), False
 
 
 def _port_loop(
-    loop: Loop, touched: Mapping[int, _Touched], *, together: bool, place: Place, option: str
+    loop: ModalSystem, touched: Mapping[int, _Touched], *, together: bool, place: SourceLocation, option: str
 ) -> PortLoop:
     """Return the map of a loop whose devices are moved from outside.
 
@@ -285,7 +287,7 @@ def _port_loop(
     if (m := sum(lengths)) > MOST_INTERVALS:
         what = f"devices that differ are sampled and pushed over {m:,} intervals of a frame"
         hint = f"fewer peers that differ: {MOST_INTERVALS:,} intervals at most"
-        raise ApcError(Mistake("E933", place, f"{option}: {what}", hint=hint))
+        raise ApcError(Diagnostic("E933", place, f"{option}: {what}", hint=hint))
     closed = close_loop(loop)
     pairs = [(closed.offsets[number], site.ports) for number, site in zip(held, sites, strict=True)]
     into = np.concatenate([start + ports.drawn[:, 0] for start, ports in pairs])
@@ -296,7 +298,7 @@ def _port_loop(
     if len(rest) > MOST_STATES:
         what = f"with devices clamped {len(rest):,} states move in a frame"
         hint = f"{MOST_STATES:,} at most: shorter delays, or fewer peers that differ"
-        raise ApcError(Mistake("E933", place, f"{option}: {what}", hint=hint))
+        raise ApcError(Diagnostic("E933", place, f"{option}: {what}", hint=hint))
     # Of which site each interval is (m, k), and which came before it in a frame (m, m).
     whose = np.repeat(np.arange(len(sites)), lengths)
     of, sums = np.eye(len(sites))[whose], np.tril(whose[:, None] == whose, -1).astype(np.float64)
@@ -317,7 +319,7 @@ def _port_loop(
     if aside is None:
         what = "with its devices clamped the scene has a motion that nothing holds back"
         hint = "couplers that hold each object to a device"
-        raise ApcError(Mistake("E933", place, f"{option}: {what}", hint=hint))
+        raise ApcError(Diagnostic("E933", place, f"{option}: {what}", hint=hint))
     # A device is where it was as the frame began, and the intervals before have moved it since.
     at_once = whole[:, out[:, None], into]
     forces = RADII.add(multiply(felt, aside), multiply(at_once, exact(of)))

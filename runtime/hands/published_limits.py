@@ -1,6 +1,6 @@
 """Published sufficient conditions for a wall behind a quantized position, where a topology has their form.
 
-Takes: a `CompiledSystem`.
+Takes: a `Model`.
 Gives: `published_limits`.
 Guarantees: a condition is evaluated only for single devices against one wall, every part of which declares
 its symbols, and within its assumptions.
@@ -11,8 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from apc.compiler.compiled import CompiledSystem, Kind
-from apc.frame.parameters import Numbers, resolve
+from apc.compiler.compiled import Model, PeerType
+from apc.frame.parameters import ResolvedNumbers, resolve
 from apc.hands.wall_conditions import CONDITIONS, UNITS
 
 MOVING = 2  # states of a device of one degree of freedom
@@ -20,7 +20,7 @@ MOVING = 2  # states of a device of one degree of freedom
 _SCALES = {"ms": 1e3}  # of the units in which a symbol is shown
 
 
-def published_limits(system: CompiledSystem) -> tuple[str, ...]:
+def published_limits(system: Model) -> tuple[str, ...]:
     """Return a line for each published condition that covers a wall and a quantized position.
 
     Parameters
@@ -39,7 +39,7 @@ def published_limits(system: CompiledSystem) -> tuple[str, ...]:
     return tuple(dict.fromkeys(lines))
 
 
-def _of_group(kind: Kind, numbers: Numbers, place: int) -> Iterator[str]:
+def _of_group(kind: PeerType, numbers: ResolvedNumbers, place: int) -> Iterator[str]:
     names: dict[str, list[str]] = {symbol: [] for symbol in UNITS}
     for symbol, name in kind.symbols:
         names[symbol].append(name)

@@ -1,7 +1,7 @@
 """What moves when a hand pushes: the steady motion under a force e^{st}, of each mode of a scene.
 
 Takes: peers with a device each, as loops.
-Gives: `Site`, `open_site`; `Pushed`, `pushed_loop`; `spectra`; `force_lanes`.
+Gives: `DrivenPeer`, `open_site`; `DrivenMode`, `pushed_loop`; `spectra`; `force_lanes`.
 Guarantees: no sampling of the force or of the motion: every tick, hold and packet acts when it does, and what
 comes back at s and at s + 2πjk/T, T a frame, is exact but for rounding, which is bounded.
 Does not: put modes together to peers (see `answers`).
@@ -25,12 +25,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.closing import Loop, close_loop
-from apc.eigen.peers import PeerGroup
+from apc.eigen.closing import ModalSystem, close_loop
+from apc.eigen.peers import PeerClass
 from apc.frame.devices import Device
 from apc.frame.discretize import COEFFICIENT_ROUNDINGS, discretize, exponential
 from apc.frame.lift import check_packets, compose, step_durations, with_roundings
-from apc.frame.ports import Ports, with_holds, with_ports
+from apc.frame.ports import FrameInputs, with_holds, with_ports
 from apc.frame.radius import RADII, UNIT, rounded, solve, value_of, with_radius
 from apc.frame.schedule import Propagate, Schedule
 
@@ -46,7 +46,7 @@ SERIES = 1e-18
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Site:
+class DrivenPeer:
     """A peer that may be pushed: its device, its equations, and its intervals in a frame.
 
     `a`, `b` (2, n_x, …) are the continuous equations with their radii, `push` (2, n_x) what a force at the
@@ -54,14 +54,14 @@ class Site:
     and, as they begin, states and holds.
     """
 
-    group: PeerGroup
+    group: PeerClass
     device: Device | None
     a: Matrix
     b: Matrix
     push: Matrix
     seconds: tuple[Fraction, ...]
     starts: tuple[Fraction, ...]
-    ports: Ports
+    ports: FrameInputs
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -70,7 +70,7 @@ class Site:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Pushed:
+class DrivenMode:
     """A mode whose peers may be pushed: ξ⁺ = M ξ + K κ, and C ξ + D κ (2, …) is what is read, κ the kicks.
 
     `kicks` and `reads` say for each site which of κ are its, interval by interval: what its states get as one
@@ -79,7 +79,7 @@ class Pushed:
     """
 
     name: str
-    sites: tuple[Site, ...]
+    sites: tuple[DrivenPeer, ...]
     m: Matrix
     k: Matrix
     c: Matrix
@@ -89,7 +89,7 @@ class Pushed:
     frame: Fraction
 
 
-def open_site(group: PeerGroup, device: Device | None) -> tuple[PeerGroup, Site]:
+def open_site(group: PeerClass, device: Device | None) -> tuple[PeerClass, DrivenPeer]:
     """Return a group whose states may be kicked and whose holds are read, interval by interval."""
     schedule = group.schedule
     at, seconds = _intervals(schedule)
@@ -116,7 +116,7 @@ def open_site(group: PeerGroup, device: Device | None) -> tuple[PeerGroup, Site]
         push[0, device.velocity] = float(device.inverse)
         push[1, device.velocity] = UNIT * abs(float(device.inverse))
     peer_group = group.with_site(site, exact, full, lifted)
-    return peer_group, Site(
+    return peer_group, DrivenPeer(
         group=group,
         device=device,
         a=rounded(group.site.a, COEFFICIENT_ROUNDINGS),
@@ -139,7 +139,7 @@ def _intervals(schedule: Schedule) -> tuple[list[int], list[int]]:
     return at, lasting
 
 
-def pushed_loop(loop: Loop, sites: Mapping[int, Site]) -> Pushed:
+def pushed_loop(loop: ModalSystem, sites: Mapping[int, DrivenPeer]) -> DrivenMode:
     """Close a loop of opened peers, and take their ways in and out from its states.
 
     Parameters
@@ -167,7 +167,7 @@ def pushed_loop(loop: Loop, sites: Mapping[int, Site]) -> Pushed:
             )
         )
     into, out = ways
-    return Pushed(
+    return DrivenMode(
         name=loop.name,
         sites=tuple(own),
         m=whole[:, rest[:, None], rest],
@@ -180,7 +180,9 @@ def pushed_loop(loop: Loop, sites: Mapping[int, Site]) -> Pushed:
     )
 
 
-def spectra(loop: Pushed, pushed: int, wanted: Sequence[tuple[int, int, int]], s: Complex) -> list[Matrix]:
+def spectra(
+    loop: DrivenMode, pushed: int, wanted: Sequence[tuple[int, int, int]], s: Complex
+) -> list[Matrix]:
     """Return what some states of a mode do under a force e^{st} at all devices of one of its sites.
 
     Parameters
@@ -211,7 +213,7 @@ def spectra(loop: Pushed, pushed: int, wanted: Sequence[tuple[int, int, int]], s
     return [result[of, alias][:, :, row, None] for of, row, alias in wanted]
 
 
-def _motion(loop: Pushed, of: int, read: Matrix, s: Complex, alias: int, *, pushed: bool) -> Matrix:
+def _motion(loop: DrivenMode, of: int, read: Matrix, s: Complex, alias: int, *, pushed: bool) -> Matrix:
     """Return the continuous states (k, 2, n_x, 1) of a site at s + 2πjn/T."""
     site, frame = loop.sites[of], float(loop.frame)
     at = s + 2j * np.pi * alias / frame
@@ -248,7 +250,7 @@ def _lasting(s: Complex, seconds: float) -> Matrix:
     return _numbers(value, 16 * UNIT * seconds * np.exp(np.maximum(x.real, 0.0)))
 
 
-def _kick(site: Site, seconds: Fraction, s: Complex) -> Matrix:
+def _kick(site: DrivenPeer, seconds: Fraction, s: Complex) -> Matrix:
     """Return γ(s) (k, 2, n_x, 1) of an interval, by its series in s."""
     time = float(seconds)
     size = float(np.abs(s).max(initial=0.0)) * time
@@ -266,7 +268,7 @@ def _kick(site: Site, seconds: Fraction, s: Complex) -> Matrix:
     return values
 
 
-def force_lanes(site: Site, seconds: float, count: int) -> Matrix:
+def force_lanes(site: DrivenPeer, seconds: float, count: int) -> Matrix:
     """Return what forces σ^i/i!, σ from 0 to 1 over an interval, make of the states as it ends.
 
     Parameters

@@ -1,6 +1,6 @@
 """How much a scene makes of what hands do: H∞ and H2 norms of its modes.
 
-Takes: a mode whose peers may be pushed (`response.Pushed`), and its rigid motions.
+Takes: a mode whose peers may be pushed (`response.DrivenMode`), and its rigid motions.
 Gives: `Peak`, `tick_peak`, `sampled_data_peak`; `noise_variance`.
 Guarantees: no grid of frequencies decides anything; an output that a rigid motion shows in has no norm.
 Does not: prove H∞: such norms are right to `error`, what roundings make of them to first order; a variance
@@ -29,7 +29,7 @@ from apc.eigen.matrix_norms import balance
 from apc.eigen.relative import relative, relative_coordinates, relative_rows, with_doubt
 from apc.frame.discretize import exponential
 from apc.frame.radius import RADII, UNIT, radius_of, value_of, with_radius
-from apc.hands.response import Pushed, Site, force_lanes
+from apc.hands.response import DrivenMode, DrivenPeer, force_lanes
 from apc.moments.operator import congruence, stein
 
 Floats = NDArray[np.float64]
@@ -60,7 +60,7 @@ class Peak:
     frequency_hz: float
 
 
-def tick_peak(loop: Pushed, pushed: int, of: int, row: int, basis: Floats) -> Peak:
+def tick_peak(loop: DrivenMode, pushed: int, of: int, row: int, basis: Floats) -> Peak:
     """Return the norm on ticks of the map from a force at all devices of a site to a state of another.
 
     Parameters
@@ -74,7 +74,7 @@ def tick_peak(loop: Pushed, pushed: int, of: int, row: int, basis: Floats) -> Pe
 
 
 def sampled_data_peak(
-    loop: Pushed, pushed: int, of: int, row: int, basis: Floats, frequency_hz: Floats
+    loop: DrivenMode, pushed: int, of: int, row: int, basis: Floats, frequency_hz: Floats
 ) -> tuple[Peak, Floats]:
     """Return the norm of the same map from forces of any course to motions between ticks as well.
 
@@ -98,7 +98,7 @@ def sampled_data_peak(
 
 
 def _peak(
-    loop: Pushed,
+    loop: DrivenMode,
     pushed: int,
     of: int,
     row: int,
@@ -153,13 +153,13 @@ def _peak(
     return Peak(gain, off, angle / turn), gains
 
 
-def _lanes(site: Site, seconds: float, count: int) -> Floats:
+def _lanes(site: DrivenPeer, seconds: float, count: int) -> Floats:
     """Return γ_i (n_x, count) of an interval, σ^i/i! in units of it."""
     n = len(site.states)
     return np.asarray(value_of(force_lanes(site, seconds, count))[:n, n:])
 
 
-def _within(site: Site, seconds: float, at: Floats, row: int, forces: Floats) -> tuple[Floats, Floats]:
+def _within(site: DrivenPeer, seconds: float, at: Floats, row: int, forces: Floats) -> tuple[Floats, Floats]:
     """Return a state within an interval at σ (q,), over states and holds (q, n_x + n_u) and forces (q, q)."""
     n, count = len(site.states), len(at)
     seen, pushed = [], []
@@ -180,7 +180,7 @@ def _shows(basis: Floats, outputs: Floats) -> bool:
 
 
 def noise_variance(
-    loop: Pushed,
+    loop: DrivenMode,
     ticks: Sequence[Fraction],
     sources: Mapping[int, float],
     outputs: Mapping[tuple[int, int], float],

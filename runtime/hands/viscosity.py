@@ -1,7 +1,7 @@
 """What of the damping that a hand feels comes of the network: everybody's news of the others is old.
 
-Takes: a `CompiledSystem`, a device, what is felt there of slow motions.
-Gives: `Viscosity`, `network_viscosity`.
+Takes: a `Model`, a device, what is felt there of slow motions.
+Gives: `NetworkDamping`, `network_viscosity`.
 Guarantees: `network` is the difference of two scenes, the one asked for and one in which every tick hears
 what the others are at that tick; both have bounds, and so has it.
 Does not: tell it of links whose receivers tick with several clocks.
@@ -17,14 +17,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
-from apc.compiler.compiled import CompiledSystem, Timing
+from apc.compiler.compiled import Model, Timing
 
 # The timing of packets that take no time.
 AT_ONCE = "at once"
 
 
 @dataclass(frozen=True, slots=True)
-class Viscosity:
+class NetworkDamping:
     """What the network adds to the damping felt of slow motions, in N·s/m: `network` ± `error`."""
 
     network: float
@@ -32,10 +32,10 @@ class Viscosity:
 
 
 def network_viscosity(
-    system: CompiledSystem,
+    system: Model,
     damping: tuple[float, float],
-    felt: Callable[[CompiledSystem], tuple[float, float] | None],
-) -> Viscosity | None:
+    felt: Callable[[Model], tuple[float, float] | None],
+) -> NetworkDamping | None:
     """Return what of a damping comes of the network.
 
     Parameters
@@ -73,4 +73,4 @@ def network_viscosity(
     without = felt(fresh)
     if without is None:
         return None
-    return Viscosity(damping[0] - without[0], damping[1] + without[1])
+    return NetworkDamping(damping[0] - without[0], damping[1] + without[1])

@@ -1,7 +1,7 @@
 """Populations by a small determinant: all different on a complete graph, or delays of any length.
 
 Takes: populations of different peers on complete graphs; or a few sites that hear each other.
-Gives: `Member`; `of_populations`, `of_loop`.
+Gives: `TransferMember`; `of_populations`, `of_loop`.
 Guarantees: the determinant's size is what is sent in a frame, by one peer of each role or by the few sites,
 whatever the number of peers or the length of a delay.
 Does not: find its zeros (see `zeros`).
@@ -22,19 +22,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.closing import Coupling, bounded_weight
-from apc.eigen.peers import PeerGroup
-from apc.frame.exchange import Exchange, check_mean
-from apc.frame.schedule import Heard, Schedule, Sent, Way
-from apc.frame.site import LinearSite
+from apc.eigen.peers import PeerClass
+from apc.frame.exchange import CommunicationGraph, check_mean
+from apc.frame.schedule import CouplingTerm, ReceivedSample, Schedule, SentSample
+from apc.frame.site import LinearSubsystem
 from apc.large.characteristic import Characteristic, characteristic_of
-from apc.large.populations import Population, hear_themselves
-from apc.large.transfer import Sites, transfer_of
+from apc.large.populations import HeterogeneousGroup, hear_themselves
+from apc.large.transfer import TransferSubsystems, transfer_of
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Member:
+class TransferMember:
     """The peers of a population, or one site of a loop, as they hear: r = `own` of themselves + `others` τ.
 
     `sites` have their maps without what they hear of themselves; τ is what is sent to `lines` by all, own
@@ -44,15 +44,15 @@ class Member:
     name: str
     schedule: Schedule
     z_names: tuple[str, ...]
-    sites: Sites
+    sites: TransferSubsystems
     own: Floats  # (n_r,)
     others: Floats
     alike: Floats
-    site: Callable[[int], LinearSite]
+    site: Callable[[int], LinearSubsystem]
 
 
 def _weights(
-    population: Population, populations: Sequence[Population], exchange: Exchange
+    population: HeterogeneousGroup, populations: Sequence[HeterogeneousGroup], exchange: CommunicationGraph
 ) -> tuple[Floats, Floats]:
     """Return what each line of r weighs another's packet by on a complete graph, and how many others send.
 
@@ -74,8 +74,8 @@ def _weights(
 
 
 def of_populations(
-    populations: Sequence[Population], exchange: Exchange
-) -> tuple[Characteristic, tuple[Member, ...]]:
+    populations: Sequence[HeterogeneousGroup], exchange: CommunicationGraph
+) -> tuple[Characteristic, tuple[TransferMember, ...]]:
     """Return the characteristic function of different peers on complete graphs.
 
     Parameters
@@ -86,8 +86,8 @@ def of_populations(
         The links, all of them complete.
     """
     roles = [exchange.role(population.group) for population in populations]
-    sent_place: dict[tuple[int, Sent], int] = {}
-    heard_place: dict[tuple[int, Heard], int] = {}
+    sent_place: dict[tuple[int, SentSample], int] = {}
+    heard_place: dict[tuple[int, ReceivedSample], int] = {}
     group_of: dict[int, int] = {}
     for role, population in zip(roles, populations, strict=True):
         group_of.setdefault(role, population.group)
@@ -96,7 +96,7 @@ def of_populations(
         for heard in population.schedule.heard:
             heard_place.setdefault((role, heard), len(heard_place))
 
-    def on_the_way(way: Way, sender: int, receiver: int) -> bool:
+    def on_the_way(way: CouplingTerm, sender: int, receiver: int) -> bool:
         return exchange.delay(way.link, group_of[sender], group_of[receiver]) == way.delay
 
     members, sites = [], []
@@ -106,10 +106,10 @@ def of_populations(
         rows = np.array([sent_place[role, sent] for sent in schedule.sent], np.int64)
         lines = np.array([heard_place[role, heard] for heard in schedule.heard], np.int64)
         own = -weight * np.array([float(on_the_way(heard.way, role, role)) for heard in schedule.heard])
-        alone = Sites(population.maps, population.counts, rows, lines)
+        alone = TransferSubsystems(population.maps, population.counts, rows, lines)
         names = (*(state.name for state in population.jacobians.kind.states), *schedule.value_names)
         members.append(
-            Member(
+            TransferMember(
                 *(population.name, schedule, names, alone, own, weight, weight * senders, population.site),
             )
         )
@@ -125,8 +125,8 @@ def of_populations(
 
 
 def of_loop(
-    groups: Sequence[PeerGroup], coupling: Coupling, doubts: Mapping[Way, float]
-) -> tuple[Characteristic, tuple[Member, ...]]:
+    groups: Sequence[PeerClass], coupling: Coupling, doubts: Mapping[CouplingTerm, float]
+) -> tuple[Characteristic, tuple[TransferMember, ...]]:
     """Return the characteristic function of a few sites that hear each other, delays of any length.
 
     Parameters
@@ -144,9 +144,9 @@ def of_loop(
         schedule, maps = group.schedule, group.lifted.mapped(lambda block: block[None])
         rows, lines = np.arange(n_s, n_s + len(schedule.sent)), np.arange(n_r, n_r + len(schedule.heard))
         n_s, n_r = n_s + len(rows), n_r + len(lines)
-        sites, unit = Sites(maps, np.ones(1), rows, lines), np.ones(len(lines))
+        sites, unit = TransferSubsystems(maps, np.ones(1), rows, lines), np.ones(len(lines))
         members.append(
-            Member(
+            TransferMember(
                 *(group.name, schedule, group.z_names, sites, 0 * unit, unit, unit),
                 site=partial(_site_of, group),
             )
@@ -155,12 +155,12 @@ def of_loop(
     return characteristic_of(transfer, *_wires_of(groups, coupling, doubts)), tuple(members)
 
 
-def _site_of(group: PeerGroup, _: int) -> LinearSite:
+def _site_of(group: PeerClass, _: int) -> LinearSubsystem:
     return group.site
 
 
 def _wires_of(
-    sites: Sequence[PeerGroup], coupling: Coupling, doubts: Mapping[Way, float]
+    sites: Sequence[PeerClass], coupling: Coupling, doubts: Mapping[CouplingTerm, float]
 ) -> tuple[tuple[int, ...], Floats, Floats]:
     """Return how what the sites of a loop send comes back to them, r = Σ_l W_l ζ^(−l) s.
 

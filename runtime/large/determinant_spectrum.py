@@ -15,15 +15,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.closing import Loop, without_packets
+from apc.eigen.closing import ModalSystem, without_packets
 from apc.eigen.rigid import find_rigid_modes
-from apc.eigen.spectrum import Mode, Motion, Spectrum, judge
-from apc.frame.exchange import Exchange
+from apc.eigen.spectrum import Mode, ModeMotion, Spectrum, judge
+from apc.frame.exchange import CommunicationGraph
 from apc.frame.radius import value_of
 from apc.large.characteristic import Characteristic, matrices_in, parts_in
-from apc.large.determinant import Member, of_loop, of_populations
-from apc.large.populations import Population, hear_themselves, lines_of, turned_by
-from apc.large.transfer import CHUNK, Sites
+from apc.large.determinant import TransferMember, of_loop, of_populations
+from apc.large.populations import HeterogeneousGroup, hear_themselves, lines_of, turned_by
+from apc.large.transfer import CHUNK, TransferSubsystems
 from apc.large.zeros import Zero, Zeros, find_zeros, near_poles
 
 Floats = NDArray[np.float64]
@@ -50,7 +50,7 @@ BESIDE, BESIDE_POLE = 1e-13, 1e-10
 
 
 @dataclass(frozen=True, slots=True)
-class _Solved:
+class _SolvedSystem:
     """One system: what its zeros say, and its modes."""
 
     zeros: Zeros
@@ -59,7 +59,7 @@ class _Solved:
     modes: tuple[Mode, ...]
 
 
-def solve_loops(loops: Sequence[Loop]) -> Spectrum:
+def solve_loops(loops: Sequence[ModalSystem]) -> Spectrum:
     """Compute the spectrum of a whole system given as independent loops, delays of any length.
 
     Parameters
@@ -70,7 +70,9 @@ def solve_loops(loops: Sequence[Loop]) -> Spectrum:
     return _spectrum([_solve_loop(loop) for loop in loops], [loop.multiplicity for loop in loops])
 
 
-def solve_populations(populations: Sequence[Population], exchange: Exchange, *, rigid: int) -> Spectrum:
+def solve_populations(
+    populations: Sequence[HeterogeneousGroup], exchange: CommunicationGraph, *, rigid: int
+) -> Spectrum:
     """Compute the spectrum of different peers on complete graphs.
 
     Parameters
@@ -97,10 +99,10 @@ def solve_populations(populations: Sequence[Population], exchange: Exchange, *, 
         else _own_mode(members, zero)
         for zero in zeros.found
     ]
-    return _spectrum([_Solved(zeros, rigid, 0, _with_conjugates(modes))], [1])
+    return _spectrum([_SolvedSystem(zeros, rigid, 0, _with_conjugates(modes))], [1])
 
 
-def _spectrum(solved: Sequence[_Solved], multiplicities: Sequence[int]) -> Spectrum:
+def _spectrum(solved: Sequence[_SolvedSystem], multiplicities: Sequence[int]) -> Spectrum:
     """Put the answers of independent systems together."""
     modes = sorted(
         (mode for item in solved for mode in item.modes),
@@ -120,7 +122,7 @@ def _spectrum(solved: Sequence[_Solved], multiplicities: Sequence[int]) -> Spect
     return Spectrum(tuple(modes), radius, error, rigid, drifts, verdict, stable, "", tuple(notes))
 
 
-def _solve_loop(loop: Loop) -> _Solved:
+def _solve_loop(loop: ModalSystem) -> _SolvedSystem:
     """Find the largest modes of a loop."""
     function, members = of_loop(loop.sites, loop.coupling, loop.doubts)
     prompt = without_packets(loop)
@@ -137,7 +139,7 @@ def _solve_loop(loop: Loop) -> _Solved:
     modes = _with_conjugates(
         _mode(function, members, zero, loop.name, loop.multiplicity) for zero in zeros.found
     )
-    return _Solved(zeros, rigid, drifts, modes)
+    return _SolvedSystem(zeros, rigid, drifts, modes)
 
 
 def _delay_starts(function: Characteristic) -> Complexes:
@@ -160,7 +162,7 @@ def _delay_starts(function: Characteristic) -> Complexes:
     return np.concatenate([starts, poles * (1 + 1e-3), poles * (1 - 1e-3)])
 
 
-def _common_starts(members: Sequence[Member]) -> Complexes:
+def _common_starts(members: Sequence[TransferMember]) -> Complexes:
     """Return the eigenvalues of populations of copies of one peer, for some peers: all moving alike."""
     result = [np.zeros(0, np.complex128)]
     for member in members:
@@ -173,12 +175,12 @@ def _common_starts(members: Sequence[Member]) -> Complexes:
     return np.concatenate(result)
 
 
-def _own_mode(members: Sequence[Member], zero: Zero) -> Mode:
+def _own_mode(members: Sequence[TransferMember], zero: Zero) -> Mode:
     """Describe an eigenvalue of one peer by itself: of equal peers moving apart, or of one nobody hears."""
     assert zero.site is not None
     which, row = zero.site
     item, every = members[which], members[which].sites
-    alone = Sites(
+    alone = TransferSubsystems(
         every.maps.mapped(lambda block: block[row : row + 1]),
         *(np.ones(1), np.arange(len(every.rows)), np.arange(len(every.lines))),
     )
@@ -187,7 +189,11 @@ def _own_mode(members: Sequence[Member], zero: Zero) -> Mode:
 
 
 def _mode(
-    function: Characteristic | None, members: Sequence[Member], zero: Zero, shape: str, multiplicity: int
+    function: Characteristic | None,
+    members: Sequence[TransferMember],
+    zero: Zero,
+    shape: str,
+    multiplicity: int,
 ) -> Mode:
     """Describe a zero; the shares of a population's peers are added up, and those of a channel's packets.
 
@@ -200,7 +206,7 @@ def _mode(
     zero
         Of f, or a pole that is an eigenvalue.
     shape, multiplicity
-        As in `Mode`.
+        As in `LossMode`.
 
     Notes
     -----
@@ -248,7 +254,7 @@ def _mode(
             most = float(own[peer].sum())
             turned = turned_by(member.site(peer), schedule, zero.value, z[peer], r[peer], w[peer])
     total = sum(shares.values()) or 1.0
-    motion = Motion(*turned, tuple((name, share / total) for name, share in shares.items()))
+    motion = ModeMotion(*turned, tuple((name, share / total) for name, share in shares.items()))
     return Mode(zero.value, abs(zero.value), multiplicity, shape, zero.error, (motion,))
 
 
@@ -270,7 +276,7 @@ class _Moves:
         return np.asarray((self.sending @ moved[..., None])[..., 0])
 
 
-def _moves(member: Member, value: complex, random: np.random.Generator) -> _Moves:
+def _moves(member: TransferMember, value: complex, random: np.random.Generator) -> _Moves:
     """Return how sites move at ζ, each hearing itself and pushed by its own v, a chunk at a time.
 
     (ζ − P) z = Q r + v and r = own N (S z + D r) + others τ, with N = Σ_l ζ^(−l) A_l. Any v will do that no

@@ -1,7 +1,7 @@
 """Peers by the thousand, all different: the matrices of every one, without an object for each.
 
-Takes: a `CompiledSystem`, its numbers, Jacobians and schedules.
-Gives: `Population`, `populations`, `joined`; `hear_themselves`, `lines_of`; `turned_by`.
+Takes: a `Model`, its numbers, Jacobians and schedules.
+Gives: `HeterogeneousGroup`, `populations`, `joined`; `hear_themselves`, `lines_of`; `turned_by`.
 Guarantees: a population costs what its different peers cost in one array operation each, not in one Python
 call each; equal peers of a population are counted.
 Does not: merge equal peers of different groups (see `peers`), or take sites that are not affine.
@@ -15,18 +15,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.errors import ApcError, Mistake, Place
-from apc.eigen.closing import Feedback, close, lay_out
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
+from apc.eigen.closing import InterconnectionMatrices, close, lay_out
 from apc.eigen.peers import states_of
 from apc.eigen.spectrum import LEAST_SHARE, oscillation
 from apc.frame.course import turns
 from apc.frame.instance import Instance
-from apc.frame.jacobians import SiteJacobians
+from apc.frame.jacobians import SubsystemJacobians
 from apc.frame.lift import FrameMap, lift
 from apc.frame.linearize import linearize, linearize_rows, site_of
 from apc.frame.radius import RADII, rounded
 from apc.frame.schedule import Schedule
-from apc.frame.site import LinearSite, every_matrix
+from apc.frame.site import LinearSubsystem, every_matrix
 from apc.memory import refuse_beyond
 
 Floats = NDArray[np.float64]
@@ -43,7 +43,7 @@ ENTRY = 100  # bytes of an entry of a different peer's matrix: with its radius, 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Population:
+class HeterogeneousGroup:
     """The peers of one group of the scene, k different ones.
 
     `group` is its place in the scene; `parameters` (k, n_p) and `maps` (k, …), with their radii, are the
@@ -52,14 +52,14 @@ class Population:
 
     name: str
     group: int
-    jacobians: SiteJacobians
+    jacobians: SubsystemJacobians
     schedule: Schedule
     parameters: Floats
     maps: FrameMap
     rows: Integers
     counts: Floats
 
-    def site(self, row: int) -> LinearSite:
+    def site(self, row: int) -> LinearSubsystem:
         """Return the matrices of one of the different peers by itself."""
         return linearize(self.jacobians, self.parameters[row])
 
@@ -68,7 +68,7 @@ class Population:
         return any(sending.link == link for sending in self.jacobians.kind.sends)
 
 
-def populations(instance: Instance) -> tuple[Population, ...]:
+def populations(instance: Instance) -> tuple[HeterogeneousGroup, ...]:
     """Linearize and lift all different peers of a system, every kind of it affine and without edge functions.
 
     Raises
@@ -79,11 +79,13 @@ def populations(instance: Instance) -> tuple[Population, ...]:
     system, schedules, numbers = instance.system, instance.schedules, instance.numbers
     if sum(map(len, numbers.rows)) > MOST_DIFFERENT:
         what = f"{system.peers:,} peers, some of whom differ, and {MOST_DIFFERENT:,} are the most of these"
-        raise ApcError(Mistake("E804", Place(system.origin.topology), what, hint="smaller counts"))
+        raise ApcError(
+            Diagnostic("E804", SourceLocation(system.origin.topology), what, hint="smaller counts")
+        )
     states = list(map(states_of, schedules, instance.sites))
     needed = ENTRY * sum(len(rows) * n**2 for rows, n in zip(numbers.parameters, states, strict=True))
     what = f"{sum(map(len, numbers.parameters)):,} different peers of up to {max(states)} states"
-    refuse_beyond(needed, "E804", Place(system.origin.topology), what, "fewer peers that differ")
+    refuse_beyond(needed, "E804", SourceLocation(system.origin.topology), what, "fewer peers that differ")
     result = []
     for place, (site, schedule) in enumerate(zip(instance.sites, schedules, strict=True)):
         group, parameters = system.groups[place], numbers.parameters[place]
@@ -94,7 +96,9 @@ def populations(instance: Instance) -> tuple[Population, ...]:
         ]
         rows = numbers.rows[place]
         counts = np.bincount(rows, minlength=len(parameters)).astype(np.float64)
-        result.append(Population(group.name, place, site, schedule, parameters, joined(parts), rows, counts))
+        result.append(
+            HeterogeneousGroup(group.name, place, site, schedule, parameters, joined(parts), rows, counts)
+        )
     return tuple(result)
 
 
@@ -130,7 +134,7 @@ def hear_themselves(maps: FrameMap, schedule: Schedule, values: Floats, others: 
             before[:, place] = picked[packet.lag][:, packet.row]
     before = values[:, None] * before
     before[:, n:] = np.diag(others)
-    heard = Feedback(rounded(values[:, None] * now), rounded(before))
+    heard = InterconnectionMatrices(rounded(values[:, None] * now), rounded(before))
     parts = []
     for start in range(0, len(maps.p), CHUNK):
         frame_map = maps.mapped(lambda block, start=start: block[start : start + CHUNK])
@@ -151,7 +155,12 @@ def lines_of(schedule: Schedule) -> dict[int, Floats]:
 
 
 def turned_by(
-    site: LinearSite, schedule: Schedule, value: complex, z: Complexes, heard: Complexes, covector: Complexes
+    site: LinearSubsystem,
+    schedule: Schedule,
+    value: complex,
+    z: Complexes,
+    heard: Complexes,
+    covector: Complexes,
 ) -> tuple[float, float]:
     """Return the frequency and damping of a mode, whole turns counted on the state that takes most part.
 

@@ -2,7 +2,7 @@
 
 Takes: the maps x⁺ = P x + Q r, s = S x + D r of many sites with their radii, how often each site counts, and
 where its rows of s and lines of r are among all; discs.
-Gives: `Sites`, `Transfer`, `transfer_of`; `Poles`; `powers`, `add_fractions`.
+Gives: `TransferSubsystems`, `Transfer`, `transfer_of`; `Poles`; `powers`, `add_fractions`.
 Guarantees: an answer holds in a disc about each point: value, radius and slope hold all that rounding does,
 and what the maps may be off by.
 Does not: answer nearer to zero than `Transfer.innermost`.
@@ -45,7 +45,7 @@ CHUNK, ANSWERS = 1024, 65_536
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sites:
+class TransferSubsystems:
     """k sites of one structure among all that is sent and heard: `rows` of s and `lines` of r are theirs.
 
     `maps` (k, …) have their radii; `counts` (k,) say how often each site is there.
@@ -75,7 +75,7 @@ class Poles:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fractions:
-    """Some sites of equally many poles K, their rows and lines as in `Sites`.
+    """Some sites of equally many poles K, their rows and lines as in `TransferSubsystems`.
 
     Beside the n_s rows and n_r lines, what an error of P does has `circle` (k, K + 1, 1 + n_s + n_r): u w,
     |S X| u and w |Y Q|, see `_split`, the block last; `block` (k,) bounds ‖(ζ − T₂)⁻¹‖ |ζ|.
@@ -102,7 +102,7 @@ class Transfer:
     poles: Poles
 
 
-def transfer_of(listed: Sequence[Sites], n_s: int, n_r: int) -> Transfer:
+def transfer_of(listed: Sequence[TransferSubsystems], n_s: int, n_r: int) -> Transfer:
     """Split every site into its poles and a block of what dies out at once.
 
     Parameters

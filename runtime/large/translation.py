@@ -21,7 +21,7 @@ from random import Random
 
 import numpy as np
 
-from apc.eigen.closing import Loop
+from apc.eigen.closing import ModalSystem
 from apc.eigen.modes import complete_loops
 from apc.eigen.peers import representatives
 from apc.eigen.rigid import find_rigid_modes, stays_rigid
@@ -30,13 +30,13 @@ from apc.frame.instance import Instance
 from apc.frame.jacobians import guards_of
 from apc.frame.linearize import site_of_entries
 from apc.frame.parameters import exact_numbers
-from apc.frame.site import LinearSite
-from apc.large.populations import Population
+from apc.frame.site import LinearSubsystem
+from apc.large.populations import HeterogeneousGroup
 
 LARGEST = 2**61 - 1  # of what random numbers are made of: a prime
 
 
-def count_translations(instance: Instance, populations: Sequence[Population]) -> int | None:
+def count_translations(instance: Instance, populations: Sequence[HeterogeneousGroup]) -> int | None:
     """Return how many independent motions nothing holds back on complete graphs; None if it can't be told.
 
     Parameters
@@ -57,7 +57,7 @@ def count_translations(instance: Instance, populations: Sequence[Population]) ->
     return total
 
 
-def hold_for_all(loop: Loop, populations: Sequence[Population]) -> bool:
+def hold_for_all(loop: ModalSystem, populations: Sequence[HeterogeneousGroup]) -> bool:
     """Say whether the rigid modes of a loop of representatives are those of every peer of their populations.
 
     Parameters
@@ -68,7 +68,7 @@ def hold_for_all(loop: Loop, populations: Sequence[Population]) -> bool:
         The population of each site.
     """
     for place, population in enumerate(populations):
-        sites: list[LinearSite | None] = [group.exact for group in loop.sites]
+        sites: list[LinearSubsystem | None] = [group.exact for group in loop.sites]
         sites[place] = _any_peer(population)
         linear_sites = [site for site in sites if site is not None]
         if len(linear_sites) < len(sites) or not stays_rigid(loop, linear_sites):
@@ -76,7 +76,7 @@ def hold_for_all(loop: Loop, populations: Sequence[Population]) -> bool:
     return True
 
 
-def _any_peer(population: Population) -> LinearSite | None:
+def _any_peer(population: HeterogeneousGroup) -> LinearSubsystem | None:
     """Return the matrices of a peer of random numbers where peers differ; None unless they are quotients."""
     built, numbers = population.jacobians, population.parameters
     symbols = built.function.sx_in()

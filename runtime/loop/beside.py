@@ -1,6 +1,6 @@
 """A run beside what is said of its scene: simulated with what arrived when, analysed with what was measured.
 
-Takes: a `Run`. Gives: `RunComparison`, `compare_run`; `WayRun`, `Ticks`, `ticks_of`.
+Takes: a `RealtimeRun`. Gives: `RunComparison`, `compare_run`; `ArcRun`, `Ticks`, `ticks_of`.
 Guarantees: the simulation is that of `simulate`, fed with the packets that each tick saw; where a peer's part
 is missing, or begins later, there is none, and that is said.
 Does not: write (see `run`).
@@ -18,18 +18,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import Analysis, analyze
-from apc.compiler.compiled import CompiledSystem, Link
+from apc.compiler.compiled import Link, Model
 from apc.loop.peer import live_scene, traced
-from apc.loop.run import PeerRun, Run, delays_of, trace_name
-from apc.moments.network_verdict import NetworkVerdict, judge_network
-from apc.network.recorded import NetworkRecording, describe_delays
-from apc.network.timetable import START, Seen
+from apc.loop.run import PeerRun, RealtimeRun, delays_of, trace_name
+from apc.moments.network_verdict import MeanSquareStability, judge_network
+from apc.network.recorded import LinkFit, describe_delays
+from apc.network.timetable import START, DeliveredPackets
 from apc.result import Result
 from apc.simulation.population import Population
 from apc.simulation.rows_in_time import blocks
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
-from apc.simulation.stepwise import Stepwise
+from apc.simulation.stepwise import InterpretedEngine
 
 Floats = NDArray[np.float64]
 
@@ -54,26 +54,26 @@ class Ticks:
 
 
 @dataclass(frozen=True, slots=True)
-class WayRun:
+class ArcRun:
     """A way's packets: those `sent` (None where the sender's part is missing), and what came."""
 
     link: str
     sender: str
     receiver: str
     sent: int | None
-    came: NetworkRecording
+    came: LinkFit
     trace: str
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class MeasuredLink:
     """What is said of the scene with a link as it was: the `delay` heard after, the packets of a way."""
 
     link: str
     way: str
     delay: float
     analysis: Analysis
-    network: NetworkVerdict | None
+    network: MeanSquareStability | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,10 +91,10 @@ class RunComparison(Result):
     seconds: float
     emulated: bool
     ticks: tuple[Ticks, ...]
-    ways: tuple[WayRun, ...]
+    ways: tuple[ArcRun, ...]
     apart: dict[str, tuple[float, float]]
     why_not: str
-    measured: tuple[Measured, ...]
+    measured: tuple[MeasuredLink, ...]
 
 
 def ticks_of(peer: PeerRun, frame: float) -> Ticks:
@@ -116,7 +116,7 @@ def _shares(values: Floats) -> tuple[float, ...]:
     return tuple(float(np.quantile(values, share)) for share in SHARES) if len(values) else ()
 
 
-def compare_run(run: Run) -> RunComparison:
+def compare_run(run: RealtimeRun) -> RunComparison:
     """Lay a run beside what `simulate` and `analyze` say of it.
 
     Raises
@@ -151,7 +151,7 @@ def _duration(peers: tuple[PeerRun, ...]) -> Fraction:
     return Fraction(max(min(ends, default=0.0), 1e-3)).limit_denominator(10**6)
 
 
-def _incomplete(system: CompiledSystem, peers: tuple[PeerRun, ...]) -> str:
+def _incomplete(system: Model, peers: tuple[PeerRun, ...]) -> str:
     """Return why the run can't be simulated again, empty if it can."""
     if len(peers) < system.peers:
         return f"of {system.peers} peers {len(peers)} left their part of the run"
@@ -166,8 +166,8 @@ def _incomplete(system: CompiledSystem, peers: tuple[PeerRun, ...]) -> str:
 class _AsSeen:
     """What the ticks of a run saw, frame by frame (see `Timetable`)."""
 
-    def __init__(self, run: Run, population: Population) -> None:
-        self.now, self.seen = 0, list[Seen]()
+    def __init__(self, run: RealtimeRun, population: Population) -> None:
+        self.now, self.seen = 0, list[DeliveredPackets]()
         self.frame = population.frame
         self.routes = population.hearing.routes
         for place, route in enumerate(self.routes):
@@ -179,21 +179,21 @@ class _AsSeen:
                 if len(ways):
                     packets[:, ways] = peer.packets[place][:rows]
                     missing[:, ways] = peer.missing[place][:rows]
-            self.seen.append(Seen(packets, missing))
+            self.seen.append(DeliveredPackets(packets, missing))
 
-    def take(self, until: int) -> tuple[Seen, ...]:
+    def take(self, until: int) -> tuple[DeliveredPackets, ...]:
         """Return what each route's ticks saw until an instant in quanta, a whole number of frames."""
         first, last, self.now = self.now // self.frame, until // self.frame, until
         seens = []
         for route, seen in zip(self.routes, self.seen, strict=True):
             rows = np.minimum(np.arange(first * route.ticks, last * route.ticks), len(seen.packets) - 1)
-            seens.append(Seen(seen.packets[rows], seen.missing[rows]))
+            seens.append(DeliveredPackets(seen.packets[rows], seen.missing[rows]))
         return tuple(seens)
 
 
-def _apart(run: Run, simulation: Simulation) -> dict[str, tuple[float, float]]:
+def _apart(run: RealtimeRun, simulation: Simulation) -> dict[str, tuple[float, float]]:
     """Return how far the peers' signals are from the simulated ones, by unit."""
-    player = Stepwise(simulation.population, lambda _: _AsSeen(run, simulation.population))
+    player = InterpretedEngine(simulation.population, lambda _: _AsSeen(run, simulation.population))
     whole = np.concatenate([block.values for block in blocks(simulation, player=player)])
     simulated = {
         signal.name: (signal.unit, whole[:, column]) for column, signal in enumerate(simulation.signals)
@@ -208,7 +208,7 @@ def _apart(run: Run, simulation: Simulation) -> dict[str, tuple[float, float]]:
     return result
 
 
-def _ways(run: Run) -> tuple[WayRun, ...]:
+def _ways(run: RealtimeRun) -> tuple[ArcRun, ...]:
     system, peers = run.system, {peer.number: peer for peer in run.peers}
     timings = {timing.name: float(timing.value) for timing in system.timings}
     periods = {clock.name: timings[clock.period] for clock in system.clocks}
@@ -219,7 +219,7 @@ def _ways(run: Run) -> tuple[WayRun, ...]:
             other = peers.get(sender)
             came = describe_delays(delays_of(peer, number, sender), trace, interval=periods[link.clock])
             way_runs.append(
-                WayRun(
+                ArcRun(
                     link=link.name,
                     sender=other.name if other else trace.split("-to-")[0],
                     receiver=peer.name,
@@ -231,7 +231,7 @@ def _ways(run: Run) -> tuple[WayRun, ...]:
     return tuple(way_runs)
 
 
-def _measured(system: CompiledSystem, link: Link, ways: Sequence[WayRun]) -> Measured:
+def _measured(system: Model, link: Link, ways: Sequence[ArcRun]) -> MeasuredLink:
     """Return what is said of the scene with a link as the worst of its ways was: most lost, then latest."""
     worst = max(ways, key=lambda way: (way.came.lost.value, way.came.mean))
     came, clocks = worst.came, {clock.name: clock.period for clock in system.clocks}
@@ -248,4 +248,4 @@ def _measured(system: CompiledSystem, link: Link, ways: Sequence[WayRun]) -> Mea
     late = came.longest > LATEST * period or came.packets > LONGEST
     network = None if late else judge_network(measured)
     way = f"{worst.sender} to {worst.receiver}"
-    return Measured(link.name, way, float(delay), analyze(measured), network)
+    return MeasuredLink(link.name, way, float(delay), analyze(measured), network)

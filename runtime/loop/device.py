@@ -26,10 +26,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.frame.devices import devices_of
-from apc.simulation.program import Member
+from apc.simulation.program import GroupProgram
 
 NAMES = {".py": "device", ".so": "apc_device"}
 
@@ -42,14 +42,16 @@ def device_function(path: Path) -> DeviceFunction:
     hint = "--device device.py"
     if name is None:
         expected, got = f"one of {', '.join(NAMES)}", path.suffix or "none"
-        raise ApcError(Mistake("E976", Place(str(path)), "the suffix of --device", expected, got, hint))
+        raise ApcError(
+            Diagnostic("E976", SourceLocation(str(path)), "the suffix of --device", expected, got, hint)
+        )
     try:
         if path.suffix == ".py":
             return runpy.run_path(str(path))[name]  # type: ignore[no-any-return] # what a user wrote
         function = ctypes.CDLL(str(path.resolve()))[name]
     except Exception as error:  # whatever the user's own code raises
         what = f"has no function {name}(time, force) that can be loaded: {type(error).__name__}: {error}"
-        raise ApcError(Mistake("E976", Place(str(path)), what, hint=hint)) from None
+        raise ApcError(Diagnostic("E976", SourceLocation(str(path)), what, hint=hint)) from None
     function.restype, function.argtypes = ctypes.c_double, [ctypes.c_double, ctypes.POINTER(ctypes.c_double)]
     return lambda time, force: float(
         function(time, None if force is None else ctypes.byref(ctypes.c_double(force)))
@@ -59,7 +61,7 @@ def device_function(path: Path) -> DeviceFunction:
 class Outside:
     """A peer's device outside."""
 
-    def __init__(self, system: CompiledSystem, member: Member, exchange: DeviceFunction) -> None:
+    def __init__(self, system: Model, member: GroupProgram, exchange: DeviceFunction) -> None:
         """Find what stands for the device in the peer's equations.
 
         Raises
@@ -79,7 +81,9 @@ class Outside:
         result = self._asked(time, None)
         if not (isinstance(result, int | float | np.floating) and math.isfinite(result)):
             what = f"gave {result!r:.40} as its position at {time:.6g} s"
-            raise ApcError(Mistake("E976", Place("--device"), what, hint="return a finite number, in m"))
+            raise ApcError(
+                Diagnostic("E976", SourceLocation("--device"), what, hint="return a finite number, in m")
+            )
         position = float(result)
         if self.before is not None and time > self.before[0]:
             carry[self.device.velocity] = (position - self.before[1]) / (time - self.before[0])
@@ -100,4 +104,4 @@ class Outside:
             return self.exchange(time, force)
         except Exception as error:  # whatever the user's own code raises
             what = f"raised {type(error).__name__} at {time:.6g} s: {error}"
-            raise ApcError(Mistake("E976", Place("--device"), what)) from None
+            raise ApcError(Diagnostic("E976", SourceLocation("--device"), what)) from None

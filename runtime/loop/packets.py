@@ -1,6 +1,6 @@
 """Packets between peers on a real network: their bytes, and who is let in.
 
-Takes: what a peer sends; datagrams from anywhere. Gives: `Post`, `Data`, `Hello`, `Answer`; `DROPPED`.
+Takes: what a peer sends; datagrams from anywhere. Gives: `Post`, `Data`, `Hello`, `HelloReply`; `DROPPED`.
 Guarantees: a datagram that is not of this version, this scene, a known peer at its own address and sealed as
 this session wants it changes nothing but a counter; nor does one heard before, in this session or another.
 Does not: wait, or know what values mean (see `peer`).
@@ -81,7 +81,7 @@ class Hello:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class HelloReply:
     """What a peer says to the hello of time `asked` that came at `came`: the scene begins at `begins`.
 
     `session` tells this time that the scene is played from any other; 0 if it is not known yet.
@@ -156,14 +156,14 @@ class Post:
         Parameters
         ----------
         time, came, begins, session
-            As in `Answer`.
+            As in `HelloReply`.
         to
             The hello that is answered.
         """
         body = ANSWER_BODY.pack(self.nonce, to.nonce, to.time, came, begins, session)
         return self._sealed(ANSWER, time, body, self.secret)
 
-    def read(self, datagram: bytes, address: Address) -> Data | Hello | Answer | None:
+    def read(self, datagram: bytes, address: Address) -> Data | Hello | HelloReply | None:
         """Return what a datagram says, None if it is dropped."""
         why = self._refused(datagram, address)
         said = None if why else self._said(datagram[:-SEAL])
@@ -174,12 +174,12 @@ class Post:
             return None
         return said
 
-    def _meet(self, said: Hello | Answer) -> str:
+    def _meet(self, said: Hello | HelloReply) -> str:
         """Take who says this peer's nonce for one that is there; return why it is let go, empty if not."""
         if said.nonce in self.past:
             return "heard before"
         if said.heard != self.nonce:
-            return "unasked" if isinstance(said, Answer) else ""
+            return "unasked" if isinstance(said, HelloReply) else ""
         before = self.nonces.get(said.sender)
         if before != said.nonce:
             if before is not None:
@@ -190,7 +190,7 @@ class Post:
             self.keys[said.sender] = hmac.digest(self.secret, text, "sha256")
         return ""
 
-    def _said(self, datagram: bytes) -> Data | Hello | Answer | None:
+    def _said(self, datagram: bytes) -> Data | Hello | HelloReply | None:
         """Return what a datagram says whose head is right, None if the rest is not."""
         _, _, sort, _, sender, time = HEAD.unpack_from(datagram)
         body = datagram[HEAD.size :]
@@ -204,7 +204,7 @@ class Post:
             hello = Hello(sender, time, *HELLO_BODY.unpack(body))
             return hello if hello.nonce else None
         elif sort == ANSWER and len(body) == ANSWER_BODY.size:
-            answer = Answer(sender, time, *ANSWER_BODY.unpack(body))
+            answer = HelloReply(sender, time, *ANSWER_BODY.unpack(body))
             times = answer.time, answer.asked, answer.came, answer.begins
             return answer if answer.nonce and max(map(abs, times)) < FAR else None
         return None

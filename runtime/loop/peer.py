@@ -1,6 +1,7 @@
 """One peer of a scene in real time: it ticks, hears what has arrived, and sends.
 
-Takes: a compiled scene, which peer, addresses, how long. Gives: `Loop`, `live_scene`, `traced`, `number_of`.
+Takes: a compiled scene, which peer, addresses, how long. Gives: `PeerLoop`, `live_scene`, `traced`,
+`number_of`.
 Guarantees: every tick is done once, in order, however late; what a tick hears is what had arrived when it was
 done; a peer that begins late, or again, joins at the instant it is; others that fall silent are held or left
 out as the link says.
@@ -28,21 +29,21 @@ from multiprocessing.connection import Connection
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import Channel, CompiledSystem, Link
-from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.compiled import Channel, Link, Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
 from apc.compiler.words import counted, cut
-from apc.frame.exchange import Exchange, build_exchange
+from apc.frame.exchange import CommunicationGraph, build_exchange
 from apc.frame.parameters import resolve
 from apc.loop.device import DeviceFunction, Outside
-from apc.loop.packets import DROPPED, Address, Answer, Data, Hello, Post
+from apc.loop.packets import DROPPED, Address, Data, Hello, HelloReply, Post
 from apc.loop.realtime import now
 from apc.network.channel import PacketSource, channel_law
-from apc.network.timetable import START, Seen
+from apc.network.timetable import START, DeliveredPackets
 from apc.simulation.population import instants_within
 from apc.simulation.rows_in_time import pushes, unsolved
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare
-from apc.simulation.stepwise import Stepwise
+from apc.simulation.stepwise import InterpretedEngine
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -62,7 +63,7 @@ AHEAD = 1024  # packets whose luck is drawn at once
 AT_ONCE = 32
 
 
-def live_scene(system: CompiledSystem) -> CompiledSystem:
+def live_scene(system: Model) -> Model:
     """Return a scene whose links take what the network does: each way's packets are heard as they come."""
     timings = {timing.name: timing.value for timing in system.timings}
     late = [
@@ -85,12 +86,12 @@ class StoppedError(RuntimeError):
     """The loop is to end: it was told so, or its device is at fault."""
 
 
-class Loop:
+class PeerLoop:
     """A peer's loop: its clock, its socket, and its part of the scene."""
 
     def __init__(
         self,
-        system: CompiledSystem,
+        system: Model,
         peer: str,
         listening: socket.socket,
         addresses: Mapping[str, Address],
@@ -150,7 +151,7 @@ class Loop:
         self.session = 0  # what all peers that play together know it by; 0 while not known
         # Of each other the shortest round trip, and how far its clock was ahead then.
         self.offsets: dict[int, tuple[int, int]] = {}
-        self.began: Answer | None = None  # the first that said when the scene begins
+        self.began: HelloReply | None = None  # the first that said when the scene begins
         self.knocked = 0  # when others were asked last
         self.first = 0  # the frame with which it joins
         self.stopped = False
@@ -158,7 +159,7 @@ class Loop:
         self.stop = stop
         self.watched: list[socket.socket | Connection] = [listening, *([stop] if stop else [])]
         self.rows: list[Floats] = []
-        self.player = _OnePeer(self, device, emulate=emulate)
+        self.player = _SinglePeer(self, device, emulate=emulate)
         self._check_addresses()
 
     def _check_addresses(self) -> None:
@@ -189,8 +190,8 @@ class Loop:
         )
         for is_wrong, what, hint in wrong:
             if is_wrong:
-                place = Place("--to" if needed else self.system.name)
-                raise ApcError(Mistake("E971", place, what, hint=hint))
+                place = SourceLocation("--to" if needed else self.system.name)
+                raise ApcError(Diagnostic("E971", place, what, hint=hint))
 
     # ---- meeting
 
@@ -236,7 +237,7 @@ class Loop:
         text = "; ".join(f"{counted(count, 'datagram')} dropped: {DROPPED[why]}" for why, count in dropped)
         what = f"{names} did not say within {patience:g} s when the scene begins" + (text and f" ({text})")
         hint = "the same FILE, --set and --secret-file at every peer, started within --wait of each other"
-        return ApcError(Mistake("E972", Place(self.name), what, hint=hint))
+        return ApcError(Diagnostic("E972", SourceLocation(self.name), what, hint=hint))
 
     # ---- running
 
@@ -297,10 +298,10 @@ class Loop:
                 case Hello() as hello:
                     answer = self.post.answer(now(), hello, came, self.begins, self.session)
                     self._send(answer, address)
-                case Answer() as answer:
+                case HelloReply() as answer:
                     self._met(answer, came)
 
-    def _met(self, answer: Answer, came: int) -> None:
+    def _met(self, answer: HelloReply, came: int) -> None:
         """Learn another's clock, and when the scene begins, by a round trip (RFC 5905, section 8)."""
         trip = (came - answer.asked) - (answer.time - answer.came)
         ahead = ((answer.came - answer.asked) + (answer.time - came)) // 2
@@ -315,14 +316,14 @@ class Loop:
             self.post.drop("not sent")
 
 
-class _OnePeer(Stepwise):
+class _SinglePeer(InterpretedEngine):
     """One peer of a population, instant by instant; what the others send comes from the network.
 
     `log` has (due, late, took) of each instant, `arrivals` (link, sender, count, sent, arrived) of each
     packet, all in nanoseconds of the scene; `seen`, a route each, what its ticks saw on the peer's own ways.
     """
 
-    def __init__(self, loop: Loop, device: DeviceFunction | None, *, emulate: bool) -> None:
+    def __init__(self, loop: PeerLoop, device: DeviceFunction | None, *, emulate: bool) -> None:
         simulation, population = loop.simulation, loop.simulation.population
         self.loop, self.routes = loop, population.hearing.routes
         self.member = next(g for g, member in enumerate(population.members) if loop.own in member.peers)
@@ -356,7 +357,7 @@ class _OnePeer(Stepwise):
         self,
         number: int,
         index: int,
-        seen: tuple[Seen, ...],
+        seen: tuple[DeliveredPackets, ...],
         rows: Floats,
         pushes: Sequence[Floats | None],
     ) -> None:
@@ -391,7 +392,7 @@ class _OnePeer(Stepwise):
         carry = self.carries[self.member][:, 0]
         self._of_device(outside.push, self.instant / NANO, carry[: layout.states], carry[layout.held])
 
-    def _sees(self, place: int, tick: int, seen: tuple[Seen, ...]) -> tuple[Integers, Flags]:
+    def _sees(self, place: int, tick: int, seen: tuple[DeliveredPackets, ...]) -> tuple[Integers, Flags]:
         """Return the packets that are here, and which should be.
 
         A peer that is late does not hear what was sampled after the instant that it is at.
@@ -471,7 +472,7 @@ class _OfLink:
     kept, `ways` the routes and ways on which each other is heard, `counts` the packets that came of each.
     """
 
-    def __init__(self, loop: Loop, place: int) -> None:
+    def __init__(self, loop: PeerLoop, place: int) -> None:
         population = loop.simulation.population
         self.place, self.name = place, loop.system.links[place].name
         link, timings = loop.system.links[place], resolve(loop.system).timings
@@ -507,7 +508,7 @@ class _OfLink:
 class _Emulated:
     """The network that a scene says: what each packet is held back by, and which are lost."""
 
-    def __init__(self, loop: Loop) -> None:
+    def __init__(self, loop: PeerLoop) -> None:
         self.loop = loop
         self.timings = resolve(loop.system).timings
         self.delays: dict[tuple[int, int], Iterator[tuple[int, float]]] = {}
@@ -537,7 +538,7 @@ def _drawn(source: PacketSource) -> Iterator[float]:
         yield from source.take(AHEAD)[0].tolist()
 
 
-def number_of(exchange: Exchange, name: str, option: str) -> int:
+def number_of(exchange: CommunicationGraph, name: str, option: str) -> int:
     """Return the number of a peer called `left[1]`, as given to an option.
 
     Parameters
@@ -559,4 +560,6 @@ def number_of(exchange: Exchange, name: str, option: str) -> int:
     expected = f"one of {', '.join(names)}{', …' if len(every) > 4 else ''}"
     near = nearest(name, [f"{group}[1]" for group in exchange.groups]) or names[0]
     hint = f'{option} "{near}{"=HOST:PORT" if option == "--to" else ""}"'
-    raise ApcError(Mistake("E970", Place(option), "a peer", expected, cut(name) or "nothing", hint))
+    raise ApcError(
+        Diagnostic("E970", SourceLocation(option), "a peer", expected, cut(name) or "nothing", hint)
+    )

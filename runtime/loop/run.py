@@ -1,6 +1,7 @@
 """What a peer of a run did and heard, on disk: one file a peer, a trace a way, and the scene they played.
 
-Takes: a `Loop` that has ended. Gives: `Words`, `PeerRun`, `Run`, `run_of`, `check_folder`, `write_run`.
+Takes: a `PeerLoop` that has ended. Gives: `PeerRecord`, `PeerRun`, `RealtimeRun`, `run_of`, `check_folder`,
+`write_run`.
 Guarantees: a run is put where it belongs when all of it is written, until then what is there stays.
 Does not: read it again (see `reading`), or judge it (see `beside`).
 """
@@ -19,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler import store
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import check_target, same_file, unwritable
-from apc.loop.peer import NANO, Loop
+from apc.loop.peer import NANO, PeerLoop
 from apc.simulation.rows_in_time import instants_of
 
 Floats = NDArray[np.float64]
@@ -41,7 +42,7 @@ OF_ROUTES = {"packets": ("<i8", 2), "missing": ("|b1", 2)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Words:
+class PeerRecord:
     """What one peer did, as far as it is said in words and single numbers.
 
     `session` is one number of all that played together; `first` is the frame it joined with, of `frames`;
@@ -67,7 +68,7 @@ class Words:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PeerRun(Words):
+class PeerRun(PeerRecord):
     """What one peer did.
 
     `values` (rows, signals) are its signals at `time` (rows,) in seconds, as `simulate` gives them. `late`
@@ -92,15 +93,15 @@ class PeerRun(Words):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Run:
+class RealtimeRun:
     """Several peers' part of one run of a scene."""
 
     folder: str
-    system: CompiledSystem
+    system: Model
     peers: tuple[PeerRun, ...]
 
 
-def run_of(loop: Loop, digest: bytes, not_given: tuple[str, ...]) -> PeerRun:
+def run_of(loop: PeerLoop, digest: bytes, not_given: tuple[str, ...]) -> PeerRun:
     """Return what a loop that has ended did."""
     simulation, player = loop.simulation, loop.player
     rows = np.concatenate([np.zeros((0, simulation.population.width)), *loop.rows])
@@ -160,10 +161,10 @@ def check_folder(folder: Path, scene: Path) -> None:
     else:
         check_target(folder / SCENE if folder.exists() else folder)
         return
-    raise ApcError(Mistake("E973", Place(str(folder)), what, hint="--out another.run"))
+    raise ApcError(Diagnostic("E973", SourceLocation(str(folder)), what, hint="--out another.run"))
 
 
-def write_run(folder: Path, system: CompiledSystem, peers: Sequence[PeerRun], *, whole: bool = False) -> None:
+def write_run(folder: Path, system: Model, peers: Sequence[PeerRun], *, whole: bool = False) -> None:
     """Write what peers did.
 
     Parameters
@@ -200,9 +201,9 @@ def write_run(folder: Path, system: CompiledSystem, peers: Sequence[PeerRun], *,
         raise unwritable(folder, error) from None
 
 
-def _write_peer(folder: Path, peer: PeerRun, system: CompiledSystem) -> None:
+def _write_peer(folder: Path, peer: PeerRun, system: Model) -> None:
     """Write what a peer did, and a trace of every way that it heard. Raises OSError if it can't."""
-    words = msgspec.json.encode({field.name: getattr(peer, field.name) for field in fields(Words)})
+    words = msgspec.json.encode({field.name: getattr(peer, field.name) for field in fields(PeerRecord)})
     arrays = {name: getattr(peer, name) for name in ARRAYS}
     for name in OF_ROUTES:
         arrays |= {f"{name}{at}": item for at, item in enumerate(getattr(peer, name))}
@@ -233,7 +234,7 @@ def file_name(peer: str) -> str:
     return peer.replace("[", "-").replace("]", "")
 
 
-def trace_name(system: CompiledSystem, link: int, sender: int, receiver: int) -> str:
+def trace_name(system: Model, link: int, sender: int, receiver: int) -> str:
     """Return the name of the trace of a way."""
     names = [f"{group.name}-{place + 1}" for group in system.groups for place in range(group.count)]
     return f"{system.links[link].name}-{names[sender]}-to-{names[receiver]}.csv"

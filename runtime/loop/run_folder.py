@@ -19,12 +19,12 @@ import msgspec
 import numpy as np
 
 from apc.compiler.cache import read_archive
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import RefusedError, read_file
 from apc.compiler.words import counted
 from apc.loop.packets import DROPPED
 from apc.loop.peer import live_scene
-from apc.loop.run import ARRAYS, OF_ROUTES, SCENE, PeerRun, Run, Words
+from apc.loop.run import ARRAYS, OF_ROUTES, SCENE, PeerRecord, PeerRun, RealtimeRun
 from apc.network.timetable import START, Route
 from apc.npz import DamageError, read_arrays
 from apc.opening import opened
@@ -52,12 +52,12 @@ class _Scene:
         return self.simulation.population.hearing.routes
 
 
-def read_run(folder: Path) -> Run:
+def read_run(folder: Path) -> RealtimeRun:
     """Read a run. Raises ApcError E973 if a folder is none, damaged, or of several scenes."""
 
     def refuse(wrong: bool, what: str, hint: str = "apc play FILE --out ANOTHER") -> None:
         if wrong:
-            raise ApcError(Mistake("E973", Place(str(folder)), what, hint=hint))
+            raise ApcError(Diagnostic("E973", SourceLocation(str(folder)), what, hint=hint))
 
     files = sorted(folder.glob("*.npz"))
     none = f"holds no run: {SCENE} and a file a peer, as apc play writes them"
@@ -75,7 +75,7 @@ def read_run(folder: Path) -> Run:
     played = hashlib.sha256(archive.model).hexdigest()
     refuse(peers[0].digest != played, f"its {SCENE} is not the scene that was played")
     refuse(len({peer.number for peer in peers}) < len(peers), "holds a peer twice")
-    return Run(str(folder), system, peers)
+    return RealtimeRun(str(folder), system, peers)
 
 
 def _read_peer(path: Path, scene: _Scene) -> PeerRun:
@@ -84,7 +84,9 @@ def _read_peer(path: Path, scene: _Scene) -> PeerRun:
         for check in (_check_words, _check_signals, _check_packets):
             check(peer, scene)
     except (RefusedError, DamageError) as error:
-        raise ApcError(Mistake("E973", Place(str(path)), f"is no peer of this run: {error}")) from None
+        raise ApcError(
+            Diagnostic("E973", SourceLocation(str(path)), f"is no peer of this run: {error}")
+        ) from None
     return peer
 
 
@@ -104,7 +106,7 @@ def _peer(data: bytes, scene: _Scene) -> PeerRun:
     _want(result.keys() == kinds.keys(), f"it lacks one of {', '.join(kinds)}")
     _want(result["told"].size <= LONGEST, "it tells too much")
     try:
-        words = msgspec.json.decode(result["told"].tobytes(), type=Words)
+        words = msgspec.json.decode(result["told"].tobytes(), type=PeerRecord)
         _want(all(map(str.isprintable, words.not_given)), "")  # it is shown in a terminal
     except ValueError:
         raise DamageError("what it tells is not what apc play writes") from None

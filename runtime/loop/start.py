@@ -1,7 +1,7 @@
 """Peers started: one here, or all of a scene as processes of this machine.
 
-Takes: a compiled scene, addresses. Gives: `Play`, `Part`, `play_one`, `play_all`; `address_of`, `listen_at`,
-`is_loopback`.
+Takes: a compiled scene, addresses. Gives: `Play`, `RunPart`, `play_one`, `play_all`; `address_of`,
+`listen_at`, `is_loopback`.
 Guarantees: every process ends with the one that started it; Ctrl-C ends all, and what was done is given; one
 that is lost, or does not end, is told, and takes nothing of the others along.
 Does not: step (see `peer`), or write (see `run`).
@@ -20,13 +20,13 @@ from dataclasses import dataclass
 from fractions import Fraction
 from multiprocessing.connection import Connection
 
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.frame.exchange import build_exchange
 from apc.frame.parameters import resolve
 from apc.loop.device import DeviceFunction
 from apc.loop.packets import Address
-from apc.loop.peer import Loop, StoppedError
+from apc.loop.peer import PeerLoop, StoppedError
 from apc.loop.realtime import claim
 from apc.loop.run import PeerRun, run_of
 from apc.processes import Workers, digest_of, local_processes, model_bytes, model_of_bytes
@@ -48,7 +48,7 @@ class Play:
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class RunPart:
     """A peer's part of a run, None if it ended before the scene began; its `trouble`, if it ended by that."""
 
     run: PeerRun | None
@@ -76,13 +76,15 @@ def address_of(text: str, option: str, peer: str = "") -> Address:
     hint = f'{option} "{peer and f"{peer}="}192.0.2.7:5000"'
     valid = colon and host and port.isascii() and port.isdecimal() and len(port) < 6
     if not (valid and least <= int(port) < 1 << 16):
-        raise ApcError(Mistake("E971", Place(option), "an address", expected, text[:80] or "nothing", hint))
+        raise ApcError(
+            Diagnostic("E971", SourceLocation(option), "an address", expected, text[:80] or "nothing", hint)
+        )
     try:
         return socket.getaddrinfo(host, int(port), socket.AF_INET, socket.SOCK_DGRAM)[0][4][:2]  # type: ignore[return-value]
     except (OSError, UnicodeError) as error:
         why = error.strerror if isinstance(error, OSError) else str(error)
         what = f"the host {host[:80]} is not known by an IPv4 address: {why}"
-        raise ApcError(Mistake("E971", Place(option), what, hint=hint)) from None
+        raise ApcError(Diagnostic("E971", SourceLocation(option), what, hint=hint)) from None
 
 
 def listen_at(address: Address) -> socket.socket:
@@ -93,7 +95,9 @@ def listen_at(address: Address) -> socket.socket:
     except OSError as error:
         listening.close()
         what = f"can't listen at {address[0]}:{address[1]}: {error.strerror or error}"
-        raise ApcError(Mistake("E974", Place("--listen"), what, hint=f'--listen "{LOOPBACK}:0"')) from None
+        raise ApcError(
+            Diagnostic("E974", SourceLocation("--listen"), what, hint=f'--listen "{LOOPBACK}:0"')
+        ) from None
     return listening
 
 
@@ -103,33 +107,33 @@ def is_loopback(address: Address) -> bool:
 
 
 def play_one(
-    system: CompiledSystem,
+    system: Model,
     peer: str,
     listening: socket.socket,
     addresses: Mapping[str, Address],
     how: Play,
     stop: Connection | None = None,
     device: DeviceFunction | None = None,
-) -> Part:
+) -> RunPart:
     """Play one peer.
 
     Parameters
     ----------
     system, peer, listening, addresses, device
-        As for `Loop`.
+        As for `PeerLoop`.
     how
         For how long, and how.
     stop
-        As for `Loop`; Ctrl-C if not given.
+        As for `PeerLoop`; Ctrl-C if not given.
 
     Raises
     ------
     ApcError
-        Those of `Loop` and `Loop.meet`.
+        Those of `PeerLoop` and `PeerLoop.meet`.
     """
     digest = digest_of(system)
     with _interrupts() if stop is None else nullcontext(stop) as stopping:
-        loop = Loop(
+        loop = PeerLoop(
             *(system, peer, listening, addresses),
             digest=digest,
             duration=how.duration,
@@ -143,9 +147,9 @@ def play_one(
         try:
             loop.meet(how.patience)
         except StoppedError:
-            return Part(None)
+            return RunPart(None)
         loop.run()
-        return Part(run_of(loop, digest, not_given) if any(map(len, loop.rows)) else None, loop.trouble)
+        return RunPart(run_of(loop, digest, not_given) if any(map(len, loop.rows)) else None, loop.trouble)
 
 
 @contextmanager
@@ -167,7 +171,7 @@ def _interrupts() -> Iterator[Connection]:
         stop.close()
 
 
-def play_all(system: CompiledSystem, how: Play) -> tuple[Part, ...]:
+def play_all(system: Model, how: Play) -> tuple[RunPart, ...]:
     """Play all peers of a scene on loopback, a process each; Ctrl-C ends all, and what was done is given.
 
     One that ends without a word, or not at all, is the trouble (E975) of its own part.
@@ -180,17 +184,19 @@ def play_all(system: CompiledSystem, how: Play) -> tuple[Part, ...]:
     exchange = build_exchange(system, resolve(system).timings)
     if exchange.peers > MOST_PEERS:
         what = f"{exchange.peers:,} peers would be as many processes: at most {MOST_PEERS}"
-        raise ApcError(Mistake("E975", Place(system.name), what, hint='apc play FILE --peer "user[1]" …'))
+        raise ApcError(
+            Diagnostic("E975", SourceLocation(system.name), what, hint='apc play FILE --peer "user[1]" …')
+        )
     names = [exchange.peer_name(index) for index in range(exchange.peers)]
     sockets = {name: listen_at((LOOPBACK, 0)) for name in names}
     addresses = {name: listening.getsockname() for name, listening in sockets.items()}
     stop, end = multiprocessing.Pipe(duplex=False)
     model, parts, patience = model_bytes(system), [], None
-    running: dict[Future[Part], tuple[str, Workers[str, Part]]] = {}
+    running: dict[Future[RunPart], tuple[str, Workers[str, RunPart]]] = {}
     with ExitStack() as stack:
         for name, listening in sockets.items():  # a pool for each: one that is lost breaks its own
             shared = _Shared(model, listening, addresses, how, stop)
-            lost = Mistake("E975", Place(name), "ended without a word: what it played is lost")
+            lost = Diagnostic("E975", SourceLocation(name), "ended without a word: what it played is lost")
             workers = stack.enter_context(local_processes(_play_named, shared, 1, lost))
             running[workers.submit(name)] = name, workers
         while running:
@@ -207,13 +213,13 @@ def play_all(system: CompiledSystem, how: Play) -> tuple[Part, ...]:
                 break
     silent = f"did not end within {TO_END:g} s of being told to, and was ended: what it played is lost"
     for name, _ in running.values():
-        parts.append(Part(None, ApcError(Mistake("E975", Place(name), silent))))
+        parts.append(RunPart(None, ApcError(Diagnostic("E975", SourceLocation(name), silent))))
     for listening in sockets.values():
         listening.close()
     return tuple(parts)
 
 
-def _part(done: Future[Part], workers: Workers[str, Part]) -> Part:
+def _part(done: Future[RunPart], workers: Workers[str, RunPart]) -> RunPart:
     """Return what a process did that has ended, by itself or by what is told as its trouble."""
     error = done.exception()
     if error is None:
@@ -221,7 +227,7 @@ def _part(done: Future[Part], workers: Workers[str, Part]) -> Part:
     trouble = error if isinstance(error, ApcError) else workers.trouble(error)
     if trouble is None:
         raise error
-    return Part(None, trouble)
+    return RunPart(None, trouble)
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,7 +241,7 @@ class _Shared:
     stop: Connection
 
 
-def _play_named(shared: _Shared, name: str) -> Part:
+def _play_named(shared: _Shared, name: str) -> RunPart:
     """Play one peer in a process of its own."""
     addresses = {other: address for other, address in shared.addresses.items() if other != name}
     system = model_of_bytes(shared.model)

@@ -1,7 +1,7 @@
 """How fast a scene settles almost surely: its growth per frame over an endless course of luck, estimated.
 
-Takes: a `CompiledSystem` whose links lose packets, whose receivers hold what they heard last.
-Gives: `AlmostSure`, `almost_sure`.
+Takes: a `Model` whose links lose packets, whose receivers hold what they heard last.
+Gives: `TopLyapunovExponent`, `almost_sure`.
 Guarantees: equal seeds give equal numbers. The interval is of independent courses, which begin once
 directions have settled, so that it holds what a norm's choice makes of both ends, O(1/T).
 Does not: prove; play more peers than fit in one matrix.
@@ -21,12 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.frame.instance import Prepared
 from apc.moments.crowd import build_hearing
 from apc.moments.frames import channels_of, held_frame, refuse_unheld
 from apc.network.channel import ChannelLaw
-from apc.unserved import UnservedError
+from apc.unserved import NotSupportedError
 
 # States of all peers and their channels in one matrix: ten equal peers of the paper's.
 MOST_STATES = 180
@@ -43,14 +43,14 @@ QUANTILE = 0.975
 
 
 @dataclass(frozen=True, slots=True)
-class AlmostSure:
+class TopLyapunovExponent:
     """The exponent per frame (log of the growth), and the 95 % confidence interval it is in."""
 
     exponent: float
     interval: tuple[float, float]
 
 
-def almost_sure(system: CompiledSystem, prepared: Prepared, *, seed: int = 0) -> AlmostSure:
+def almost_sure(system: Model, prepared: Prepared, *, seed: int = 0) -> TopLyapunovExponent:
     """Estimate a scene's growth per frame over one endless course of luck.
 
     Parameters
@@ -69,7 +69,7 @@ def almost_sure(system: CompiledSystem, prepared: Prepared, *, seed: int = 0) ->
     states += sum(channels_of(link, system.peers) for link in lossy)
     if states > MOST_STATES:
         what = f"{system.peers:,} peers and their channels have {states:,} states"
-        raise UnservedError(f"{what}, and {MOST_STATES} are the most")
+        raise NotSupportedError(f"{what}, and {MOST_STATES} are the most")
     frame = held_frame(system, hearing)
     share = np.array([law.mean_loss for law in frame.laws])[:, None, None]
     n, count, width = len(frame.mean), len(frame.laws), frame.misses.shape[1]
@@ -85,13 +85,13 @@ def almost_sure(system: CompiledSystem, prepared: Prepared, *, seed: int = 0) ->
         if (number + 1) % STRIDE == 0:
             size = np.linalg.norm(x, axis=0)
             if not size.all():  # nothing is left
-                return AlmostSure(-math.inf, (-math.inf, -math.inf))
+                return TopLyapunovExponent(-math.inf, (-math.inf, -math.inf))
             x /= size
             total += np.log(size) * (number >= SETTLING)
     values = total / FRAMES
     middle = float(values.mean())
     half = float(stdtrit(COURSES - 1, QUANTILE)) * float(values.std(ddof=1)) / math.sqrt(COURSES)
-    return AlmostSure(middle, (middle - half, middle + half))
+    return TopLyapunovExponent(middle, (middle - half, middle + half))
 
 
 def _lost(

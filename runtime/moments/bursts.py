@@ -29,10 +29,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.relative import relative_rows
-from apc.moments.copies_apart import Peer, largest_error
-from apc.moments.frames import Arc, Arcs, LossyFrame
+from apc.moments.copies_apart import PeerReadings, largest_error
+from apc.moments.frames import Arcs, LossChannel, LossyFrame
 from apc.threads import load_pool
-from apc.unserved import UnservedError
+from apc.unserved import NotSupportedError
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.intp]
@@ -64,7 +64,7 @@ def tagged_radius(of: LossyFrame, order: int) -> float:
     return _largest(partial(_step, tags), tags.at_rest(np.eye(len(of.mean))))
 
 
-def tagged_error(of: LossyFrame, order: int, classes: Sequence[tuple[int, Peer]]) -> float:
+def tagged_error(of: LossyFrame, order: int, classes: Sequence[tuple[int, PeerReadings]]) -> float:
     """Return the largest error of copies in m, with so many tags at most.
 
     Parameters
@@ -139,7 +139,7 @@ def _renamed(tags: Arcs, label: Mapping[int, int]) -> Arcs:
     return tuple(sorted((label[g], label[h], link) for g, h, link in tags))
 
 
-def _times(terms: Terms, arc: Arc, plain: float, tagged: float, kappa: float) -> Terms:
+def _times(terms: Terms, arc: LossChannel, plain: float, tagged: float, kappa: float) -> Terms:
     """Return `plain` + `tagged` φ, φ being of an arc, times moments so tagged."""
     result = [(factor * plain, tags) for factor, tags in terms if plain]
     for factor, tags in terms:
@@ -326,5 +326,5 @@ def _settled(step: Callable[[Floats], Floats], added: Floats) -> Floats:
     operator = linalg.LinearOperator((added.size,) * 2, matvec=lambda x: x - step(x), dtype=np.float64)
     result, open_end = linalg.gmres(operator, added, rtol=LEFT, atol=0.0, restart=VECTORS, maxiter=RESTARTS)
     if open_end:
-        raise UnservedError("its iteration did not come to an end")
+        raise NotSupportedError("its iteration did not come to an end")
     return np.asarray(result)

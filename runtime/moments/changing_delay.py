@@ -1,6 +1,6 @@
 """A link whose delay changes from packet to packet: a bound by which a scene stays stable whatever it does.
 
-Takes: a `CompiledSystem` and a range of the delay of one of its links.
+Takes: a `Model` and a range of the delay of one of its links.
 Gives: `loop_gain`, `unstable_delays`.
 Guarantees: with a gain below 1 the scene is exponentially stable however the delays of each way from peer to
 peer change within the range, the newest packet that has arrived being heard; proved, with every rounding
@@ -27,18 +27,18 @@ from fractions import Fraction
 import numpy as np
 
 from apc.analysis.sides import sides
-from apc.compiler.compiled import Channel, CompiledSystem
+from apc.compiler.compiled import Channel, Model
 from apc.eigen.modes import loops_at_right_angles
 from apc.frame.instance import prepare
-from apc.frame.jacobians import SiteJacobians
-from apc.frame.names import Free
+from apc.frame.jacobians import SubsystemJacobians
+from apc.frame.names import ParameterRef
 from apc.frame.overrides import Override, apply
 from apc.frame.radius import UNIT
 from apc.moments.crowd import build_hearing
 from apc.moments.frames import refuse_unheld
 from apc.moments.small_gain import MOST_STATES, change_of_sent, felt_rows, ratios_of, weight_of
 from apc.moments.traces import Packets, trace_radius
-from apc.unserved import UnservedError
+from apc.unserved import NotSupportedError
 
 # What a link whose packets come late is like: the newest that has arrived is heard, until there is another.
 HOLDING = Channel(None, None, "uniform", "newest", "hold", None)
@@ -51,7 +51,7 @@ LONGEST, LONGER = 8, 12
 ABOVE = 1 + 1e-3
 
 
-def loop_gain(system: CompiledSystem, delay: Free, low: Fraction, high: Fraction) -> float:
+def loop_gain(system: Model, delay: ParameterRef, low: Fraction, high: Fraction) -> float:
     """Return the left side of the small gain theorem, proved from above; infinite if the middle is unstable.
 
     At a kink it is the largest of all sides.
@@ -67,7 +67,7 @@ def loop_gain(system: CompiledSystem, delay: Free, low: Fraction, high: Fraction
 
     Raises
     ------
-    UnservedError
+    NotSupportedError
         What stands in the way of a bound.
     """
     return max(
@@ -77,7 +77,11 @@ def loop_gain(system: CompiledSystem, delay: Free, low: Fraction, high: Fraction
 
 
 def _loop_gain(
-    system: CompiledSystem, jacobians: tuple[SiteJacobians, ...], delay: Free, low: Fraction, high: Fraction
+    system: Model,
+    jacobians: tuple[SubsystemJacobians, ...],
+    delay: ParameterRef,
+    low: Fraction,
+    high: Fraction,
 ) -> float:
     """Return `loop_gain` of one side of a kink."""
     middle = apply(system, [Override(delay, (low + high) / 2)])
@@ -90,7 +94,7 @@ def _loop_gain(
         for clock in kind.clocks
         for receive in clock.receives
     ):
-        raise UnservedError("receivers ask how old packets are, or for the packet before")
+        raise NotSupportedError("receivers ask how old packets are, or for the packet before")
     links = tuple(replace(item, channel=HOLDING) if item is link else item for item in middle.links)
     changing = replace(middle, links=links)
     hearing = build_hearing(changing, prepare(changing, jacobians))
@@ -127,7 +131,7 @@ def _loop_gain(
 
 
 def unstable_delays(
-    system: CompiledSystem, delay: Free, low: Fraction, high: Fraction
+    system: Model, delay: ParameterRef, low: Fraction, high: Fraction
 ) -> tuple[int, int] | None:
     """Return how many packets take the least delay, and how many then the largest, and so on, unstably.
 

@@ -1,7 +1,7 @@
 """How far copies are from each other while hands push at random, over the network as it is.
 
 Takes: a scene that is stable in mean square, and how its second moments move.
-Gives: `Forced`, `forced`, `Peer`; `moments_error`, `largest_error`.
+Gives: `Forced`, `forced`, `PeerReadings`; `moments_error`, `largest_error`.
 Guarantees: the peers move as before, and are pushed besides; positions are those at the start of a frame of
 the scene, whenever frames are said to begin.
 Does not: say whether the scene is stable (see `network_verdict`); bound rounding.
@@ -22,16 +22,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem, Kind
+from apc.compiler.compiled import Model, PeerType
 from apc.eigen.modes import dense_loop
-from apc.eigen.peers import PeerGroup
+from apc.eigen.peers import PeerClass
 from apc.eigen.relative import Relative
 from apc.frame.devices import Device, coupled_directly, find_device
 from apc.frame.ports import with_holds, with_ports
-from apc.frame.site import LinearSite
-from apc.moments.crowd import Hearing, Moments, instants
+from apc.frame.site import LinearSubsystem
+from apc.moments.crowd import Moments, PerTickReception, instants
 from apc.moments.operator import settled
-from apc.unserved import UnservedError
+from apc.unserved import NotSupportedError
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
@@ -44,7 +44,7 @@ Copy = tuple[str, str]
 
 
 @dataclass(frozen=True, slots=True)
-class Peer:
+class PeerReadings:
     """What of z a peer got: `drawn` are forces in N as a frame begins, `copies` positions in m."""
 
     drawn: range
@@ -55,19 +55,19 @@ class Peer:
 class Forced:
     """The peers of a scene, pushed; `peers` says what of z they got, by the schedule's id."""
 
-    hearing: Hearing
-    peers: Mapping[int, Peer]
+    hearing: PerTickReception
+    peers: Mapping[int, PeerReadings]
 
-    def of(self, sites: Sequence[PeerGroup]) -> list[tuple[int, Peer]]:
+    def of(self, sites: Sequence[PeerClass]) -> list[tuple[int, PeerReadings]]:
         """Return of each class of peers how many there are, and what they got."""
         return [(site.count, self.peers[id(site.schedule)]) for site in sites]
 
-    def peer_by_peer(self) -> list[tuple[int, Peer]]:
+    def peer_by_peer(self) -> list[tuple[int, PeerReadings]]:
         """Return what each peer got, one after another."""
         return self.of(dense_loop(self.hearing.groups, self.hearing.exchange).sites)
 
 
-def forced(system: CompiledSystem, hearing: Hearing, first: Fraction = Fraction(0)) -> Forced:
+def forced(system: Model, hearing: PerTickReception, first: Fraction = Fraction(0)) -> Forced:
     """Push what hands hold, each for itself, by a force of variance 1 N².
 
     Parameters
@@ -81,7 +81,7 @@ def forced(system: CompiledSystem, hearing: Hearing, first: Fraction = Fraction(
 
     Raises
     ------
-    UnservedError
+    NotSupportedError
         It is not clear what hands hold.
     """
     unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
@@ -95,13 +95,13 @@ def forced(system: CompiledSystem, hearing: Hearing, first: Fraction = Fraction(
     )
     ticks = instants(hearing, fastest)
     groups, rows, peers = [], {}, {}
-    built: dict[tuple[int, int], tuple[PeerGroup, Peer]] = {}
+    built: dict[tuple[int, int], tuple[PeerClass, PeerReadings]] = {}
     for group in hearing.groups:
         key = id(group.schedule), id(group.lifting)
         if key not in built:
             held = find_device(group.jacobians, group.parameters, unit_of, group.listening, direct=direct)
             if isinstance(held, str):
-                raise UnservedError(held)
+                raise NotSupportedError(held)
             built[key] = _pushed(group, held, ticks, -first % hearing.frame)
         pushed, peer = built[key]
         groups.append(
@@ -117,13 +117,13 @@ def forced(system: CompiledSystem, hearing: Hearing, first: Fraction = Fraction(
         rows[id(pushed.schedule)] = hearing.rows.get(id(group.schedule), ())
         peers[id(pushed.schedule)] = peer
     if not any(peer.drawn for peer in peers.values()):
-        raise UnservedError("no peer holds anything but what it tells others about")
+        raise NotSupportedError("no peer holds anything but what it tells others about")
     return Forced(replace(hearing, groups=tuple(groups), rows=rows), peers)
 
 
 def _pushed(
-    group: PeerGroup, device: Device | None, ticks: Sequence[Fraction], start: Fraction
-) -> tuple[PeerGroup, Peer]:
+    group: PeerClass, device: Device | None, ticks: Sequence[Fraction], start: Fraction
+) -> tuple[PeerClass, PeerReadings]:
     """Return the first peer of a group with forces, drawn as a frame begins, and its copies' positions.
 
     Parameters
@@ -155,14 +155,14 @@ def _pushed(
     taken = int(start / schedule.quantum)
     (site, exact), full, ports = with_ports(sites, schedule, 1, at, readings, [taken])
     drawn = ports.drawn.ravel().tolist()
-    peer = Peer(
+    peer = PeerReadings(
         drawn=range(drawn[0], drawn[-1] + 1) if drawn else range(0),
         copies=dict(zip(copies, ports.read[0].tolist(), strict=True)),
     )
     return group.with_site(site, exact, full), peer
 
 
-def _positions(site: LinearSite, kind: Kind) -> Matrix:
+def _positions(site: LinearSubsystem, kind: PeerType) -> Matrix:
     """Return what of states and holds the positions depend on that are sent (positions, n_x + n_u)."""
     rows = [
         np.concatenate([send.x[place], send.u[place]])
@@ -173,7 +173,7 @@ def _positions(site: LinearSite, kind: Kind) -> Matrix:
     return np.array(rows, dtype=site.b.dtype).reshape(len(rows), sum(site.b.shape))
 
 
-def moments_error(of: Moments, classes: Sequence[tuple[int, Peer]]) -> float:
+def moments_error(of: Moments, classes: Sequence[tuple[int, PeerReadings]]) -> float:
     """Return the largest error of copies in m.
 
     Parameters
@@ -207,7 +207,7 @@ def moments_error(of: Moments, classes: Sequence[tuple[int, Peer]]) -> float:
 
 
 def largest_error(
-    moments: Floats, at: Relative, offsets: Sequence[int], classes: Sequence[tuple[int, Peer]]
+    moments: Floats, at: Relative, offsets: Sequence[int], classes: Sequence[tuple[int, PeerReadings]]
 ) -> float:
     """Return the largest error of copies in m of peers that are followed one by one.
 
@@ -228,12 +228,12 @@ def _largest(variances: Floats) -> float:
     """Return the root of the largest variance."""
     largest = float(variances.max())
     if not largest >= 0:
-        raise UnservedError("rounding leaves its digits in doubt")
+        raise NotSupportedError("rounding leaves its digits in doubt")
     return math.sqrt(largest)
 
 
 def _error_rows(
-    sites: Sequence[tuple[int, Peer]], at: Relative, offsets: Sequence[int]
+    sites: Sequence[tuple[int, PeerReadings]], at: Relative, offsets: Sequence[int]
 ) -> list[tuple[Copy, int, Floats]]:
     """Return the error of a copy of each site that has others: which copy and site, and it over coordinates.
 
@@ -258,8 +258,10 @@ def _error_rows(
                 row[place] = (k == g) * (1 + 1 / others) - sites[k][0] / others
             moved = row[at.held] + row[at.rest] @ at.weights
             if np.abs(moved).max(initial=0.0) > STANDING * np.abs(row).max(initial=0.0):
-                raise UnservedError("nothing holds the copies together: what they differ by grows for ever")
+                raise NotSupportedError(
+                    "nothing holds the copies together: what they differ by grows for ever"
+                )
             errors.append((copy, g, row[at.rest]))
     if not errors:
-        raise UnservedError("no position of a mass is told to others")
+        raise NotSupportedError("no position of a mass is told to others")
     return errors

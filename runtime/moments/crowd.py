@@ -1,7 +1,7 @@
 """The mean loops and the luck of a scene: what its second moments are made of.
 
-Takes: a `CompiledSystem` whose links lose or delay packets independently of each other.
-Gives: `crowd`; `Classes`, `classes_of`, `moments_of`; `Hearing`, `build_hearing`, `own_value`;
+Takes: a `Model` whose links lose or delay packets independently of each other.
+Gives: `crowd`; `Classes`, `classes_of`, `moments_of`; `PerTickReception`, `build_hearing`, `own_value`;
 `peer_classes`, `remembered_of`, `standing_motions`, `instants`.
 Guarantees: equal peers on complete graphs cost the same, however many they are; peers that can change places
 are one class on any graph.
@@ -20,22 +20,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import lifted_groups
-from apc.compiler.compiled import Clock, CompiledSystem, Kind
-from apc.eigen.closing import Coupling, Loop, without_packets
+from apc.compiler.compiled import Clock, Model, PeerType
+from apc.eigen.closing import Coupling, ModalSystem, without_packets
 from apc.eigen.modes import complete_degrees, complete_loops, couple, dense_loop, split_exchangeable
-from apc.eigen.peers import PeerGroup, used_ways
+from apc.eigen.peers import PeerClass, used_ways
 from apc.eigen.relative import Relative
 from apc.eigen.rigid import find_rigid_modes
-from apc.frame.exchange import Exchange
-from apc.frame.instance import Peers, Prepared
+from apc.frame.exchange import CommunicationGraph
+from apc.frame.instance import PeerIndices, Prepared
 from apc.frame.lift import FrameMap
 from apc.frame.parameters import resolve
 from apc.frame.radius import radius_of, value_of
-from apc.frame.schedule import Event, Schedule, Selected, Send, Sent, Tick, Way, tick_by_tick
+from apc.frame.schedule import (
+    CouplingTerm,
+    Event,
+    Schedule,
+    SendEvent,
+    SentSample,
+    Tick,
+    UncertainSample,
+    tick_by_tick,
+)
 from apc.frame.scheduling import build_schedules
 from apc.frame.taylor import arithmetic_of
-from apc.moments.mean_loops import Heard, Listened, Remembered, Route, mean_loop, remember
-from apc.moments.operator import Block, Operator
+from apc.moments.mean_loops import Listened, ReceptionChannel, Route, RouteMemory, mean_loop, remember
+from apc.moments.operator import MomentBlock, Operator
 from apc.moments.packet_memory import memory_of
 from apc.network.channel import ChannelLaw, channel_law
 
@@ -51,25 +60,25 @@ PERFECT = ChannelLaw(0.0, 1.0, 0.0, 0.0, 0.0, 0.0, "uniform", None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Hearing:
+class PerTickReception:
     """The peers of a scene, each tick of theirs hearing by itself: `rows` says what, by the schedule's id."""
 
-    groups: tuple[PeerGroup, ...]
-    exchange: Exchange
-    rows: Mapping[int, tuple[Selected, ...]]
+    groups: tuple[PeerClass, ...]
+    exchange: CommunicationGraph
+    rows: Mapping[int, tuple[UncertainSample, ...]]
     timings: Mapping[str, Fraction]
     frame: Fraction
     quantum: Fraction
     strictly: bool  # a tick misses what arrives just then
 
-    def of(self, loop: Loop) -> list[tuple[Selected, ...]]:
+    def of(self, loop: ModalSystem) -> list[tuple[UncertainSample, ...]]:
         """Return what each row of r of each site of a loop hears."""
         return [self.rows[id(site.schedule)] for site in loop.sites]
 
 
 def build_hearing(
-    system: CompiledSystem, prepared: Prepared, *, first: Fraction = Fraction(0), stand_in: bool = False
-) -> Hearing:
+    system: Model, prepared: Prepared, *, first: Fraction = Fraction(0), stand_in: bool = False
+) -> PerTickReception:
     """Lift the peers of a scene with a row of r for each tick that hears.
 
     Parameters
@@ -103,15 +112,15 @@ def build_hearing(
     groups, exchange = lifted_groups(moved, prepared=replace(prepared, schedules=by_tick, timings=timings))
     strictly = prepared.order.index("tick") < prepared.order.index("deliver")
     frame, quantum = schedules[0].frame_s, schedules[0].quantum
-    return Hearing(groups, exchange, rows, timings, frame, quantum, strictly)
+    return PerTickReception(groups, exchange, rows, timings, frame, quantum, strictly)
 
 
-def own_value(row: Selected) -> Sent:
+def own_value(row: UncertainSample) -> SentSample:
     """Return the name of what a peer sends itself at a tick, to stand in for a value it misses."""
-    return Sent(f"{row.way.link} at {row.clock}", row.channel, row.tick)
+    return SentSample(f"{row.way.link} at {row.clock}", row.channel, row.tick)
 
 
-def standing_in(schedule: Schedule, kind: Kind) -> Schedule:
+def standing_in(schedule: Schedule, kind: PeerType) -> Schedule:
     """Return `tick_by_tick` of a schedule, with what stands in for missed values sent at the ticks."""
     partition = {send.link: place for place, send in enumerate(kind.sends)}
     sent = list(schedule.sent)
@@ -125,7 +134,7 @@ def standing_in(schedule: Schedule, kind: Kind) -> Schedule:
                     sent.append(own)
                 number = partition[row.way.link]
                 channel = kind.sends[number].channels.index(row.channel)
-                events.append(Send(number, ((channel, sent.index(own)),)))
+                events.append(SendEvent(number, ((channel, sent.index(own)),)))
         events.append(event)
     more = len(sent) - len(schedule.sent)
     return replace(
@@ -140,7 +149,7 @@ def standing_in(schedule: Schedule, kind: Kind) -> Schedule:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Apart:
+class PeerVersusRest:
     """A loop in which one peer of a class, its first site, moves apart from the others.
 
     `of` says of which class each site is, `many` for how many peers the first site's place could be taken by
@@ -148,7 +157,7 @@ class Apart:
     `standing` are its rigid motions over the sites' own z.
     """
 
-    loop: Loop
+    loop: ModalSystem
     of: tuple[int, ...]
     many: tuple[int, ...]
     standing: Floats
@@ -166,10 +175,10 @@ class Classes:
     `weights` says what a peer of one class weighs one of another by.
     """
 
-    hearing: Hearing
-    common: Loop
+    hearing: PerTickReception
+    common: ModalSystem
     weights: Coupling
-    loops: tuple[Apart, ...]
+    loops: tuple[PeerVersusRest, ...]
 
     @property
     def counts(self) -> list[int]:
@@ -177,12 +186,12 @@ class Classes:
         return [site.count for site in self.common.sites]
 
 
-def classes_of(hearing: Hearing) -> Classes:
+def classes_of(hearing: PerTickReception) -> Classes:
     """Return the loops of a scene with their rigid motions."""
     common, weights = peer_classes(hearing)
     loops = []
     for which, own in enumerate(common.sites):
-        alone = Peers((range(own.peers.first, own.peers.first + 1),))
+        alone = PeerIndices((range(own.peers.first, own.peers.first + 1),))
         sites = [(which, replace(own, count=1, peers=alone), 1)]
         for g, site in enumerate(common.sites):
             first = int(g == which)
@@ -197,20 +206,20 @@ def classes_of(hearing: Hearing) -> Classes:
             )
             for way, rows in weights.items()
         }
-        loop = Loop(own.name, 1, tuple(site for _, site, _ in sites), coupling)
+        loop = ModalSystem(own.name, 1, tuple(site for _, site, _ in sites), coupling)
         listed = tuple(g for g, *_ in sites), tuple(many for *_, many in sites)
-        loops.append(Apart(loop, *listed, standing_motions(loop)))
+        loops.append(PeerVersusRest(loop, *listed, standing_motions(loop)))
     return Classes(hearing, common, weights, tuple(loops))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Moving:
+class MomentCoordinates:
     """Where a block's motions are: the relative coordinates `at` of a loop whose sites begin at `offsets`.
 
     It stands for `heard` channels to the loop's first site; or for that site itself.
     """
 
-    loop: Apart
+    loop: PeerVersusRest
     at: Relative
     offsets: tuple[int, ...]
     heard: int | None = None
@@ -224,7 +233,7 @@ class Moments:
     """
 
     operator: Operator
-    moving: tuple[Moving, ...]
+    moving: tuple[MomentCoordinates, ...]
     entries: int
     states: int
 
@@ -245,7 +254,7 @@ class _Kind:
     spreads: tuple[Matrix, ...]
 
 
-def crowd(system: CompiledSystem, hearing: Hearing) -> Moments:
+def crowd(system: Model, hearing: PerTickReception) -> Moments:
     """Make the mean loops of a scene and the luck that drives them.
 
     Parameters
@@ -260,7 +269,7 @@ def crowd(system: CompiledSystem, hearing: Hearing) -> Moments:
 
 
 def moments_of(
-    of: Classes, memories: Sequence[Remembered], frames: Mapping[str, FrameMap] | None = None
+    of: Classes, memories: Sequence[RouteMemory], frames: Mapping[str, FrameMap] | None = None
 ) -> Moments:
     """Make the mean loops and the luck of a scene's classes of peers.
 
@@ -276,7 +285,7 @@ def moments_of(
     kinds = _kinds(of, memories)
     spreads = [spread for kind in kinds for spread in kind.spreads]
     widths = [len(spread[0]) for spread in spreads]
-    blocks, moving, states = list[Block](), list[Moving](), 0
+    blocks, moving, states = list[MomentBlock](), list[MomentCoordinates](), 0
     for h, apart in enumerate(of.loops):
         driving = [kind for kind in kinds if kind.receiver == h]
         rows = of.hearing.of(apart.loop)
@@ -288,7 +297,7 @@ def moments_of(
             luck = channel.luck if channel else range(0)
             forms = _forms(kinds, apart, mean.misses, kind, channel)
             blocks.append(_block(mean.matrix, own, luck, forms, widths, kind.lucks if kind else ()))
-            moving.append(Moving(apart, mean.at, mean.offsets, kind.heard if kind else None))
+            moving.append(MomentCoordinates(apart, mean.at, mean.offsets, kind.heard if kind else None))
             states = max(states, len(own))
     width, like = max(widths, default=0), blocks[0].matrix
     listed = np.zeros((len(widths), len(like), width, width))
@@ -304,10 +313,10 @@ Form = tuple[int, float, Matrix]
 
 def _forms(
     kinds: Sequence[_Kind],
-    apart: Apart,
+    apart: PeerVersusRest,
     misses: Mapping[tuple[int, Route, int], Matrix],
     kind: _Kind | None,
-    channel: Heard | None,
+    channel: ReceptionChannel | None,
 ) -> list[Form]:
     """Return by which forms luck follows from what moves in a loop, driven by channels of a kind or none.
 
@@ -342,7 +351,7 @@ def _block(
     forms: Sequence[Form],
     widths: Sequence[int],
     by: Sequence[int],
-) -> Block:
+) -> MomentBlock:
     """Return a block of the operator.
 
     Parameters
@@ -370,10 +379,10 @@ def _block(
         for e, span in enumerate(spans):
             at_once[k, e, :, : widths[number], : span.stop - span.start] = form[..., span]
     moved = matrix[:, own[:, None], own]
-    return Block(moved, enters, tuple(by), seen, shares, at_once if at_once.any() else None)
+    return MomentBlock(moved, enters, tuple(by), seen, shares, at_once if at_once.any() else None)
 
 
-def _kinds(of: Classes, memories: Sequence[Remembered]) -> list[_Kind]:
+def _kinds(of: Classes, memories: Sequence[RouteMemory]) -> list[_Kind]:
     """Return the kinds of channels left to chance."""
     kinds: list[_Kind] = []
     first, counts = 0, of.counts
@@ -393,13 +402,13 @@ def _kinds(of: Classes, memories: Sequence[Remembered]) -> list[_Kind]:
     return kinds
 
 
-def standing_motions(loop: Loop) -> Floats:
+def standing_motions(loop: ModalSystem) -> Floats:
     """Return the rigid motions of a loop over its sites' own states."""
     states = sum(len(site.z_names) for site in loop.sites)
     return find_rigid_modes(without_packets(loop), with_drifts=False).basis[:states]
 
 
-def peer_classes(hearing: Hearing) -> tuple[Loop, Coupling]:
+def peer_classes(hearing: PerTickReception) -> tuple[ModalSystem, Coupling]:
     """Return the loop of all classes of peers, and what a peer of one weighs one of another by.
 
     Peers of a class can change places: each hears all others alike, of its own class too, or none of them.
@@ -408,7 +417,7 @@ def peer_classes(hearing: Hearing) -> tuple[Loop, Coupling]:
     if all(exchange.is_complete(way.link) for way in used_ways(group.schedule for group in groups)):
         degrees = complete_degrees(groups, exchange)
 
-        def weight(way: Way, g: int, h: int) -> Fraction:
+        def weight(way: CouplingTerm, g: int, h: int) -> Fraction:
             return Fraction(groups[h].count > (1 if g == h else 0))
 
         return complete_loops(groups, exchange)[0], couple(groups, exchange, weight, degrees)
@@ -425,13 +434,13 @@ def peer_classes(hearing: Hearing) -> tuple[Loop, Coupling]:
 
 
 def remembered_of(
-    system: CompiledSystem,
-    hearing: Hearing,
-    common: Loop,
+    system: Model,
+    hearing: PerTickReception,
+    common: ModalSystem,
     *,
     perfect: bool = False,
     lost: Mapping[str, tuple[float, ...]] = EXACTLY,
-) -> list[Remembered]:
+) -> list[RouteMemory]:
     """Return what is remembered on each route that anybody listens to.
 
     Parameters
@@ -446,7 +455,7 @@ def remembered_of(
         How far the share of packets that a link loses may be off, and how it changes over a cell, by the
         link's name, as for `packet_memory.memory_of`.
     """
-    heard: dict[Route, list[Selected]] = {}
+    heard: dict[Route, list[UncertainSample]] = {}
     for site, rows in zip(common.sites, hearing.of(common), strict=True):
         size = site.lifted.mapped(lambda block: np.abs(value_of(block)) + radius_of(block))
         felt: Flags = np.any(size.q, axis=0) | np.any(size.d, axis=0)
@@ -467,7 +476,7 @@ def remembered_of(
     return memories
 
 
-def instants(hearing: Hearing, clock: Clock) -> list[Fraction]:
+def instants(hearing: PerTickReception, clock: Clock) -> list[Fraction]:
     """Return when a clock ticks in a frame, in seconds."""
     phase, period = hearing.timings[clock.phase], hearing.timings[clock.period]
     return [phase % period + number * period for number in range(int(hearing.frame / period))]

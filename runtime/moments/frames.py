@@ -23,23 +23,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem, Link
+from apc.compiler.compiled import Link, Model
 from apc.eigen.matrix_norms import balance
 from apc.eigen.modes import dense_loop
 from apc.eigen.relative import Relative, relative_coordinates
 from apc.frame.exchange import arcs
 from apc.frame.radius import value_of
-from apc.moments.crowd import Hearing, remembered_of, standing_motions
+from apc.moments.crowd import PerTickReception, remembered_of, standing_motions
 from apc.moments.mean_loops import Listened, mean_loop, standing_state
 from apc.moments.stand_in import receivers_of
 from apc.network.channel import ChannelLaw, channel_law
-from apc.unserved import UnservedError
+from apc.unserved import NotSupportedError
 
 Floats = NDArray[np.float64]
 
 # A channel: who hears whom, and which of the scene's links and delays it is of.
-Arc = tuple[int, int, int]
-Arcs = tuple[Arc, ...]
+LossChannel = tuple[int, int, int]
+Arcs = tuple[LossChannel, ...]
 
 # What the frame of a motion that stands still may be off by, in floats.
 STANDING = 1e-12
@@ -72,12 +72,12 @@ class LossyFrame:
         return len(self.offsets) - 1
 
 
-def refuse_unheld(system: CompiledSystem, hearing: Hearing) -> None:
+def refuse_unheld(system: Model, hearing: PerTickReception) -> None:
     """Refuse a scene whose receivers don't just hold what they heard last, one packet a frame.
 
     Raises
     ------
-    UnservedError
+    NotSupportedError
         Which link is in the way, and by what.
     """
     rows = [row for listed in hearing.rows.values() for row in listed]
@@ -86,17 +86,17 @@ def refuse_unheld(system: CompiledSystem, hearing: Hearing) -> None:
         if (channel := link.channel) is None:
             continue
         if channel.trace is not None:
-            raise UnservedError(f"{link.name} plays a trace")
+            raise NotSupportedError(f"{link.name} plays a trace")
         if channel.jitter is not None:
-            raise UnservedError(f"{link.name} has jitter")
+            raise NotSupportedError(f"{link.name} has jitter")
         if channel.on_loss != "hold":
             what = f"takes no difference where a packet is missed (on_loss: {channel.on_loss})"
-            raise UnservedError(f"{link.name} {what}")
+            raise NotSupportedError(f"{link.name} {what}")
         if hearing.timings[clocks[link.clock].period] < hearing.frame:
             what = f"more than one packet in a frame of {float(hearing.frame):g} s"
-            raise UnservedError(f"{link.name} sends {what}")
+            raise NotSupportedError(f"{link.name} sends {what}")
         if not {row.way.operator for row in rows if row.way.link == link.name} <= {"mean", "sum"}:
-            raise UnservedError(f"more than means and sums are taken over {link.name}")
+            raise NotSupportedError(f"more than means and sums are taken over {link.name}")
 
 
 def channels_of(link: Link, peers: int) -> int:
@@ -104,7 +104,7 @@ def channels_of(link: Link, peers: int) -> int:
     return peers * (peers - 1) if link.graph.shape == "complete" else len(arcs(link.graph, peers)[0])
 
 
-def held_frame(system: CompiledSystem, hearing: Hearing, *, alike: bool = False) -> LossyFrame:
+def held_frame(system: Model, hearing: PerTickReception, *, alike: bool = False) -> LossyFrame:
     """Return the frame of peers whose receivers hold what they heard last.
 
     Parameters
@@ -117,7 +117,7 @@ def held_frame(system: CompiledSystem, hearing: Hearing, *, alike: bool = False)
     loop = dense_loop(hearing.groups, hearing.exchange)
     memories = remembered_of(system, hearing, loop)
     links = {link.name: link for link in system.links}
-    listened, ways, laws = list[Listened](), list[Arc](), list[ChannelLaw]()
+    listened, ways, laws = list[Listened](), list[LossChannel](), list[ChannelLaw]()
     for number, memory in enumerate(memory for memory in memories if any(memory.sizes)):
         routes = [way for way in loop.coupling if (way.link, way.delay) == memory.route]
         for g, h in itertools.product(range(len(loop.sites)), repeat=2):
@@ -136,7 +136,7 @@ def held_frame(system: CompiledSystem, hearing: Hearing, *, alike: bool = False)
     for c, (channel, (_, sender, _), listen) in enumerate(zip(means.channels, ways, listened, strict=True)):
         missed = value_of(means.misses[sender, listen.route, 0])
         if missed[:, luck].any():
-            raise UnservedError("a packet follows from another one of its frame")
+            raise NotSupportedError("a packet follows from another one of its frame")
         missed = missed + value_of(channel.misses[0])
         enters[c, :, : len(channel.luck)] = -matrix[rest][:, list(channel.luck)]
         misses[c, : len(channel.luck)] = missed[:, rest]
@@ -150,7 +150,7 @@ def held_frame(system: CompiledSystem, hearing: Hearing, *, alike: bool = False)
     return _projected(mean, terms, enters, misses, ways, laws, offsets, held, basis, alike)
 
 
-def stand_in_frame(system: CompiledSystem, hearing: Hearing, most: int, *, alike: bool = False) -> LossyFrame:
+def stand_in_frame(system: Model, hearing: PerTickReception, most: int, *, alike: bool = False) -> LossyFrame:
     """Return the frame of peers whose own values stand in for missing ones.
 
     Parameters
@@ -167,7 +167,7 @@ def stand_in_frame(system: CompiledSystem, hearing: Hearing, most: int, *, alike
     heard = [np.flatnonzero(receiver.heard.any(axis=0)).tolist() for receiver in receivers]
     ways = [(h, g, 0) for h, senders in enumerate(heard) for g in senders]
     if len(ways) > most:
-        raise UnservedError(
+        raise NotSupportedError(
             f"bursts of values that stand in on {len(ways)} ways: {most} are the most that are followed"
         )
     n = offsets[-1]
@@ -207,7 +207,7 @@ def _projected(
     terms: tuple[Arcs, ...],
     enters: Floats,
     misses: Floats,
-    ways: Sequence[Arc],
+    ways: Sequence[LossChannel],
     laws: Sequence[ChannelLaw],
     offsets: Sequence[int],
     held: tuple[range, ...],

@@ -1,8 +1,8 @@
 """The loops that the mean of all peers moves by, and what one channel's luck does to them.
 
 Takes: the loops of a scene whose ticks each hear by themselves, and what channels remember.
-Gives: `Remembered`, `remember`; `Site`, `with_memory`, `standing_state`; `Listened`, `Heard`, `MeanLoop`,
-`mean_loop`.
+Gives: `RouteMemory`, `remember`; `MeanSubsystem`, `with_memory`, `standing_state`; `Listened`,
+`ReceptionChannel`, `MeanLoop`, `mean_loop`.
 Guarantees: each matrix comes with the radius of its rounding, those of the sites' frames included; rigid
 motions are taken out, which no luck moves.
 Does not: compute second moments (see `gains`).
@@ -26,16 +26,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.errors import ApcError, Mistake, Place
-from apc.eigen.closing import Feedback, Loop, StateLayout, bounded_weight, close
-from apc.eigen.peers import PeerGroup
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
+from apc.eigen.closing import InterconnectionMatrices, ModalSystem, StateLayout, bounded_weight, close
+from apc.eigen.peers import PeerClass
 from apc.eigen.relative import Relative, relative_coordinates, relative_rows, with_doubt
 from apc.frame.discretize import TOO_LARGE
 from apc.frame.lift import FrameMap
 from apc.frame.radius import UNIT, radius_of, value_of
-from apc.frame.schedule import Selected, Sent, Way
+from apc.frame.schedule import CouplingTerm, SentSample, UncertainSample
 from apc.frame.taylor import arithmetic_of, entrywise, hull, over_as_many
-from apc.moments.packet_memory import Memory
+from apc.moments.packet_memory import ReceiverMemory
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
@@ -49,7 +49,7 @@ FINEST = (10**6, 10**4, 100)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Remembered:
+class RouteMemory:
     """What is remembered of a link's packets with one delay: of each of its `channels` the same.
 
     `after` holds each value once all packets are sent, over [values kept, packets sent, luck]; `misses`, for
@@ -57,7 +57,7 @@ class Remembered:
     """
 
     route: Route
-    memory: Memory
+    memory: ReceiverMemory
     channels: tuple[str, ...]
     after: Matrix
     misses: tuple[Matrix, ...]
@@ -87,11 +87,11 @@ class Listened:
 
     site: int
     route: Route
-    weights: Mapping[Way, Fraction]
+    weights: Mapping[CouplingTerm, Fraction]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Heard:
+class ReceptionChannel:
     """A channel in a loop: where in the state what it keeps is, and its luck ξ, drawn as a frame begins.
 
     `misses` say, slot by slot, what it adds itself to how far its uncertain values are from what is sent.
@@ -112,13 +112,13 @@ class MeanLoop:
     """
 
     matrix: Matrix
-    channels: tuple[Heard, ...]
+    channels: tuple[ReceptionChannel, ...]
     at: Relative
     offsets: tuple[int, ...]
     misses: Mapping[tuple[int, Route, int], Matrix]
 
 
-def remember(route: Route, memory: Memory, channels: Sequence[str]) -> Remembered:
+def remember(route: Route, memory: ReceiverMemory, channels: Sequence[str]) -> RouteMemory:
     """Follow what is remembered on a route through a frame."""
     count, slots = memory.count, memory.slots
     sizes = [len(memory.uncertain(slot)) for slot in range(slots)]
@@ -141,11 +141,11 @@ def remember(route: Route, memory: Memory, channels: Sequence[str]) -> Remembere
         after[:, uncertain, count + slot] = chance
         after[0, uncertain, first + np.arange(size)] = 1.0
         first += size
-    return Remembered(route, memory, tuple(channels), after, tuple(misses))
+    return RouteMemory(route, memory, tuple(channels), after, tuple(misses))
 
 
 @dataclass(frozen=True, slots=True)
-class Site:
+class MeanSubsystem:
     """A site with what its receivers remember of it on the mean: its map, whose s holds three kinds of rows.
 
     `values` says which row is a value that ticks hear, by route, channel and value; `misses` are those of how
@@ -155,7 +155,7 @@ class Site:
     map: FrameMap
     values: Mapping[tuple[Route, str, int], int]
     misses: Mapping[tuple[Route, int], slice]
-    sent: Mapping[Sent, int]
+    sent: Mapping[SentSample, int]
 
     @property
     def states(self) -> int:
@@ -163,7 +163,9 @@ class Site:
         return int(self.map.p.shape[-1])
 
 
-def with_memory(group: PeerGroup, remembered: Sequence[Remembered], frame: FrameMap | None = None) -> Site:
+def with_memory(
+    group: PeerClass, remembered: Sequence[RouteMemory], frame: FrameMap | None = None
+) -> MeanSubsystem:
     """Return a site whose state holds what its receivers remember of it on the mean.
 
     Parameters
@@ -180,7 +182,7 @@ def with_memory(group: PeerGroup, remembered: Sequence[Remembered], frame: Frame
         (item, channel)
         for item in remembered
         for channel in item.channels
-        if Sent(item.route[0], channel, 0) in row_of
+        if SentSample(item.route[0], channel, 0) in row_of
     ]
     counts = [remembered.memory.count for remembered, _ in numbers]
     firsts, n_m, n_s = np.cumsum([0, *counts]), sum(counts), len(row_of)
@@ -191,7 +193,7 @@ def with_memory(group: PeerGroup, remembered: Sequence[Remembered], frame: Frame
         values = np.zeros((len(block), block.shape[-2], n_m + n_s))
         values[..., firsts[place] : firsts[place + 1]] = block[..., : remembered.memory.count]
         for slot in range(remembered.memory.slots):
-            values[..., n_m + row_of[Sent(remembered.route[0], channel, slot)]] = block[
+            values[..., n_m + row_of[SentSample(remembered.route[0], channel, slot)]] = block[
                 ..., remembered.memory.count + slot
             ]
         return values
@@ -229,14 +231,14 @@ def with_memory(group: PeerGroup, remembered: Sequence[Remembered], frame: Frame
     q = np.concatenate([plain.q, multiply(keeping[..., n_m:], plain.d)], axis=-2)
     s = np.concatenate([multiply(listed[..., n_m:], plain.s), listed[..., :n_m]], axis=-1)
     d = multiply(listed[..., n_m:], plain.d)
-    sent: dict[Sent, int] = {sent: count + row for sent, row in row_of.items()}
-    return Site(FrameMap(p, q, s, d), values, misses, sent)
+    sent: dict[SentSample, int] = {sent: count + row for sent, row in row_of.items()}
+    return MeanSubsystem(FrameMap(p, q, s, d), values, misses, sent)
 
 
 def mean_loop(
-    loop: Loop,
-    heard: Sequence[Sequence[Selected]],
-    remembered: Sequence[Remembered],
+    loop: ModalSystem,
+    heard: Sequence[Sequence[UncertainSample]],
+    remembered: Sequence[RouteMemory],
     listened: Sequence[Listened],
     standing: Floats,
     frames: Mapping[str, FrameMap] | None = None,
@@ -266,7 +268,7 @@ def mean_loop(
     layout = StateLayout(tuple(offsets[:-1]), ("",) * offsets[-1], {})
     values = [of_route[item.route].memorized(of_route[item.route].after) for item in listened]
     firsts = np.cumsum([offsets[-1]] + [value.shape[-1] for value in values]).tolist()
-    feedback, like, numbers = list[Feedback](), sites[0].map.p, arithmetic_of(sites[0].map.p)
+    feedback, like, numbers = list[InterconnectionMatrices](), sites[0].map.p, arithmetic_of(sites[0].map.p)
     for g, rows in enumerate(heard):
         now, before = (np.zeros((len(like), len(rows), many)) for many in (starts[-1], firsts[-1]))
         for line, row in enumerate(rows):
@@ -284,7 +286,7 @@ def mean_loop(
                     by = np.array(bounded_weight(channel.weights[row.way], 0.0)).reshape(2, 1, 1)
                     weighed = entrywise(own[:, place, None], by)
                     before[:, line, first : first + own.shape[-1]] = over_as_many(weighed, like)[:, 0]
-        feedback.append(Feedback(now, before))
+        feedback.append(InterconnectionMatrices(now, before))
     closed = close([site.map for site in sites], feedback, layout, numbers=numbers)
     at = relative_coordinates(standing_state(closed.matrix[..., : offsets[-1]], standing, loop, offsets))
     rest, n = at.rest, len(at.rest)
@@ -306,7 +308,9 @@ def mean_loop(
             wide = np.zeros((len(like), memorized.shape[-2], len(columns)))
             wide[..., start:end] = over_as_many(memorized, like)
             misses.append(wide)
-        channels.append(Heard(range(start, start + len(kept)), range(start + len(kept), end), tuple(misses)))
+        channels.append(
+            ReceptionChannel(range(start, start + len(kept)), range(start + len(kept), end), tuple(misses))
+        )
         start = end
     missed = {
         (h, *which): closed.sent[:, starts[h] + rows.start : starts[h] + rows.stop][..., columns]
@@ -316,7 +320,7 @@ def mean_loop(
     return MeanLoop(matrix, tuple(channels), at, tuple(offsets), missed)
 
 
-def standing_state(matrix: Matrix, standing: Floats, loop: Loop, offsets: Sequence[int]) -> Floats:
+def standing_state(matrix: Matrix, standing: Floats, loop: ModalSystem, offsets: Sequence[int]) -> Floats:
     """Return rigid motions with what is remembered of them: whatever stands still is heard as it is sent.
 
     Of rational weights, it is made of small fractions; which of them, the matrix tells.
@@ -344,4 +348,4 @@ def standing_state(matrix: Matrix, standing: Floats, loop: Loop, offsets: Sequen
         off = hull(numbers.subtract(numbers.multiply(matrix, numbers.exact(basis)), numbers.exact(basis)))
         if (np.abs(value_of(off)) <= radius_of(off)).all():
             return basis
-    raise ApcError(Mistake("E806", Place("the scene"), TOO_LARGE))
+    raise ApcError(Diagnostic("E806", SourceLocation("the scene"), TOO_LARGE))

@@ -1,6 +1,6 @@
 """Proof that a scene is stable in mean square, over the network that it has, for all values in a box.
 
-Takes: a `CompiledSystem` whose links lose or delay packets independently of each other, and ranges.
+Takes: a `Model` whose links lose or delay packets independently of each other, and ranges.
 Gives: `prove_box`.
 Guarantees: stable means proved for every point of the box, unstable proved at the point that is named; what
 can't be had is refused by name.
@@ -25,12 +25,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.box import open_sites
-from apc.analysis.box_proof import TOGETHER, UNDECIDED, BoxProof, Looked, middle, search_box
-from apc.analysis.cells import Cell, OpenFrames, frames_over, open_frames
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.analysis.box_proof import TOGETHER, UNDECIDED, CellVerdict, RobustStability, middle, search_box
+from apc.analysis.cells import Cell, ParametricFrames, frames_over, open_frames
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.timings import part
-from apc.eigen.closing import Loop, without_packets
+from apc.eigen.closing import ModalSystem, without_packets
 from apc.eigen.rigid import stays_rigid
 from apc.frame.instance import Prepared, prepare
 from apc.frame.lift import FrameMap
@@ -40,7 +40,7 @@ from apc.frame.parameters import resolve
 from apc.frame.radius import UNIT
 from apc.frame.taylor import hull, within
 from apc.moments.crowd import Classes, build_hearing, classes_of, moments_of, peer_classes, remembered_of
-from apc.moments.mean_loops import Remembered
+from apc.moments.mean_loops import RouteMemory
 from apc.moments.network_verdict import STABLE, UNSTABLE, growth
 from apc.moments.operator import dies_out
 from apc.moments.packet_memory import is_memoryless
@@ -50,7 +50,7 @@ from apc.threads import single_threaded
 
 Matrix = NDArray[Any]
 
-PLACE = Place("box")
+PLACE = SourceLocation("box")
 
 # What a cell takes, in cells in balls.
 WORK = 0.5
@@ -60,19 +60,19 @@ WORK = 0.5
 class _Question:
     """A scene with ranges of what its peers are made of, `own`, and of what links lose."""
 
-    system: CompiledSystem
+    system: Model
     prepared: Prepared
     ranges: tuple[Range, ...]
     own: tuple[int, ...]  # places of the ranges that are no link's
     classes: Classes
-    frames: OpenFrames  # of all groups of peers
+    frames: ParametricFrames  # of all groups of peers
     places: Mapping[str, int]  # which of these each site of a loop is, by its name
-    wide: Loop  # of all classes, its maps those of the whole box
-    memories: Sequence[Remembered]
+    wide: ModalSystem  # of all classes, its maps those of the whole box
+    memories: Sequence[RouteMemory]
 
 
 @part("box")
-def prove_box(system: CompiledSystem, ranges: Sequence[Range], *, cells: int | None = None) -> BoxProof:
+def prove_box(system: Model, ranges: Sequence[Range], *, cells: int | None = None) -> RobustStability:
     """Prove a scene stable in mean square in a whole box, or find a point of it where it is not.
 
     Parameters
@@ -95,19 +95,19 @@ def prove_box(system: CompiledSystem, ranges: Sequence[Range], *, cells: int | N
             bare = without_packets(loop)
             if not stays_rigid(bare, [asked.frames.sites[asked.places[site.name]] for site in bare.sites]):
                 note = f"{loop.name} moves freely in a direction that changes with the parameters"
-                return BoxProof(system.name, tuple(ranges), UNDECIDED, None, 0, 1.0, (), (note,))
+                return RobustStability(system.name, tuple(ranges), UNDECIDED, None, 0, 1.0, (), (note,))
         is_unstable = partial(_is_unstable, asked)
         looks = partial(_looked, asked), is_unstable
         return search_box(system.name, ranges, *looks, stable=STABLE, unstable=UNSTABLE, cells=cells)
 
 
-def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question:
+def _question(system: Model, ranges: Sequence[Range]) -> _Question:
     """Leave parameters open, and see how wide each may be about the middle of the box."""
     numbers = channel_numbers(system)
     own = tuple(place for place, interval in enumerate(ranges) if interval.free.name not in numbers)
     prepared = prepare(system)
 
-    def lifted(changed: CompiledSystem) -> Any:
+    def lifted(changed: Model) -> Any:
         result = build_hearing(changed, prepared)
         return result.groups, result.exchange
 
@@ -137,7 +137,7 @@ def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question:
     return _Question(system, prepared, tuple(ranges), own, classes, frames, places, wide, memories)
 
 
-def _refuse(system: CompiledSystem, prepared: Prepared, interval: Range) -> None:
+def _refuse(system: Model, prepared: Prepared, interval: Range) -> None:
     """Refuse a network that a box is not proved over, and a range that is more than a share lost."""
     what = ""
     for link, law in unreliable(system):
@@ -156,12 +156,12 @@ def _refuse(system: CompiledSystem, prepared: Prepared, interval: Range) -> None
     if what or why:
         text = f"no box is proved in mean square over {what}" if what else f"no box is proved: {why}"
         hint = f"apc critical {interval.free.label} --in mean-square"
-        raise ApcError(Mistake("E898", PLACE, text, hint=hint))
+        raise ApcError(Diagnostic("E898", PLACE, text, hint=hint))
 
 
 def _changed(
-    system: CompiledSystem, ranges: Sequence[Range], point: Sequence[Fraction], places: Sequence[int] = ()
-) -> CompiledSystem:
+    system: Model, ranges: Sequence[Range], point: Sequence[Fraction], places: Sequence[int] = ()
+) -> Model:
     """Return the scene at a point of the box, or with some of its numbers."""
     chosen = places or range(len(ranges))
     return apply(system, [Override(ranges[place].free, point[place]) for place in chosen])
@@ -176,7 +176,7 @@ def _is_unstable(asked: _Question, point: Sequence[Fraction]) -> bool:
     return result.proved and result.stable is False
 
 
-def _looked(asked: _Question, cells: Sequence[Cell]) -> Iterator[Looked]:
+def _looked(asked: _Question, cells: Sequence[Cell]) -> Iterator[CellVerdict]:
     """Look at cells, their frames lifted many at a time, until one is found unstable."""
     widths = np.array([float(interval.high - interval.low) for interval in asked.ranges])
     for start in range(0, len(cells), TOGETHER):
@@ -186,7 +186,9 @@ def _looked(asked: _Question, cells: Sequence[Cell]) -> Iterator[Looked]:
             lifted = [frame_map.mapped(partial(_of_cell, place, len(cell))) for frame_map in maps]
             proved, sound = _proved(asked, cell, lifted)
             reach = np.array([float(high - low) for low, high in cell]) / widths
-            yield Looked(None if proved else reach, not sound and _is_unstable(asked, middle(cell)), WORK)
+            yield CellVerdict(
+                None if proved else reach, not sound and _is_unstable(asked, middle(cell)), WORK
+            )
 
 
 def _of_cell(place: int, count: int, block: Matrix) -> Matrix:
@@ -204,7 +206,7 @@ def _proved(asked: _Question, cell: Cell, lifted: Sequence[FrameMap]) -> tuple[b
     return dies_out(of.operator)
 
 
-def _memories(asked: _Question, cell: Cell) -> Sequence[Remembered]:
+def _memories(asked: _Question, cell: Cell) -> Sequence[RouteMemory]:
     """Return what is remembered on each route, for all shares lost in a cell."""
     shares = [place for place in range(len(cell)) if place not in asked.own]
     if not shares:

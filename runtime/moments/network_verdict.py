@@ -1,7 +1,7 @@
 """Is a scene stable in mean square over the network that it has, lost and late packets included.
 
-Takes: a `CompiledSystem` whose links say loss, jitter or a trace.
-Gives: `NetworkVerdict`, `judge_network`; `Growth`, `growth`; `unreliable`.
+Takes: a `Model` whose links say loss, jitter or a trace.
+Gives: `MeanSquareStability`, `judge_network`; `StabilityMeasure`, `growth`; `unreliable`.
 Guarantees: a network that can't be judged is not: a note says by name why.
 Does not: look at the nominal network (see `analysis`).
 """
@@ -17,26 +17,26 @@ import numpy as np
 
 from apc.analysis.elements import is_linear
 from apc.analysis.sides import severity, sides
-from apc.compiler.compiled import CompiledSystem, Link
+from apc.compiler.compiled import Link, Model
 from apc.compiler.multiples import common_multiple
 from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, prepare
 from apc.frame.parameters import resolve
-from apc.moments.almost_sure import AlmostSure, almost_sure
+from apc.moments.almost_sure import TopLyapunovExponent, almost_sure
 from apc.moments.bursts import tagged_error, tagged_radius
 from apc.moments.copies_apart import forced, moments_error
-from apc.moments.crowd import Hearing, Moments, build_hearing, crowd, peer_classes
+from apc.moments.crowd import Moments, PerTickReception, build_hearing, crowd, peer_classes
 from apc.moments.frames import LossyFrame, channels_of, held_frame, refuse_unheld, stand_in_frame
 from apc.moments.operator import enclosed
 from apc.moments.packet_memory import is_memoryless
 from apc.moments.stand_in import stand_in
 from apc.moments.traces import trace_radius
-from apc.moments.worst import LossesInARow, worst_case
+from apc.moments.worst import ConsecutiveLosses, worst_case
 from apc.network.channel import LATEST, ChannelLaw
 from apc.network.nominal import unreliable
 from apc.result import Result
 from apc.threads import single_threaded
-from apc.unserved import UnservedError
+from apc.unserved import NotSupportedError
 
 STABLE = "stable in mean square"
 UNSTABLE = "unstable in mean square"
@@ -78,7 +78,7 @@ EARLIEST = {"uniform": 1.0, "normal": LATEST["normal"], "pareto": 2 / 3}
 
 
 @dataclass(frozen=True, slots=True)
-class NetworkVerdict(Result):
+class MeanSquareStability(Result):
     """What becomes of a scene whose packets get lost or come late by chance.
 
     `mean_square_radius` is what second moments grow by in a frame, right to `error`; its root compares with
@@ -98,14 +98,14 @@ class NetworkVerdict(Result):
     exact: bool
     proof: str
     rms_error_m: float | None
-    almost_sure: AlmostSure | None
-    losses_in_a_row: LossesInARow | None
+    almost_sure: TopLyapunovExponent | None
+    losses_in_a_row: ConsecutiveLosses | None
     linearized: bool
     notes: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class Growth:
+class StabilityMeasure:
     """One number, below 1 where a scene is stable, with bounds; an estimate where `exact` is False.
 
     Of a lossy network it is what second moments grow by in a frame, of passive hands what they can draw.
@@ -131,7 +131,7 @@ class Growth:
 
 
 @np.errstate(all="ignore")
-def growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool = True) -> Growth:
+def growth(system: Model, prepared: Prepared, *, bounded: bool = True) -> StabilityMeasure:
     """Return what second moments grow by in a frame, common translations left out.
 
     Parameters
@@ -143,12 +143,12 @@ def growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool = True) 
     """
     try:
         each = [_growth(side.system, side.prepared, bounded) for side in sides(system, prepared)]
-    except UnservedError as why:
-        return Growth(np.nan, 0.0, np.inf, False, str(why))
+    except NotSupportedError as why:
+        return StabilityMeasure(np.nan, 0.0, np.inf, False, str(why))
     return worst_growth(each)
 
 
-def worst_growth(each: Sequence[Growth]) -> Growth:
+def worst_growth(each: Sequence[StabilityMeasure]) -> StabilityMeasure:
     """Return the largest of several numbers, all of which have to be below 1."""
     largest = max(each, key=lambda growth: math.inf if math.isnan(growth.radius) else growth.radius)
     return replace(
@@ -160,11 +160,11 @@ def worst_growth(each: Sequence[Growth]) -> Growth:
     )
 
 
-def _growth(system: CompiledSystem, prepared: Prepared, bounded: bool) -> Growth:
+def _growth(system: Model, prepared: Prepared, bounded: bool) -> StabilityMeasure:
     """Return `growth`, or raise why there is none."""
     lossy = unreliable(system)
     if why := _unserved(system, lossy):
-        raise UnservedError(why)
+        raise NotSupportedError(why)
     if any(law.trace is not None for _, law in lossy):
         return _over_trace(system, prepared)
     holding = {link.channel.on_loss == "hold" for link, law in lossy if link.channel and law.mean_loss}
@@ -172,7 +172,9 @@ def _growth(system: CompiledSystem, prepared: Prepared, bounded: bool) -> Growth
     if memoryless and holding <= {True}:
         return _by_gain(system, prepared, None, bounded=bounded)
     if any(law.jitter for _, law in lossy):
-        raise UnservedError("jitter beside losses of another link that come in bursts or with on_loss: zero")
+        raise NotSupportedError(
+            "jitter beside losses of another link that come in bursts or with on_loss: zero"
+        )
     if holding == {True}:
         return _by_tags(system, prepared, None)
     first = _due(system, lossy)
@@ -181,22 +183,22 @@ def _growth(system: CompiledSystem, prepared: Prepared, bounded: bool) -> Growth
     return _by_tags(system, prepared, first)
 
 
-def _over_trace(system: CompiledSystem, prepared: Prepared) -> Growth:
+def _over_trace(system: Model, prepared: Prepared) -> StabilityMeasure:
     """Return what second moments grow by over recorded delays."""
     result = trace_radius(system, prepared)
 
     def errors() -> tuple[float, str]:
-        raise UnservedError("it is not worked out over recorded delays")
+        raise NotSupportedError("it is not worked out over recorded delays")
 
     radius, low, high = result.radius**2, result.low**2 * (1 - ROUNDED), result.high**2 * (1 + ROUNDED)
     if low > 1 or high < 1 or high - low < LOOSE:
-        return Growth(min(max(radius, low), high), low, high, True, proved=True, errors=errors)
+        return StabilityMeasure(min(max(radius, low), high), low, high, True, proved=True, errors=errors)
     doubt = max(DOUBTS * 2 * result.radius * result.doubt, LOOSE)
     note = f"an estimate: bounds on the roundings of {result.frames:,} frames leave it open"
-    return Growth(radius, max(radius - doubt, 0.0), radius + doubt, False, note=note, errors=errors)
+    return StabilityMeasure(radius, max(radius - doubt, 0.0), radius + doubt, False, note=note, errors=errors)
 
 
-def _by_gain(system: CompiledSystem, prepared: Prepared, first: Fraction | None, *, bounded: bool) -> Growth:
+def _by_gain(system: Model, prepared: Prepared, first: Fraction | None, *, bounded: bool) -> StabilityMeasure:
     """Return what second moments grow by where packets are lost or late one by one.
 
     Parameters
@@ -209,7 +211,7 @@ def _by_gain(system: CompiledSystem, prepared: Prepared, first: Fraction | None,
     """
     hearing = build_hearing(system, prepared, first=first or Fraction(0), stand_in=first is not None)
 
-    def moments(hearing: Hearing) -> Moments:
+    def moments(hearing: PerTickReception) -> Moments:
         return crowd(system, hearing) if first is None else stand_in(system, hearing)
 
     def errors() -> tuple[float, str]:
@@ -219,7 +221,7 @@ def _by_gain(system: CompiledSystem, prepared: Prepared, first: Fraction | None,
 
     of = moments(hearing)
     if of.entries * of.states**3 > MOST_WORK:
-        raise UnservedError(
+        raise NotSupportedError(
             f"{of.entries:,} covariances of random losses and delays that drive loops of {of.states} states "
             "would take minutes: fewer ticks at which a packet may arrive, a shorter delay, or fewer peers "
             "that differ"
@@ -228,10 +230,12 @@ def _by_gain(system: CompiledSystem, prepared: Prepared, first: Fraction | None,
     # Of many peers whose values stand in, the nodes of a quadrature are rounded.
     proved = first is None or system.peers <= ENUMERATED
     quick = proved if first is not None else of.entries * of.states**3 <= QUICK
-    return Growth(inner.radius, inner.low, inner.high, True, proved=proved, quick=quick, errors=errors)
+    return StabilityMeasure(
+        inner.radius, inner.low, inner.high, True, proved=proved, quick=quick, errors=errors
+    )
 
 
-def _by_tags(system: CompiledSystem, prepared: Prepared, first: Fraction | None) -> Growth:
+def _by_tags(system: Model, prepared: Prepared, first: Fraction | None) -> StabilityMeasure:
     """Return what second moments grow by where losses come in bursts.
 
     Parameters
@@ -250,10 +254,10 @@ def _by_tags(system: CompiledSystem, prepared: Prepared, first: Fraction | None)
         alike = alike and len(links) == 1 and system.peers <= MOST_TAGGED
         if not alike and channels > MOST_CHANNELS:
             what = f"followed are {MOST_CHANNELS}, or {MOST_TAGGED} equal peers that hold what they miss"
-            raise UnservedError(f"bursts on {channels} ways: {what}")
+            raise NotSupportedError(f"bursts on {channels} ways: {what}")
     orders = (channels,) if system.peers <= EXACTLY_TAGGED or channels <= MOST_CHANNELS else ORDERS
 
-    def frame(hearing: Hearing) -> LossyFrame:
+    def frame(hearing: PerTickReception) -> LossyFrame:
         if first is None:
             return held_frame(system, hearing, alike=alike)
         return stand_in_frame(system, hearing, MOST_CHANNELS, alike=alike)
@@ -267,13 +271,13 @@ def _by_tags(system: CompiledSystem, prepared: Prepared, first: Fraction | None)
     whole = frame(hearing)
     rough, *more = (tagged_radius(whole, order) for order in orders)
     if not more:
-        return Growth(rough, rough * (1 - ITERATED), rough * (1 + ITERATED), True, errors=errors)
+        return StabilityMeasure(rough, rough * (1 - ITERATED), rough * (1 + ITERATED), True, errors=errors)
     off = abs(more[0] - rough)
     note = f"{ESTIMATE} the radius is {rough:.9g}"
-    return Growth(more[0], more[0] - off, more[0] + off, False, note=note, errors=errors)
+    return StabilityMeasure(more[0], more[0] - off, more[0] + off, False, note=note, errors=errors)
 
 
-def _unserved(system: CompiledSystem, lossy: Sequence[tuple[Link, ChannelLaw]]) -> str:
+def _unserved(system: Model, lossy: Sequence[tuple[Link, ChannelLaw]]) -> str:
     """Return what of the scene can't be judged, "" if all can."""
     if why := next((why for link, _ in lossy if (why := _asked_of_packets(system, link))), ""):
         return why
@@ -304,7 +308,7 @@ def _unserved(system: CompiledSystem, lossy: Sequence[tuple[Link, ChannelLaw]]) 
     return ""
 
 
-def _asked_of_packets(system: CompiledSystem, link: Link) -> str:
+def _asked_of_packets(system: Model, link: Link) -> str:
     """Return what a scene asks of packets over a link beside what is in them, "" if nothing."""
     receives = [
         receive
@@ -320,7 +324,7 @@ def _asked_of_packets(system: CompiledSystem, link: Link) -> str:
     return ""
 
 
-def _overtakes(system: CompiledSystem, link: Link, law: ChannelLaw) -> bool:
+def _overtakes(system: Model, link: Link, law: ChannelLaw) -> bool:
     """Say whether a packet may arrive before one that was sent before it."""
     timings = resolve(system).timings
     period = next(timings[clock.period] for clock in system.clocks if clock.name == link.clock)
@@ -328,23 +332,23 @@ def _overtakes(system: CompiledSystem, link: Link, law: ChannelLaw) -> bool:
     return law.longest - least >= float(period)
 
 
-def _due(system: CompiledSystem, lossy: Sequence[tuple[Link, ChannelLaw]]) -> Fraction:
+def _due(system: Model, lossy: Sequence[tuple[Link, ChannelLaw]]) -> Fraction:
     """Return when in a frame packets are due, or raise why there is no one instant."""
     timings = resolve(system).timings
     clocks = {clock.name: clock for clock in system.clocks}
     if len(system.links) > 1 or system.links[0].delays:
-        raise UnservedError("values that stand in beside packets of another link or delay")
+        raise NotSupportedError("values that stand in beside packets of another link or delay")
     link = lossy[0][0]
     period, phase = timings[clocks[link.clock].period], timings[clocks[link.clock].phase]
     frame = common_multiple([timings[clock.period] for clock in system.clocks])
     if frame != period:
-        raise UnservedError(f"a frame of {float(frame) * 1e3:.6g} ms with several packets of {link.name}")
+        raise NotSupportedError(f"a frame of {float(frame) * 1e3:.6g} ms with several packets of {link.name}")
     return (phase + timings[link.delay]) % period
 
 
 def judge_network(
-    system: CompiledSystem, prepared: Prepared | None = None, *, certify: bool = False
-) -> NetworkVerdict | None:
+    system: Model, prepared: Prepared | None = None, *, certify: bool = False
+) -> MeanSquareStability | None:
     """Judge a scene over the network that it has, None where every packet takes its nominal delay.
 
     Parameters
@@ -368,7 +372,7 @@ def judge_network(
     )
 
 
-def _judge_network(system: CompiledSystem, prepared: Prepared, *, certify: bool) -> NetworkVerdict:
+def _judge_network(system: Model, prepared: Prepared, *, certify: bool) -> MeanSquareStability:
     """Judge a scene without kinks whose packets get lost or come late by chance."""
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         result = growth(system, prepared)
@@ -388,7 +392,7 @@ def _judge_network(system: CompiledSystem, prepared: Prepared, *, certify: bool)
         unmeasured and f"root mean square error of copies: {unmeasured}",
         worst.note if worst is not None else "",
     )
-    return NetworkVerdict(
+    return MeanSquareStability(
         topology=system.name,
         verdict=verdict_of(result),
         stable=result.stable if judged else None,
@@ -406,7 +410,7 @@ def _judge_network(system: CompiledSystem, prepared: Prepared, *, certify: bool)
     )
 
 
-def _rms_error(growth: Growth) -> tuple[float | None, str]:
+def _rms_error(growth: StabilityMeasure) -> tuple[float | None, str]:
     """Return the error of copies where second moments die out, and what there is to say of it."""
     if not growth.stable or growth.errors is None:
         return None, "" if growth.why else "only where second moments die out"
@@ -414,11 +418,11 @@ def _rms_error(growth: Growth) -> tuple[float | None, str]:
         return None, "rounding leaves its digits in doubt"
     try:
         return growth.errors()
-    except UnservedError as why:
+    except NotSupportedError as why:
         return None, str(why)
 
 
-def verdict_of(growth: Growth) -> str:
+def verdict_of(growth: StabilityMeasure) -> str:
     """Return the verdict in words."""
     if not np.isfinite(growth.radius):
         return NOT_JUDGED
@@ -426,11 +430,13 @@ def verdict_of(growth: Growth) -> str:
     return f"probably {verdict}" if not growth.exact and growth.stable is not None else verdict
 
 
-def _almost_sure(system: CompiledSystem, prepared: Prepared, growth: Growth) -> tuple[AlmostSure | None, str]:
+def _almost_sure(
+    system: Model, prepared: Prepared, growth: StabilityMeasure
+) -> tuple[TopLyapunovExponent | None, str]:
     """Return how a scene settles almost surely where mean squares leave it open, or why that is not told."""
     if growth.why or growth.stable:  # what settles in mean square settles almost surely
         return None, ""
     try:
         return almost_sure(system, prepared), ""
-    except UnservedError as why:
+    except NotSupportedError as why:
         return None, f"almost surely: {why}"

@@ -1,7 +1,8 @@
 """How second moments move in a frame by themselves and by luck: what they grow by, and the proof of it.
 
 Takes: the matrices that move motions, how luck enters them, and what luck follows from.
-Gives: `Block`, `Operator`; `Enclosed`, `enclosed`, `dies_out`, `settled`; `stein`; `mean_of`, `number_of`.
+Gives: `MomentBlock`, `Operator`; `Enclosed`, `enclosed`, `dies_out`, `settled`; `stein`; `mean_of`,
+`number_of`.
 Guarantees: a radius between `low` and `high` for every operator within the radii of its matrices.
 Does not: know where the matrices come from (see `crowd` and `stand_in`).
 
@@ -65,7 +66,7 @@ WEIGHT_ROUNDINGS = 18
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Block:
+class MomentBlock:
     """Some motions, and their luck: all matrices with their radii, or over a cell.
 
     Attributes
@@ -96,14 +97,14 @@ class Block:
 class Operator:
     """T: its blocks, and S (lucks, 2, p, p)."""
 
-    blocks: tuple[Block, ...]
+    blocks: tuple[MomentBlock, ...]
     spreads: Matrix
 
     @cached_property
     def floats(self) -> Operator:
         """The same in floats, without radii."""
         blocks = [
-            Block(
+            MomentBlock(
                 value_of(block.matrix),
                 value_of(block.into),
                 block.by,

@@ -1,7 +1,7 @@
 """What a receiver goes on with of one sender, when packets get lost or come late by chance.
 
 Takes: a channel's law whose packets are independent of each other, when packets are sent and ticks hear.
-Gives: `Memory`, `memory_of`; `arrives`, `is_memoryless`.
+Gives: `ReceiverMemory`, `memory_of`; `arrives`, `is_memoryless`.
 Guarantees: as few numbers from frame to frame as ticks still to come can differ in.
 Does not: know what is sent, or who hears it (see `mean_loops`); serve states that last (bursts), or a packet
 that is overtaken and counts all the same.
@@ -42,7 +42,7 @@ ROUNDED = 4e-16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Memory:
+class ReceiverMemory:
     """The values that ticks hear: of this frame, and of those to come, `old` and `chances` by value.
 
     Value e of those there are once all packets of a frame are sent was `old[e]` before it, one of `count`
@@ -140,7 +140,7 @@ def memory_of(
     *,
     strictly: bool = False,
     lost: tuple[float, ...] = (0.0,),
-) -> Memory:
+) -> ReceiverMemory:
     """Describe what ticks hear of one sender.
 
     Parameters
@@ -192,7 +192,7 @@ def memory_of(
     old = [known[key[slots:]] for key in listed]
     chances = np.array([key[:slots][::-1] for key in listed])
     doubt, *moves = (value / (1 - law.mean_loss) if value else 0.0 for value in lost)
-    return Memory(
+    return ReceiverMemory(
         old=np.array(old, np.intp),
         chances=chances,
         doubts=chances * (doubt * (1 + 8 * UNIT) + 4 * UNIT * sum(map(abs, moves))),

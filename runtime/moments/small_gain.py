@@ -22,14 +22,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.closing import Feedback, Loop, close, feedback_of, lay_out_loop
+from apc.eigen.closing import InterconnectionMatrices, ModalSystem, close, feedback_of, lay_out_loop
 from apc.eigen.dissipation import peak_gain, proves_gain
-from apc.eigen.peers import PeerGroup
+from apc.eigen.peers import PeerClass
 from apc.eigen.relative import Relative, relative, relative_coordinates, relative_rows, with_doubt
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.radius import RADII, UNIT, value_of
-from apc.frame.schedule import Heard, Way
-from apc.unserved import UnservedError
+from apc.frame.schedule import CouplingTerm, ReceivedSample
+from apc.unserved import NotSupportedError
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
@@ -70,7 +70,7 @@ class Response:
         return proves_gain(self.a, self.b, self.c, self.d, gain)
 
 
-def felt_rows(site: PeerGroup, link: str) -> list[tuple[int, Heard]]:
+def felt_rows(site: PeerClass, link: str) -> list[tuple[int, ReceivedSample]]:
     """Return the rows of r of a site that hear a link and that something follows from."""
     q, d = value_of(site.lifted.q), value_of(site.lifted.d)
     felt = np.any(q, axis=0) | np.any(d, axis=0)
@@ -79,7 +79,7 @@ def felt_rows(site: PeerGroup, link: str) -> list[tuple[int, Heard]]:
 
 
 def change_of_sent(
-    loop: Loop, off: Sequence[tuple[int, Mapping[int, int], float]], ratios: Ratios, sizes: Sizes
+    loop: ModalSystem, off: Sequence[tuple[int, Mapping[int, int], float]], ratios: Ratios, sizes: Sizes
 ) -> Response:
     """Return how what is sent changes from frame to frame, of errors in what is heard.
 
@@ -94,7 +94,7 @@ def change_of_sent(
     """
     layout = lay_out_loop(loop)
     if (n := len(layout.names)) > MOST_STATES:
-        raise UnservedError(f"peers make one system of {n:,} states, and {MOST_STATES} are the most")
+        raise NotSupportedError(f"peers make one system of {n:,} states, and {MOST_STATES} are the most")
 
     def size(site: int, link: str) -> float:
         """Return how far n peers of a site that move alike by 1 move together: √n, or as they are weighed."""
@@ -119,7 +119,7 @@ def change_of_sent(
             for line, late in lines.items() if site == g else ():
                 at = starts[place] + late - 1 if late else states + place
                 before[:, line, at] = share, 8 * UNIT * share
-        feedback.append(Feedback(hears.now, before))
+        feedback.append(InterconnectionMatrices(hears.now, before))
     closed = close([site.lifted for site in loop.sites], feedback, layout, numbers=RADII)
     senders = [
         (h, row, sent) for h, site in enumerate(loop.sites) for row, sent in enumerate(site.schedule.sent)
@@ -153,14 +153,14 @@ def change_of_sent(
     )
 
 
-def ratios_of(sites: Sequence[PeerGroup], lossy: frozenset[str]) -> Ratios:
+def ratios_of(sites: Sequence[PeerClass], lossy: frozenset[str]) -> Ratios:
     """Find the links of which every tick of every site combines all channels into the same number.
 
     Those of other links are kept apart. The first channel that counts has the ratio 1.
     """
     result: dict[tuple[str, str], Fraction] = {}
     for link in sorted(lossy):
-        columns: dict[str, dict[tuple[int, int, int, Way], Fraction]] = {}
+        columns: dict[str, dict[tuple[int, int, int, CouplingTerm], Fraction]] = {}
         for g, site in enumerate(sites):
             used = {(heard.way, heard.sent.channel) for _, heard in felt_rows(site, link)}
             for partition, tick in enumerate(site.exact.ticks):
@@ -188,7 +188,7 @@ def ratios_of(sites: Sequence[PeerGroup], lossy: frozenset[str]) -> Ratios:
     return result
 
 
-def weight_of(loops: Sequence[Loop], lossy: frozenset[str]) -> tuple[float, Sizes]:
+def weight_of(loops: Sequence[ModalSystem], lossy: frozenset[str]) -> tuple[float, Sizes]:
     """Return ‖|W|‖₂, rounded up, and the sizes of peers by which it is as small as can be.
 
     Notes

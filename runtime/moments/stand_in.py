@@ -27,25 +27,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem
-from apc.eigen.closing import Coupling, Feedback, Loop, StateLayout, close
+from apc.compiler.compiled import Model
+from apc.eigen.closing import Coupling, InterconnectionMatrices, ModalSystem, StateLayout, close
 from apc.eigen.relative import relative_coordinates, relative_rows, with_doubt
 from apc.frame.radius import RADII, UNIT, with_radius
-from apc.frame.schedule import Selected, Way
+from apc.frame.schedule import CouplingTerm, UncertainSample
 from apc.frame.taylor import entrywise
 from apc.moments.crowd import (
-    Apart,
-    Hearing,
+    MomentCoordinates,
     Moments,
-    Moving,
+    PeerVersusRest,
+    PerTickReception,
     classes_of,
     own_value,
     remembered_of,
 )
-from apc.moments.mean_loops import Remembered, Site, standing_state, with_memory
-from apc.moments.operator import Block, Operator, mean_of, number_of
+from apc.moments.mean_loops import MeanSubsystem, RouteMemory, standing_state, with_memory
+from apc.moments.operator import MomentBlock, Operator, mean_of, number_of
 from apc.network.channel import ChannelLaw, channel_law
-from apc.unserved import UnservedError
+from apc.unserved import NotSupportedError
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
@@ -98,7 +98,7 @@ def quadrature(n: int, lost: float, most: int) -> tuple[Floats, Floats]:
     return nodes, vectors[0] ** 2
 
 
-def stand_in(system: CompiledSystem, hearing: Hearing) -> Moments:
+def stand_in(system: Model, hearing: PerTickReception) -> Moments:
     """Return the loops and the luck of peers that put their own values in the place of missing ones.
 
     Parameters
@@ -127,8 +127,8 @@ def stand_in(system: CompiledSystem, hearing: Hearing) -> Moments:
         )
         inner = relative_rows(matrix[..., at.rest], bounded, RADII)
         listed = np.concatenate(seen), np.concatenate(shares, axis=-1)
-        blocks.append(Block(inner, into[None], (own,), *listed))
-        moving.append(Moving(apart, at, tuple(starts)))
+        blocks.append(MomentBlock(inner, into[None], (own,), *listed))
+        moving.append(MomentCoordinates(apart, at, tuple(starts)))
     everything = np.ones((len(sizes), width, width))
     entries = sum(size * (size + 1) // 2 for size in sizes)
     operator = Operator(tuple(blocks), with_radius(everything, np.zeros_like(everything)))
@@ -136,7 +136,7 @@ def stand_in(system: CompiledSystem, hearing: Hearing) -> Moments:
 
 
 def receivers_of(
-    system: CompiledSystem, hearing: Hearing, common: Loop, weights: Coupling
+    system: Model, hearing: PerTickReception, common: ModalSystem, weights: Coupling
 ) -> tuple[list[Receiver], list[int], ChannelLaw]:
     """Return how peers of each class move, where their states start, and the law of what they miss.
 
@@ -151,7 +151,7 @@ def receivers_of(
     """
     remembered = remembered_of(system, hearing, common, perfect=True)
     if len(remembered) != 1:
-        raise UnservedError("values that stand in beside what is heard over other links")
+        raise NotSupportedError("values that stand in beside what is heard over other links")
     (item,) = remembered
     link = next(link for link in system.links if link.name == item.route[0])
     law = channel_law(system, link, hearing.timings[item.route[1]])
@@ -178,7 +178,7 @@ def receivers_of(
         ]
         ways = math.prod(len(listed) for listed, _ in nodes)
         if ways > MOST_NODES:
-            raise UnservedError(
+            raise NotSupportedError(
                 f"values that stand in between different peers: a peer hears others in {ways:,} ways; "
                 f"{MOST_NODES:,} are the most that are followed"
             )
@@ -192,11 +192,11 @@ def receivers_of(
 
 
 def _receiver(
-    site: Site,
-    rows: Sequence[Selected],
-    remembered: Remembered,
+    site: MeanSubsystem,
+    rows: Sequence[UncertainSample],
+    remembered: RouteMemory,
     values: Sequence[Matrix],
-    weights: Mapping[Way, Sequence[Fraction]],
+    weights: Mapping[CouplingTerm, Sequence[Fraction]],
     others: Sequence[int],
     heard: Floats,
     weight: Floats,
@@ -236,7 +236,7 @@ def _receiver(
         value += remembered.channels.index(row.channel) * len(heard_now)
         before[:, :, line, np.array(ends[:-1]) + value] = own, UNIT * np.abs(own)
     layout = StateLayout((0,), ("",) * n, {})
-    moved = close([site.map], [Feedback(now, before)], layout, numbers=RADII).matrix
+    moved = close([site.map], [InterconnectionMatrices(now, before)], layout, numbers=RADII).matrix
     alone = moved[..., :n]
 
     heard_of = [
@@ -251,7 +251,7 @@ def _receiver(
     return Receiver(heard, weight, alone, mean, tuple(heard_of), tuple(shares))
 
 
-def _mean(receivers: Sequence[Receiver], apart: Apart, starts: Sequence[int]) -> Matrix:
+def _mean(receivers: Sequence[Receiver], apart: PeerVersusRest, starts: Sequence[int]) -> Matrix:
     """Return the matrix (2, n, n) that the means of a loop's sites move by."""
     spans, matrix = list(map(slice, starts, starts[1:])), np.zeros((2, starts[-1], starts[-1]))
     for place, g in enumerate(apart.of):
@@ -262,7 +262,7 @@ def _mean(receivers: Sequence[Receiver], apart: Apart, starts: Sequence[int]) ->
 
 
 def _forms(
-    receiver: Receiver, apart: Apart, place: int, starts: Sequence[int], mean: Matrix
+    receiver: Receiver, apart: PeerVersusRest, place: int, starts: Sequence[int], mean: Matrix
 ) -> Iterator[tuple[Floats, Matrix]]:
     """Give the probabilities (m,) of how a peer of a site moves beside the mean, and how (m, 2, n_h, n).
 

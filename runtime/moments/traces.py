@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem
-from apc.eigen.closing import Loop, close, feedback_of, lay_out_loop
+from apc.compiler.compiled import Model
+from apc.eigen.closing import ModalSystem, close, feedback_of, lay_out_loop
 from apc.eigen.enclosure import enclose_eigenvalues
 from apc.eigen.modes import arrange
 from apc.eigen.peers import MOST_STATES
@@ -31,10 +31,10 @@ from apc.eigen.relative import Relative, relative, relative_coordinates, with_do
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.instance import Prepared
 from apc.frame.radius import RADII, radius_of, value_of, with_radius
-from apc.frame.schedule import Heard, Selected, Sent
-from apc.moments.crowd import Hearing, build_hearing, instants
+from apc.frame.schedule import ReceivedSample, SentSample, UncertainSample
+from apc.moments.crowd import PerTickReception, build_hearing, instants
 from apc.network.timetable import instant_of
-from apc.unserved import UnservedError
+from apc.unserved import NotSupportedError
 
 Floats = NDArray[np.float64]
 Balls = NDArray[Any]  # of numbers with their radii
@@ -60,14 +60,16 @@ class Packets:
     `slots` says how many are sent in a frame on each link.
     """
 
-    def __init__(self, system: CompiledSystem, hearing: Hearing) -> None:
+    def __init__(self, system: Model, hearing: PerTickReception) -> None:
         self.hearing = hearing
         self.rows = dict.fromkeys(row for listed in hearing.rows.values() for row in listed)
         self.links = {link.name: link for link in system.links}
         self.times = {clock.name: instants(hearing, clock) for clock in system.clocks}
         self.slots = {name: len(self.times[link.clock]) for name, link in self.links.items()}
 
-    def heard(self, row: Selected, delay: Fraction | None = None, trace: Floats | None = None) -> list[int]:
+    def heard(
+        self, row: UncertainSample, delay: Fraction | None = None, trace: Floats | None = None
+    ) -> list[int]:
         """Return which packet a tick hears, frame by frame over a period.
 
         Parameters
@@ -104,27 +106,29 @@ class Packets:
             numbers.append(best[1])
         return numbers
 
-    def depths(self, numbers: Iterable[tuple[Selected, int]], least: int = 0) -> dict[str, int]:
+    def depths(self, numbers: Iterable[tuple[UncertainSample, int]], least: int = 0) -> dict[str, int]:
         """Return for how many frames packets of each link are kept, if ticks hear those of these numbers."""
         depths = dict.fromkeys(self.links, least)
         for row, number in numbers:
             depths[row.way.link] = max(depths[row.way.link], -(number // self.slots[row.way.link]))
         return depths
 
-    def loop(self, loop: Loop, numbers: Mapping[Selected, int], depths: Mapping[str, int]) -> Loop:
+    def loop(
+        self, loop: ModalSystem, numbers: Mapping[UncertainSample, int], depths: Mapping[str, int]
+    ) -> ModalSystem:
         """Return a loop whose ticks hear the packets of these numbers."""
         sites = []
         for site, rows in zip(loop.sites, self.hearing.of(loop), strict=True):
             heard = []
             for row in rows:
                 frames, slot = divmod(numbers[row], self.slots[row.way.link])
-                heard.append(Heard(row.way, Sent(row.way.link, row.channel, slot), -frames))
+                heard.append(ReceivedSample(row.way, SentSample(row.way.link, row.channel, slot), -frames))
             kept = tuple(depths[sent.link] for sent in site.schedule.sent)
             sites.append(replace(site, schedule=replace(site.schedule, heard=tuple(heard), depths=kept)))
         return replace(loop, sites=tuple(sites))
 
 
-def trace_radius(system: CompiledSystem, prepared: Prepared) -> Found:
+def trace_radius(system: Model, prepared: Prepared) -> Found:
     """Return what motions grow by in a frame, on the mean over a period.
 
     Parameters
@@ -134,7 +138,7 @@ def trace_radius(system: CompiledSystem, prepared: Prepared) -> Found:
 
     Raises
     ------
-    UnservedError
+    NotSupportedError
         The period or the delays are too long to follow.
     """
     packets = Packets(system, build_hearing(system, prepared))
@@ -144,14 +148,14 @@ def trace_radius(system: CompiledSystem, prepared: Prepared) -> Found:
     frames = math.lcm(*(_period_of(lengths.get(name, 1), packets.slots[name]) for name in used))
     if frames > MOST_FRAMES:
         what = f"the recorded delays come again after {frames:,} frames"
-        raise UnservedError(f"{what}, and {MOST_FRAMES:,} are the most")
+        raise NotSupportedError(f"{what}, and {MOST_FRAMES:,} are the most")
     heard = {row: packets.heard(row, trace=traces.get(row.way.link)) for row in packets.rows}
     depths = packets.depths((row, number) for row, numbers in heard.items() for number in numbers)
     result = []
     for loop in arrange(packets.hearing.groups, packets.hearing.exchange).loops:
         kept = sum(depths[sent.link] for site in loop.sites for sent in site.schedule.sent)
         if kept + sum(len(site.z_names) for site in loop.sites) > MOST_STATES:
-            raise UnservedError("the recorded delays are longer than can be followed")
+            raise NotSupportedError("the recorded delays are longer than can be followed")
         result.append(_period(loop, packets, heard, depths, frames))
     low, high, radius, doubt = np.array(result).max(axis=0).tolist()
     return Found(low, high, radius, doubt, frames)
@@ -163,9 +167,9 @@ def _period_of(delays: int, slots: int) -> int:
 
 
 def _period(
-    loop: Loop,
+    loop: ModalSystem,
     packets: Packets,
-    heard: Mapping[Selected, Sequence[int]],
+    heard: Mapping[UncertainSample, Sequence[int]],
     depths: Mapping[str, int],
     frames: int,
 ) -> tuple[float, float, float, float]:

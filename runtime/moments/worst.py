@@ -1,7 +1,7 @@
 """The worst that losses can do: how many in a row are harmless, and a pattern of them that shakes a scene.
 
-Takes: a `CompiledSystem` whose links lose packets, whose receivers hold what they heard last.
-Gives: `LossesInARow`, `worst_case`; `trace_of_worst`.
+Takes: a `Model` whose links lose packets, whose receivers hold what they heard last.
+Gives: `ConsecutiveLosses`, `worst_case`; `trace_of_worst`.
 Guarantees: what is certified is proved for every pattern on every channel by itself; a pattern's growth above
 1 is proved. The cost does not grow with the number of equal peers on complete graphs.
 Does not: find the worst pattern of all: between the losses certified and those of the pattern it is open.
@@ -29,15 +29,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem, Link
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Link, Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.eigen.closing import close, feedback_of, lay_out_loop
 from apc.eigen.enclosure import enclose_eigenvalues
 from apc.eigen.modes import loops_at_right_angles
 from apc.eigen.relative import relative
 from apc.frame.instance import Prepared, prepare
 from apc.frame.radius import RADII, UNIT, radius_of, value_of
-from apc.frame.schedule import Sent, Way
+from apc.frame.schedule import CouplingTerm, SentSample
 from apc.moments.crowd import build_hearing
 from apc.moments.frames import refuse_unheld
 from apc.moments.small_gain import (
@@ -49,7 +49,7 @@ from apc.moments.small_gain import (
     weight_of,
 )
 from apc.moments.traces import Packets
-from apc.unserved import UnservedError
+from apc.unserved import NotSupportedError
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
@@ -72,7 +72,7 @@ ABOVE = 1 + 1e-12
 
 
 @dataclass(frozen=True, slots=True)
-class LossesInARow:
+class ConsecutiveLosses:
     """What losses in a row do to a scene.
 
     `certified` in a row are proved harmless, whatever their pattern, on every channel by itself; None where
@@ -88,7 +88,7 @@ class LossesInARow:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Mode:
+class LossMode:
     """A mode of a scene: its matrix where all channels lose the packet of a frame, and d ← r if none does."""
 
     name: str
@@ -96,7 +96,7 @@ class Mode:
     off: Response
 
 
-def worst_case(system: CompiledSystem, prepared: Prepared) -> LossesInARow:
+def worst_case(system: Model, prepared: Prepared) -> ConsecutiveLosses:
     """Say how many losses in a row are harmless, and which pattern shakes a scene.
 
     Parameters
@@ -108,18 +108,20 @@ def worst_case(system: CompiledSystem, prepared: Prepared) -> LossesInARow:
     """
     try:
         modes, weight = _modes(system, prepared)
-    except UnservedError as why:
-        return LossesInARow(None, None, None, f"losses in a row are left open: {why}")
+    except NotSupportedError as why:
+        return ConsecutiveLosses(None, None, None, f"losses in a row are left open: {why}")
     certified = _harmless(modes, weight)
     if certified == MANY:
-        return LossesInARow(MANY, None, None, f"{MANY:,} losses in a row are harmless, where counting ends")
+        return ConsecutiveLosses(
+            MANY, None, None, f"{MANY:,} losses in a row are harmless, where counting ends"
+        )
     pattern, growth, note = _shaking(modes, certified or 0)
     if certified is None and pattern is None:
         note = f"the scene is not proved to settle with no packet lost; {note}"
-    return LossesInARow(certified, pattern, growth, note)
+    return ConsecutiveLosses(certified, pattern, growth, note)
 
 
-def trace_of_worst(system: CompiledSystem) -> CompiledSystem:
+def trace_of_worst(system: Model) -> Model:
     """Return a system whose unreliable links lose packets by the pattern that shakes it, again and again.
 
     Parameters
@@ -136,13 +138,15 @@ def trace_of_worst(system: CompiledSystem) -> CompiledSystem:
     pattern = losses_in_a_row.unstable_pattern
     if pattern is None:
         what = f"--trace-of worst has nothing to play: {losses_in_a_row.note}"
-        raise ApcError(Mistake("E897", Place(system.origin.topology), what, hint="apc simulate"))
+        raise ApcError(Diagnostic("E897", SourceLocation(system.origin.topology), what, hint="apc simulate"))
     seconds = {timing.name: float(timing.value) for timing in system.timings}
     for link in system.links:
         delays = {seconds[link.delay], *(seconds[delay.delay] for delay in link.delays)}
         if link.channel is not None and len(delays) > 1:
             what = f"--trace-of worst gives all packets of {link.name} one delay, and they have several"
-            raise ApcError(Mistake("E897", Place(system.origin.topology), what, hint="apc simulate"))
+            raise ApcError(
+                Diagnostic("E897", SourceLocation(system.origin.topology), what, hint="apc simulate")
+            )
 
     def played(link: Link) -> Link:
         if link.channel is None:
@@ -153,7 +157,7 @@ def trace_of_worst(system: CompiledSystem) -> CompiledSystem:
     return replace(system, links=tuple(map(played, system.links)))
 
 
-def _modes(system: CompiledSystem, prepared: Prepared) -> tuple[list[Mode], float]:
+def _modes(system: Model, prepared: Prepared) -> tuple[list[LossMode], float]:
     """Return the modes of a scene whose receivers hold what they heard last, and ‖|W|‖₂."""
     hearing = build_hearing(system, prepared)
     refuse_unheld(system, hearing)
@@ -171,7 +175,7 @@ def _modes(system: CompiledSystem, prepared: Prepared) -> tuple[list[Mode], floa
         off = []
         for g, site in enumerate(now.sites):
             hearing_of = dict[
-                tuple[Way, Sent], dict[int, int]
+                tuple[CouplingTerm, SentSample], dict[int, int]
             ]()  # all that hear a packet are off by the same
             for link in sorted(lossy):
                 for line, heard in felt_rows(site, link):
@@ -190,11 +194,11 @@ def _modes(system: CompiledSystem, prepared: Prepared) -> tuple[list[Mode], floa
             if packet.lag == 1 and missing.sites[packet.site].schedule.sent[packet.row].link in lossy:
                 matrix[:, place] = 0.0
                 matrix[0, place, place] = 1.0
-        modes.append(Mode(loop.name, relative(matrix, response.at, RADII), response))
+        modes.append(LossMode(loop.name, relative(matrix, response.at, RADII), response))
     return modes, weight
 
 
-def _harmless(modes: Sequence[Mode], weight: float) -> int | None:
+def _harmless(modes: Sequence[LossMode], weight: float) -> int | None:
     """Return how many losses in a row are proved harmless, None where not even none are."""
     nominal = [mode.off.a for mode in modes]
     if any(enclose_eigenvalues(value_of(values), radius_of(values))[1].high >= 1 for values in nominal):
@@ -235,7 +239,7 @@ def _words() -> dict[int, list[tuple[int, ...]]]:
     return by_losses
 
 
-def _growths(mode: Mode, words: Sequence[tuple[int, ...]]) -> Floats:
+def _growths(mode: LossMode, words: Sequence[tuple[int, ...]]) -> Floats:
     """Return what words make of a mode per frame (words,), all channels losing the same packets."""
     heard, lost = value_of(mode.off.a), value_of(mode.lost)
     gaps = [heard]
@@ -254,7 +258,7 @@ def _growths(mode: Mode, words: Sequence[tuple[int, ...]]) -> Floats:
     return growths
 
 
-def _shaking(modes: Sequence[Mode], harmless: int) -> tuple[tuple[bool, ...] | None, float | None, str]:
+def _shaking(modes: Sequence[LossMode], harmless: int) -> tuple[tuple[bool, ...] | None, float | None, str]:
     """Find a pattern of as few losses in a row as possible that shakes a scene, the shortest of these.
 
     Parameters
@@ -301,7 +305,7 @@ def pattern_of(word: Sequence[int]) -> tuple[bool, ...]:
     return tuple(lost for gap in word for lost in (*(True,) * (gap - 1), False))
 
 
-def _is_proved(mode: Mode, word: Sequence[int]) -> bool:
+def _is_proved(mode: LossMode, word: Sequence[int]) -> bool:
     """Say whether a word is proved to make a mode grow."""
     product = RADII.exact(np.eye(mode.lost.shape[-1]))
     for gone in pattern_of(word):

@@ -29,8 +29,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from apc.compiler.compiled import CompiledSystem, Link
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Link, Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -89,7 +89,7 @@ class ChannelLaw:
         return self.delay + self.jitter * LATEST[self.distribution]
 
 
-def channel_law(system: CompiledSystem, link: Link, delay: Fraction) -> ChannelLaw:
+def channel_law(system: Model, link: Link, delay: Fraction) -> ChannelLaw:
     """Return the numbers of a link's channel.
 
     Parameters
@@ -117,7 +117,7 @@ def channel_law(system: CompiledSystem, link: Link, delay: Fraction) -> ChannelL
         for parameter in group.values:
             if parameter.name in loss:
                 what = f"{parameter.name} is of a link, the same for all peers: {group.name} can't set it"
-                raise ApcError(Mistake("E891", Place(system.origin.topology), what))
+                raise ApcError(Diagnostic("E891", SourceLocation(system.origin.topology), what))
     value = {parameter.name: parameter.value for parameter in system.parameters}
     seconds = {timing.name: float(timing.value) for timing in system.timings}
     p, r, one_minus_h, one_minus_k = (value[name] for name in loss) if loss else (0.0, 1.0, 1.0, 0.0)

@@ -1,6 +1,6 @@
 """What an answer about the nominal network leaves out: loss, jitter, recorded delays, ranges of delay.
 
-Takes: a `CompiledSystem`.
+Takes: a `Model`.
 Gives: `unreliable`, `chance`, `left_out`, `refuse_range`, `channel_numbers`, `refuse_channel_number`.
 Guarantees: a question about a number that only lost or late packets depend on is refused by name, as its
 answer would be about a network without them.
@@ -13,14 +13,14 @@ import re
 from collections.abc import Collection
 from fractions import Fraction
 
-from apc.compiler.compiled import CompiledSystem, Link
-from apc.compiler.errors import ApcError, Mistake, Place
-from apc.frame.names import Free, given_ranges, unit_of
+from apc.compiler.compiled import Link, Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
+from apc.frame.names import ParameterRef, given_ranges, unit_of
 from apc.frame.parameters import resolve, scope_of
 from apc.network.channel import ChannelLaw, channel_law
 
 
-def unreliable(system: CompiledSystem) -> list[tuple[Link, ChannelLaw]]:
+def unreliable(system: Model) -> list[tuple[Link, ChannelLaw]]:
     """Return the links that lose packets or delay them by chance, with their laws."""
     links = [link for link in system.links if link.channel is not None]
     timings = resolve(system).timings if links else {}
@@ -36,7 +36,7 @@ def chance(link: Link, law: ChannelLaw) -> str:
 
 
 def left_out(
-    system: CompiledSystem, *, network: bool = True, varied: Collection[Free] = ()
+    system: Model, *, network: bool = True, varied: Collection[ParameterRef] = ()
 ) -> tuple[str, ...]:
     """Return what an analysis leaves out of each unreliable link, and of each delay that is given as a range.
 
@@ -63,7 +63,7 @@ def left_out(
     return tuple(notes)
 
 
-def refuse_range(system: CompiledSystem) -> None:
+def refuse_range(system: Model) -> None:
     """Refuse to play or write out a scene with a range in the place of a delay: ApcError E899."""
     for interval in given_ranges(system):
         low, middle, high = (
@@ -76,14 +76,16 @@ def refuse_range(system: CompiledSystem) -> None:
             for text in system.warnings
         )
         line, column = next((map(int, result.groups()) for result in matches if result), (0, 0))
-        raise ApcError(Mistake("E899", Place(system.origin.topology, line, column), what, hint=hint))
+        raise ApcError(
+            Diagnostic("E899", SourceLocation(system.origin.topology, line, column), what, hint=hint)
+        )
 
 
 def _ms(seconds: Fraction) -> str:
     return f"{float(seconds) * 1e3:.6g} ms"
 
 
-def channel_numbers(system: CompiledSystem) -> frozenset[str]:
+def channel_numbers(system: Model) -> frozenset[str]:
     """Return the names of what links lose and delay packets by, and of all that these follow from."""
     texts: list[str] = []
     for link in system.links:
@@ -95,7 +97,9 @@ def channel_numbers(system: CompiledSystem) -> frozenset[str]:
     return frozenset(scope_of(system).needed(texts))
 
 
-def refuse_channel_number(system: CompiledSystem, free: Free, place: Place, *, instead: str = "") -> None:
+def refuse_channel_number(
+    system: Model, free: ParameterRef, place: SourceLocation, *, instead: str = ""
+) -> None:
     """Refuse to vary a number of an unreliable link where every packet counts as on time.
 
     Parameters
@@ -121,4 +125,4 @@ def refuse_channel_number(system: CompiledSystem, free: Free, place: Place, *, i
         )
         value = "2 ms" if unit_of(system, free.name) == "s" else "5 %"
         hint = instead or f'apc simulate --set {free.label}="{value}"'
-        raise ApcError(Mistake("E896", place, what, hint=hint))
+        raise ApcError(Diagnostic("E896", place, what, hint=hint))

@@ -1,6 +1,6 @@
 """What a recording of packets amounts to, and the keys of a link that say so.
 
-Takes: recorded delays. Gives: `NetworkRecording`, `describe`, `describe_delays`, `Share`, `Law`.
+Takes: recorded delays. Gives: `LinkFit`, `describe`, `describe_delays`, `Share`, `Law`.
 Guarantees: a share has an interval that holds its probability in 95 of 100 recordings (Clopper and Pearson
 1934), whatever that is; what a link's keys can't say of the recording stands in `left_out`.
 Does not: judge a scene (see `moments`).
@@ -21,7 +21,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.errors import Place
+from apc.compiler.errors import SourceLocation
 from apc.compiler.language.probes import HALVED
 from apc.compiler.language.recordings import read_trace
 from apc.network.channel import LATEST, deviates
@@ -75,7 +75,7 @@ class Law:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class NetworkRecording(Result):
+class LinkFit(Result):
     """What a recording amounts to; times in seconds.
 
     `lost`, `turns_bad` (a lost packet follows one that arrived) and `turns_good` are shares; `bursty` says
@@ -109,7 +109,7 @@ class NetworkRecording(Result):
     delays: Floats
 
 
-def describe(path: str | Path, interval: float | None = None) -> NetworkRecording:
+def describe(path: str | Path, interval: float | None = None) -> LinkFit:
     """Say what a recording of packets amounts to.
 
     Parameters
@@ -124,14 +124,12 @@ def describe(path: str | Path, interval: float | None = None) -> NetworkRecordin
     ApcError
         E701 to E703, as for a link's `trace`.
     """
-    trace = read_trace(Path(path), Place(str(path)))
+    trace = read_trace(Path(path), SourceLocation(str(path)))
     between = trace.interval if interval is None else interval
     return describe_delays(trace.delays, str(path), program=trace.program, interval=between)
 
 
-def describe_delays(
-    delays: Floats, name: str, *, program: str = "", interval: float = math.nan
-) -> NetworkRecording:
+def describe_delays(delays: Floats, name: str, *, program: str = "", interval: float = math.nan) -> LinkFit:
     """Say what recorded delays amount to.
 
     Parameters
@@ -153,7 +151,7 @@ def describe_delays(
     correlation = _correlation(delays)
     law = _law(arrived)
     runs = np.diff(np.flatnonzero(np.diff(np.concatenate([[False], gone, [False]]))))[::2]
-    return NetworkRecording(
+    return LinkFit(
         file=name,
         program=program,
         packets=len(delays),

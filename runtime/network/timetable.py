@@ -1,8 +1,9 @@
 """Every packet of a scene's unreliable links: which of them each tick sees, on each way from peer to peer.
 
-Takes: a `CompiledSystem` with its numbers, who hears whom, the frame and the quantum of its schedules, a
+Takes: a `Model` with its numbers, who hears whom, the frame and the quantum of its schedules, a
 seed.
-Gives: `Route`, `routes_of`; `Luck`, `luck_of`; `Timetable`, `Listener`, `Seen`, `START`; `instant_of`.
+Gives: `Route`, `routes_of`; `ArrivalProcess`, `luck_of`; `Timetable`, `Listener`, `DeliveredPackets`,
+`START`; `instant_of`.
 Guarantees: without loss and jitter a tick sees the packet that `scheduling` says; a way is heard alike by all
 clocks of a receiver; it does not matter how time is cut into pieces; what is remembered does not grow with
 time.
@@ -19,9 +20,9 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem, Kind, Link
-from apc.compiler.errors import ApcError, Mistake, Place
-from apc.frame.exchange import Exchange
+from apc.compiler.compiled import Link, Model, PeerType
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
+from apc.frame.exchange import CommunicationGraph
 from apc.memory import refuse_beyond
 from apc.network.channel import ChannelLaw, PacketSource, channel_law
 
@@ -69,7 +70,7 @@ class Route:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen:
+class DeliveredPackets:
     """What ticks see on M ways.
 
     `packets` (ticks, M) are the numbers of the packets in effect, counted from 0, `START` for the start
@@ -83,7 +84,7 @@ class Seen:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Luck:
+class ArrivalProcess:
     """What chance does on the ways of a route, in numbers; times in quanta of `quantum` seconds.
 
     `law` is that of all ways but for their `delays` (M,), in seconds; `nominal` (M,) are the same in quanta.
@@ -110,12 +111,12 @@ class Luck:
 
 
 def luck_of(
-    system: CompiledSystem,
+    system: Model,
     timings: Mapping[str, Fraction],
-    exchange: Exchange,
+    exchange: CommunicationGraph,
     route: Route,
     quantum: Fraction,
-) -> Luck:
+) -> ArrivalProcess:
     """Return what chance does on the ways of a route.
 
     Parameters
@@ -145,7 +146,7 @@ def luck_of(
     }
     groups, of_way = _groups(exchange, route.pairs)
     late = [timings[exchange.delay(link.name, *pair)] for pair in groups]
-    luck = Luck(
+    luck = ArrivalProcess(
         law=channel_law(system, link, timings[link.delay]),
         delays=np.array([float(number) for number in late])[of_way],
         nominal=np.array([int(number / quantum) for number in late], np.int64)[of_way],
@@ -160,7 +161,7 @@ def luck_of(
     return luck
 
 
-def _check_luck(system: CompiledSystem, route: Route, luck: Luck) -> None:
+def _check_luck(system: Model, route: Route, luck: ArrivalProcess) -> None:
     """Refuse what could not be followed: too many packets on their way, or too many quanta."""
     latest, ways = luck.latest(route), len(route.pairs)
     if max(latest, route.ticks * luck.tick_period) > LONGEST:
@@ -170,12 +171,14 @@ def _check_luck(system: CompiledSystem, route: Route, luck: Luck) -> None:
             f"{LONGEST} of them"
         )
         raise ApcError(
-            Mistake("E892", Place(system.origin.topology), what, hint="periods and delays in whole µs")
+            Diagnostic(
+                "E892", SourceLocation(system.origin.topology), what, hint="periods and delays in whole µs"
+            )
         )
     packets = luck.kept(route) * ways
     what = f"{packets:,} packets kept on {ways:,} ways of {route.link}, which is unreliable,"
     hint = "a shorter delay or jitter, fewer peers, or graph: ring"
-    refuse_beyond(WAY * ways + PACKET * packets, "E892", Place(system.origin.topology), what, hint)
+    refuse_beyond(WAY * ways + PACKET * packets, "E892", SourceLocation(system.origin.topology), what, hint)
 
 
 class Listener:
@@ -218,11 +221,11 @@ class Listener:
         """How many packets may yet come in effect, or be found missing, on all ways."""
         return self._under_way.shape[1] + self._due.shape[1]
 
-    def hear(self, ticks: Integers) -> Seen:
+    def hear(self, ticks: Integers) -> DeliveredPackets:
         """Return what the ticks (n,) see, in quanta, rising, all after those heard before."""
         if not len(ticks):
             nothing = (0, self.source.ways)
-            return Seen(np.zeros(nothing, np.int64), np.zeros(nothing, np.bool_))
+            return DeliveredPackets(np.zeros(nothing, np.int64), np.zeros(nothing, np.bool_))
         self._send_until(int(ticks[-1]))
         ways, numbers, seen, _ = self._under_way
         arrived = seen <= ticks[-1]
@@ -231,7 +234,7 @@ class Listener:
         self._effective = packets[-1].copy()
         keep = ~arrived & (numbers > self._effective[ways]) if self.newest else ~arrived
         self._under_way = self._under_way[:, keep]
-        return Seen(packets, missing)
+        return DeliveredPackets(packets, missing)
 
     def _send_until(self, tick: int) -> None:
         """Send the packets up to a time; what is sent later can't have arrived."""
@@ -272,7 +275,7 @@ class Timetable:
     """The packets of all unreliable links of a scene, from time 0 on; time only goes forward."""
 
     def __init__(
-        self, routes: Sequence[Route], lucks: Sequence[Luck], *, seed: int = 0, run: int = 0
+        self, routes: Sequence[Route], lucks: Sequence[ArrivalProcess], *, seed: int = 0, run: int = 0
     ) -> None:
         """Start at time 0.
 
@@ -287,7 +290,7 @@ class Timetable:
         self._listeners = [_listen(route, luck, seed, run) for route, luck in zip(routes, lucks, strict=True)]
         self._now = 0
 
-    def take(self, until: int) -> tuple[Seen, ...]:
+    def take(self, until: int) -> tuple[DeliveredPackets, ...]:
         """Return what each route's ticks see, from where the last call ended to before `until`, in quanta."""
         seen = []
         for route, luck, listeners in zip(self.routes, self._lucks, self._listeners, strict=True):
@@ -299,12 +302,12 @@ class Timetable:
             for ways, listener in listeners:
                 heard = listener.hear(ticks)
                 packets[:, ways], missing[:, ways] = heard.packets, heard.missing
-            seen.append(Seen(packets, missing))
+            seen.append(DeliveredPackets(packets, missing))
         self._now = until
         return tuple(seen)
 
 
-def _listen(route: Route, luck: Luck, seed: int, run: int) -> list[tuple[Integers, Listener]]:
+def _listen(route: Route, luck: ArrivalProcess, seed: int, run: int) -> list[tuple[Integers, Listener]]:
     """Return a listener for the ways of each delay of a route, with their places in it."""
     pairs = []
     for nominal in np.unique(luck.nominal).tolist():
@@ -323,7 +326,7 @@ def _listen(route: Route, luck: Luck, seed: int, run: int) -> list[tuple[Integer
 
 
 def routes_of(
-    system: CompiledSystem, timings: Mapping[str, Fraction], exchange: Exchange, frame_s: Fraction
+    system: Model, timings: Mapping[str, Fraction], exchange: CommunicationGraph, frame_s: Fraction
 ) -> tuple[Route, ...]:
     """Return what is heard over unreliable links: a route for each of them and each clock that hears it.
 
@@ -345,9 +348,9 @@ def routes_of(
 
 
 def _routes_over(
-    system: CompiledSystem,
+    system: Model,
     timings: Mapping[str, Fraction],
-    exchange: Exchange,
+    exchange: CommunicationGraph,
     frame_s: Fraction,
     link: Link,
 ) -> list[Route]:
@@ -359,7 +362,7 @@ def _routes_over(
             f"{link.name} is unreliable, and {peers} peers that all hear each other are "
             f"{peers * (peers - 1)} ways with packets of their own; at most {MOST_WAYS} can be followed"
         )
-        raise ApcError(Mistake("E892", Place(system.origin.topology), what, hint="graph: ring"))
+        raise ApcError(Diagnostic("E892", SourceLocation(system.origin.topology), what, hint="graph: ring"))
     kind_of = np.repeat([group.kind for group in system.groups], np.diff(exchange.starts))
     pairs, weights = exchange.arcs(link.name)
     order = np.lexsort((pairs[:, 0], pairs[:, 1]))  # receiver by receiver: what each hears stands together
@@ -392,12 +395,12 @@ def _routes_over(
     ]
 
 
-def _hears(kind: Kind, link: str, clock: str) -> bool:
+def _hears(kind: PeerType, link: str, clock: str) -> bool:
     ticking = [partition for partition in kind.clocks if partition.clock == clock]
     return any(receive.link == link for partition in ticking for receive in partition.receives)
 
 
-def _groups(exchange: Exchange, pairs: Integers) -> tuple[list[tuple[int, int]], Integers]:
+def _groups(exchange: CommunicationGraph, pairs: Integers) -> tuple[list[tuple[int, int]], Integers]:
     """Return the different pairs of groups of pairs of peers, and which of them each pair (M,) is."""
     groups = np.searchsorted(exchange.starts, pairs, side="right") - 1
     count = len(exchange.groups)

@@ -1,6 +1,6 @@
 """Analyses as text, plain data, a picture: the verdict, what stands beside it, what a compiled scene needs.
 
-Takes: results of `analysis`, and the `Answer` they make together; a `Locus`.
+Takes: results of `analysis`, and the `AnalysisReport` they make together; a `Locus`.
 Gives: their texts and documents; `compile_text`; `analysis_picture`, the eigenvalues over the unit circle,
 and `locus_picture`, where they go.
 Guarantees: every number that decides something stands with its error. In a picture what decides is in sight,
@@ -43,14 +43,14 @@ from apc.present.pictures import COLOURS, legend_below, new_figure
 
 if TYPE_CHECKING:
     from apc.analysis.analysis import Analysis
-    from apc.analysis.box_proof import BoxProof, ChangingDelay
+    from apc.analysis.box_proof import ChangingDelay, RobustStability
     from apc.analysis.contact_modes import ContactMode, ContactModes
-    from apc.analysis.conventions import Conventions, Outcome
-    from apc.analysis.needs import Needs, SiteNeeds
-    from apc.analysis.paper import NamedMatrix, PaperRoute
-    from apc.analysis.switching import Switching
-    from apc.answer import Answer, NetworkAnswer
-    from apc.compiler.compiled import CompiledSystem
+    from apc.analysis.conventions import EventOrder, Outcome
+    from apc.analysis.needs import ModelSize, SubsystemSize
+    from apc.analysis.paper import NamedMatrix, PaperMethod
+    from apc.analysis.switching import ArbitrarySwitching
+    from apc.answer import AnalysisReport, NetworkAnswer
+    from apc.compiler.compiled import Model
     from apc.eigen.spectrum import Mode
     from apc.frame.names import Range
     from apc.vary.locus import Locus
@@ -87,7 +87,7 @@ MARKS = "os^Dv"
 LETTERS = 75  # of a line of a title
 
 
-def compile_text(system: CompiledSystem, needs: Needs, target: Path) -> Lines:
+def compile_text(system: Model, needs: ModelSize, target: Path) -> Lines:
     """Yield what `apc compile` prints.
 
     Parameters
@@ -108,7 +108,7 @@ def compile_text(system: CompiledSystem, needs: Needs, target: Path) -> Lines:
     yield from notes(*_pairwise(system), *dropped)
 
 
-def _pairwise(system: CompiledSystem) -> Iterator[str]:
+def _pairwise(system: Model) -> Iterator[str]:
     """Yield what is evaluated once a pair of peers, and why it can't be once a peer."""
     result = {
         receive.name: receive
@@ -185,7 +185,7 @@ def _mode_document(mode: Mode) -> Plain:
     return record(mode, {"motion": ..., **moved})
 
 
-def answer_text(answer: Answer) -> Lines:
+def answer_text(answer: AnalysisReport) -> Lines:
     """Yield what `apc analyze` prints: the analysis, and what stands beside it."""
     conventions, topology = answer.conventions, answer.analysis.topology
     warned = f"Warning: {conventions.warning}" if conventions.warning else ""
@@ -237,7 +237,7 @@ def network_answer_document(network_answer: NetworkAnswer) -> Plain:
     }
 
 
-def answer_document(answer: Answer) -> Plain:
+def answer_document(answer: AnalysisReport) -> Plain:
     """Return what `apc analyze --json` prints: the analysis with more keys."""
     plain = answer.analysis.to_dict()
     plain |= picked(answer, "network", "sensitivities", "contact_modes", "switching", "buzz")
@@ -315,7 +315,7 @@ def _leading(mode: Mode) -> str:
     return ", ".join(f"{name} {share:.0%}" for name, share in largest if share >= LEAST_SHARE)
 
 
-def needs_text(needs: Needs) -> Lines:
+def needs_text(needs: ModelSize) -> Lines:
     """Yield what a scene needs in one sentence."""
     several = len(needs.sites) > 1
     sites = "; ".join(f"{site.name}: {_site(site)}" if several else _site(site) for site in needs.sites)
@@ -327,7 +327,7 @@ def needs_text(needs: Needs) -> Lines:
     yield f"{sites}, {counted(needs.peers, 'peer')}; {analysed}{pairs}"
 
 
-def _site(site_needs: SiteNeeds) -> str:
+def _site(site_needs: SubsystemSize) -> str:
     parts = [f"{site_needs.motion} motion"]
     if site_needs.remembered:
         parts.append(f"{site_needs.remembered} delayed force")
@@ -336,7 +336,7 @@ def _site(site_needs: SiteNeeds) -> str:
     return f"{site_needs.states} states a peer ({', '.join(parts)})"
 
 
-def box_proof_text(box_proof: BoxProof) -> Lines:
+def box_proof_text(box_proof: RobustStability) -> Lines:
     """Yield what was proved of a box."""
     where = [
         f"  {interval.free.label} = {quantity(value, interval.unit, 12)}"
@@ -396,7 +396,7 @@ def range_document(interval: Range) -> Plain:
     }
 
 
-def box_proof_document(box_proof: BoxProof) -> Plain:
+def box_proof_document(box_proof: RobustStability) -> Plain:
     """Return what was proved of a box as plain data."""
     return {
         **picked(box_proof, "topology", "left_out", "verdict", "stable", "cells", "open_share", "notes"),
@@ -441,7 +441,7 @@ def contact_modes_document(contact_modes: ContactModes) -> Plain:
     return record(contact_modes, {"unstable": contact_modes.unstable, "modes": modes})
 
 
-def switching_text(switching: Switching) -> Lines:
+def switching_text(switching: ArbitrarySwitching) -> Lines:
     """Yield whether contacts may open and close at will, in words."""
     reach = switching.reach
     if switching.stable:
@@ -458,7 +458,7 @@ def switching_text(switching: Switching) -> Lines:
     yield from wrapped(f"{switching.topology}, contacts that open and close at will: {text}", "", "  ")
 
 
-def switching_document(switching: Switching) -> Plain:
+def switching_document(switching: ArbitrarySwitching) -> Plain:
     """Return whether contacts may open and close at will, as plain data."""
     return {"stable": switching.stable, **record(switching)}
 
@@ -470,7 +470,7 @@ def _analysed(result: ContactMode | Outcome, instead: Plain, *more: str) -> Plai
     return record(result, instead)
 
 
-def conventions_text(conventions: Conventions) -> Lines:
+def conventions_text(conventions: EventOrder) -> Lines:
     """Yield what every convention leads to."""
     from apc.analysis.conventions import (  # loaded where there are outcomes, and else not needed
         DEFAULT,
@@ -495,7 +495,7 @@ def conventions_text(conventions: Conventions) -> Lines:
         yield "\n  What is heard before the first packet can't change the verdict."
 
 
-def conventions_document(conventions: Conventions) -> Plain:
+def conventions_document(conventions: EventOrder) -> Plain:
     """Return what every convention leads to as plain data."""
     outcomes = [_analysed(outcome, {}) for outcome in conventions.outcomes]
     return record(
@@ -503,7 +503,7 @@ def conventions_document(conventions: Conventions) -> Plain:
     )
 
 
-def paper_route_text(paper_route: PaperRoute) -> Lines:
+def paper_route_text(paper_route: PaperMethod) -> Lines:
     """Yield the shapes of the paper's matrices, a line each."""
     yield f"ratio {paper_route.ratio}, frame {paper_route.frame_s * 1e3:.6g} ms"
     for field in fields(paper_route):

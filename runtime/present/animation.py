@@ -1,6 +1,6 @@
 """A run as a moving picture: the bodies of every peer as `still` draws them, from frame to frame.
 
-Takes: a `CompiledSystem` and its `Trajectory`. Gives: `SUFFIXES`, `check_animation`, `save_animation`.
+Takes: a `Model` and its `Trajectory`. Gives: `SUFFIXES`, `check_animation`, `save_animation`.
 Guarantees: what is shown is of the run's own rows, the nearest in time; everything that moves stays in sight;
 a run is slowed down or sped up to what can be watched, and how much is written above it; a file is there
 whole or not at all.
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.compiler.files import check_target, write_file
 from apc.compiler.timings import part
 from apc.optional import missing, need
@@ -47,7 +47,7 @@ def check_animation(path: Path) -> None:
 
 
 @part("draw")
-def save_animation(system: CompiledSystem, trajectory: Trajectory, path: Path) -> None:
+def save_animation(system: Model, trajectory: Trajectory, path: Path) -> None:
     """Draw a run into a file that moves, its format chosen by the suffix.
 
     Parameters

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-from apc.benchmark.speed_and_error import SAME, Bench, Comparison, Measured
+from apc.benchmark.speed_and_error import SAME, Bench, MethodTiming, TaskComparison
 from apc.compiler.words import counted, wrapped
 from apc.present.forms import Lines, notes, record, table
 from apc.present.pictures import COLOURS, legend_below, new_figure
@@ -43,7 +43,7 @@ def bench_text(bench: Bench) -> Lines:
     yield from notes(", ".join(f"{name} {value}" for name, value in bench.machine.items() if value))
 
 
-def _task(comparison: Comparison) -> Lines:
+def _task(comparison: TaskComparison) -> Lines:
     yield f"apc {comparison.task}: time against error of the {comparison.quantity}"
     yield from notes(*comparison.left_out)
     yield ""
@@ -71,7 +71,7 @@ def _task(comparison: Comparison) -> Lines:
     yield from notes(*(f"{name} left out: {reason}" for name, reason in comparison.refused))
 
 
-def _times(comparison: Comparison) -> str:
+def _times(comparison: TaskComparison) -> str:
     """Say what the columns of times are."""
     least, most = (pick(measured.rounds for measured in comparison.measured) for pick in (min, max))
     runs = counted(most, "run") if least == most else f"{least} to {most} runs"
@@ -79,8 +79,8 @@ def _times(comparison: Comparison) -> str:
     return f"{columns} are of {runs}: processor time of {comparison.timed}"
 
 
-def _choice(comparison: Comparison) -> str:
-    chosen: Measured | None = comparison.chosen
+def _choice(comparison: TaskComparison) -> str:
+    chosen: MethodTiming | None = comparison.chosen
     if chosen is None:
         return f"what {comparison.task} chooses is none of these"
     if chosen.error is None:
@@ -166,7 +166,7 @@ def bench_picture(bench: Bench) -> Any:
     return figure
 
 
-def _panel(ax: Any, comparison: Comparison) -> None:
+def _panel(ax: Any, comparison: TaskComparison) -> None:
     ax.set_title(f"apc {comparison.task}", fontsize=10)
     ax.set_xlabel("median time [s]")
     ax.set_ylabel(f"error of the {comparison.quantity}", fontsize=9)
@@ -197,7 +197,7 @@ def _panel(ax: Any, comparison: Comparison) -> None:
     legend_below(ax, -0.16, fontsize=7)
 
 
-def _drawn(measured: Measured) -> float:
+def _drawn(measured: MethodTiming) -> float:
     return max(measured.error or 0.0, LEAST)
 
 

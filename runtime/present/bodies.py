@@ -1,7 +1,7 @@
 """The bodies of a scene and the surfaces between them, found in its equations.
 
-Takes: a `CompiledSystem`.
-Gives: `Body`, `Disc`, `Line`, `PeerView`, `moves_in_plane`, `bodies_of`, `views_of`.
+Takes: a `Model`.
+Gives: `DrawnBody`, `Disc`, `SupportLine`, `PeerView`, `moves_in_plane`, `bodies_of`, `views_of`.
 Guarantees: a body is a position, a number or a vector of numbers in metres, and the angle of the part whose
 position it is; where something is decided by the
 distance of two of them, or of one from a fixed point, in metres, there is a disc; where by the distance from
@@ -22,7 +22,7 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem, Kind
+from apc.compiler.compiled import Model, PeerType
 from apc.compiler.interpolation import jacobian
 from apc.compiler.language.vectors import whole_and_index
 from apc.frame.jacobians import guards_of, jacobians
@@ -38,7 +38,7 @@ SAME = 1e-9  # relative: what is equal but for roundings
 
 
 @dataclass(frozen=True, slots=True)
-class Body:
+class DrawnBody:
     """A body at the start: its place (d,) and its radius, 0 for a point, in m; `states` are its coordinates.
 
     Of a body on an axis d is 1, and the radius half its width. `turning` are the states that say how it is
@@ -63,7 +63,7 @@ class Disc:
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class SupportLine:
     """Where normal·x = offset: a point of an axis, a line or a plane; the normal has length 1, m."""
 
     normal: tuple[float, ...]
@@ -75,11 +75,11 @@ class PeerView:
     """A peer at the start: its bodies, those of a plane only if there are some, and its fixed surfaces."""
 
     name: str
-    bodies: tuple[Body, ...]
-    surfaces: tuple[Disc | Line, ...]
+    bodies: tuple[DrawnBody, ...]
+    surfaces: tuple[Disc | SupportLine, ...]
 
 
-def positions_of(kind: Kind) -> dict[str, list[int]]:
+def positions_of(kind: PeerType) -> dict[str, list[int]]:
     """Return the positions of a kind, each by the places of its coordinates among the states."""
     result: dict[str, list[int]] = {}
     for place, state in enumerate(kind.states):
@@ -103,7 +103,7 @@ def heading(turned: Floats) -> Floats:
     return np.asarray(np.arctan2(2 * (c + a * b), 1 + a**2 - b**2 - c**2))
 
 
-def turns_of(kind: Kind) -> dict[str, list[int]]:
+def turns_of(kind: PeerType) -> dict[str, list[int]]:
     """Return of each part that turns, in a plane or in space, the places of how among the states."""
     result: dict[str, list[int]] = {}
     for place, state in enumerate(kind.states):
@@ -112,12 +112,12 @@ def turns_of(kind: Kind) -> dict[str, list[int]]:
     return {part: places for part, places in result.items() if len(places) in (1, 3)}
 
 
-def moves_in_plane(system: CompiledSystem) -> bool:
+def moves_in_plane(system: Model) -> bool:
     """Return whether some body's position is a vector."""
     return any(len(places) > 1 for kind in system.kinds for places in positions_of(kind).values())
 
 
-def views_of(system: CompiledSystem) -> list[PeerView]:
+def views_of(system: Model) -> list[PeerView]:
     """Return the first `MOST_PEERS` peers as they look at the start."""
     numbers = resolve(system)
     sites = [jacobians(kind) for kind in system.kinds]
@@ -134,8 +134,8 @@ def views_of(system: CompiledSystem) -> list[PeerView]:
 
 
 def bodies_of(
-    kind: Kind, vector: Sequence[float], start: Sequence[float]
-) -> tuple[list[Body], list[Disc | Line]]:
+    kind: PeerType, vector: Sequence[float], start: Sequence[float]
+) -> tuple[list[DrawnBody], list[Disc | SupportLine]]:
     """Return what a peer's start looks like.
 
     Parameters
@@ -150,7 +150,7 @@ def bodies_of(
     positions = positions_of(kind)
     radii = dict.fromkeys(positions, 0.0)
     sent = sent_states(kind)
-    fixed: dict[Disc | Line, None] = {}
+    fixed: dict[Disc | SupportLine, None] = {}
     for points, values, slopes in _decisions(kind, vector):
         moving = set(np.flatnonzero(slopes.any(axis=0)).tolist())
         names = [name for name, places in positions.items() if moving & set(places)]
@@ -169,13 +169,13 @@ def bodies_of(
             fixed[surface] = None
             continue
         wide = next((name for name in names if positions[name][0] in sent), names[1])
-        if isinstance(surface, Line) and len(first) == 1:
+        if isinstance(surface, SupportLine) and len(first) == 1:
             radii[wide] = max(radii[wide], abs(surface.offset))
         elif isinstance(surface, Disc) and _equal(surface.centre, 0):
             radii[wide] = max(radii[wide], surface.radius)
     turns = turns_of(kind)
     bodies = [
-        Body(
+        DrawnBody(
             part,
             tuple(float(start[place]) for place in places),
             radii[name],
@@ -190,7 +190,7 @@ def bodies_of(
     return bodies, list(fixed)
 
 
-def _decisions(kind: Kind, vector: Sequence[float]) -> Iterator[tuple[Floats, Floats, Floats]]:
+def _decisions(kind: PeerType, vector: Sequence[float]) -> Iterator[tuple[Floats, Floats, Floats]]:
     """Yield of all that is decided by states alone: states (k, n_x), its values (k,), slopes (k, n_x)."""
     points = np.random.default_rng(1).uniform(-1, 1, (PROBES, len(kind.states)))
     for function in (kind.derivative, *(clock.tick for clock in kind.clocks)):
@@ -212,7 +212,7 @@ def _equal(values: Any, others: Any, scale: float = 1.0) -> bool:
     return np.allclose(values, others, rtol=0, atol=SAME * scale)
 
 
-def _surface(at: Floats, values: Floats, slopes: Floats) -> Disc | Line | None:
+def _surface(at: Floats, values: Floats, slopes: Floats) -> Disc | SupportLine | None:
     """Return where a function of a point is zero, if it is the distance from a disc or a line, with a sign.
 
     Parameters
@@ -226,7 +226,7 @@ def _surface(at: Floats, values: Floats, slopes: Floats) -> Disc | Line | None:
     if _equal(slopes, slopes[0]):
         normal = slopes[0] * np.sign(slopes[0][np.abs(slopes[0]).argmax()])
         offset = normal @ at[0] - (normal @ slopes[0]) * values[0]
-        return Line(tuple(map(_tidy, normal)), _tidy(offset))
+        return SupportLine(tuple(map(_tidy, normal)), _tidy(offset))
     if size == 1:
         return None
     # g = ∓(R − |p − c|) has the slope ±(p − c)/|p − c|: c = p − g·slope ∓ R·slope, the same from every point.

@@ -1,6 +1,6 @@
 """Schemes side by side as text, plain data, a table, and a picture: a panel a quantity, a bar a scheme.
 
-Takes: a `Comparison`. Gives: its text, document, rows and picture.
+Takes: a `SchemeComparison`. Gives: its text, document, rows and picture.
 Guarantees: what is left out stands first; a cell that can't be had says why in a footnote; a line is at most
 80 columns wide.
 In the picture bars of one scheme have one colour and hatch in every panel, so that they can be told apart
@@ -34,10 +34,10 @@ from apc.present.forms import (
     uncertain,
 )
 from apc.present.pictures import COLOURS, new_figure
-from apc.tables import Column, Row, Tabled
+from apc.tables import Row, TableColumn, Tabled
 
 if TYPE_CHECKING:
-    from apc.comparison.comparison import Comparison, Scheme
+    from apc.comparison.comparison import Scheme, SchemeComparison
     from apc.vary.critical_values import Critical
 
 NONE = "–"
@@ -81,7 +81,7 @@ REACHES = (
 )
 
 
-def comparison_text(comparison: Comparison) -> Lines:
+def comparison_text(comparison: SchemeComparison) -> Lines:
     """Yield what `apc compare` prints: a table for each question, a line for each scheme."""
     schemes = comparison.schemes
     feet: dict[str, int] = {}
@@ -124,7 +124,7 @@ def _costs(scheme: Scheme) -> tuple[str, ...]:
     return f"{counted(effort.operations, 'operation', ',d')}{clock}", *sent
 
 
-def _meant(comparison: Comparison) -> Iterator[str]:
+def _meant(comparison: SchemeComparison) -> Iterator[str]:
     """Yield what stable means, where it is not that motions die out."""
     if any(scheme.passive for scheme in comparison.schemes):
         yield MEANT["passive"]
@@ -210,7 +210,7 @@ def _felt(scheme: Scheme, feet: dict[str, int]) -> tuple[str, str, str]:
     return cells[0], cells[1], scheme.feel.at
 
 
-def comparison_document(comparison: Comparison) -> Plain:
+def comparison_document(comparison: SchemeComparison) -> Plain:
     """Return the same as plain data, in SI: each part as the JSON of its command."""
     return {"schemes": [_document(scheme) for scheme in comparison.schemes], "notes": list(comparison.notes)}
 
@@ -221,46 +221,46 @@ def _document(scheme: Scheme) -> Plain:
     )
 
 
-def comparison_rows(comparison: Comparison) -> Tabled:
+def comparison_rows(comparison: SchemeComparison) -> Tabled:
     """Return the columns of a table of schemes, a row a scheme, and what was left out."""
     left_out = {scheme.topology: list(scheme.left_out) for scheme in comparison.schemes}
     columns = [column for column, _ in COLUMNS]
     return columns, map(_row, comparison.schemes), {"left_out": left_out, "notes": list(comparison.notes)}
 
 
-def _varied_columns(key: str, unit: str) -> list[tuple[Column, str]]:
+def _varied_columns(key: str, unit: str) -> list[tuple[TableColumn, str]]:
     """Return the columns of what is varied, and how far it was looked."""
     words = ("parameter", "stable side", "verdict")
     numbers = (("", "value"), (" error", "error"), (" scanned to", "scanned.1"))
     first, *others = (
-        (Column(f"{key} {word}", kind="text"), f"{key}.{word.replace(' ', '_')}") for word in words
+        (TableColumn(f"{key} {word}", kind="text"), f"{key}.{word.replace(' ', '_')}") for word in words
     )
-    value, error, scanned = ((Column(key + name, unit), f"{key}.{place}") for name, place in numbers)
+    value, error, scanned = ((TableColumn(key + name, unit), f"{key}.{place}") for name, place in numbers)
     return [first, value, error, others[0], scanned, others[1]]
 
 
 # The columns of a table of schemes, and where in a scheme their cells stand.
-COLUMNS: list[tuple[Column, str]] = [
-    (Column("topology", kind="text"), "topology"),
-    (Column("peers", kind="count"), "peers"),
-    (Column("verdict", kind="text"), "verdict"),
-    (Column("in time", kind="text"), "played.summary.verdict"),
-    (Column("frame", "s"), "analysis.frame_s"),
-    (Column("spectral radius"), "analysis.spectral_radius"),
-    (Column("spectral radius error"), "analysis.spectral_radius_error"),
-    (Column("mean square radius"), "network.mean_square_radius"),
+COLUMNS: list[tuple[TableColumn, str]] = [
+    (TableColumn("topology", kind="text"), "topology"),
+    (TableColumn("peers", kind="count"), "peers"),
+    (TableColumn("verdict", kind="text"), "verdict"),
+    (TableColumn("in time", kind="text"), "played.summary.verdict"),
+    (TableColumn("frame", "s"), "analysis.frame_s"),
+    (TableColumn("spectral radius"), "analysis.spectral_radius"),
+    (TableColumn("spectral radius error"), "analysis.spectral_radius_error"),
+    (TableColumn("mean square radius"), "network.mean_square_radius"),
     *_varied_columns("stiffness", "N/m"),
     *_varied_columns("delay", "s"),
     *_varied_columns("loss", ""),
-    (Column("felt at", kind="text"), "feel.at"),
-    (Column("impedance at 1 Hz real", "N*s/m"), "feel.impedance.0.real"),
-    (Column("impedance at 1 Hz imaginary", "N*s/m"), "feel.impedance.0.imag"),
-    (Column("impedance at 10 Hz real", "N*s/m"), "feel.impedance.1.real"),
-    (Column("impedance at 10 Hz imaginary", "N*s/m"), "feel.impedance.1.imag"),
-    (Column("operations a tick", kind="count"), "effort.operations"),
-    (Column("numbers sent", "1/s"), "effort.sent"),
-    (Column("numbers sent by all", "1/s"), "effort.sent_by_all"),
-    (Column("missing", kind="text"), ""),
+    (TableColumn("felt at", kind="text"), "feel.at"),
+    (TableColumn("impedance at 1 Hz real", "N*s/m"), "feel.impedance.0.real"),
+    (TableColumn("impedance at 1 Hz imaginary", "N*s/m"), "feel.impedance.0.imag"),
+    (TableColumn("impedance at 10 Hz real", "N*s/m"), "feel.impedance.1.real"),
+    (TableColumn("impedance at 10 Hz imaginary", "N*s/m"), "feel.impedance.1.imag"),
+    (TableColumn("operations a tick", kind="count"), "effort.operations"),
+    (TableColumn("numbers sent", "1/s"), "effort.sent"),
+    (TableColumn("numbers sent by all", "1/s"), "effort.sent_by_all"),
+    (TableColumn("missing", kind="text"), ""),
 ]
 
 
@@ -282,7 +282,7 @@ class _Bar:
     further: bool = False
 
 
-def comparison_picture(comparison: Comparison) -> Any:
+def comparison_picture(comparison: SchemeComparison) -> Any:
     """Draw all schemes beside each other; return the matplotlib Figure.
 
     Raises

@@ -18,7 +18,7 @@ from apc.present.forms import Lines, Plain, document, listed, notes, picked, rec
 
 if TYPE_CHECKING:
     from apc.exports.code import Code
-    from apc.exports.fmu import Unit
+    from apc.exports.fmu import FmuContent
     from apc.exports.lifted import StateSpace
     from apc.exports.modelica import ModelicaModel
 
@@ -120,7 +120,7 @@ def code_document(code: Code) -> Plain:
     }
 
 
-def unit_text(unit: Unit) -> Lines:
+def unit_text(unit: FmuContent) -> Lines:
     """Yield what an FMU takes and gives."""
     what = unit.peer or counted(len(unit.scene.peers), "peer")
     yield f"{unit.system.name}: {what} for co-simulation, FMI 2.0\n"
@@ -139,7 +139,7 @@ def unit_text(unit: Unit) -> Lines:
     yield from notes(text)
 
 
-def unit_document(unit: Unit) -> Plain:
+def unit_document(unit: FmuContent) -> Plain:
     """Return an FMU as plain data."""
     variables = [
         {

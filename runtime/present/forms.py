@@ -19,7 +19,7 @@ from typing import Any
 
 from apc.compiler.words import measured, with_unit, wrapped
 from apc.frame.display_units import as_shown
-from apc.later import Later
+from apc.later import LazyTuple
 from apc.result import Result
 
 # What stable means by a criterion, where it is not that motions die out.
@@ -62,7 +62,7 @@ def document(value: Any) -> Any:
         return record(value)
     if isinstance(value, Mapping):
         return {key: document(item) for key, item in value.items() if item is not ...}
-    if isinstance(value, tuple | list | Later):
+    if isinstance(value, tuple | list | LazyTuple):
         return [document(item) for item in value]
     return document(value.tolist())  # of an array
 

@@ -18,8 +18,8 @@ from typing import Any
 
 from apc.compiler.multiples import common_multiple
 from apc.compiler.scene.links import SceneLink
-from apc.compiler.scene.scene import Scene
-from apc.compiler.view.diagram import Box, Diagram, Edge, one_of, seconds, shape_of
+from apc.compiler.scene.scene import Topology
+from apc.compiler.view.diagram import Box, Diagram, DiagramEdge, one_of, seconds, shape_of
 from apc.compiler.words import counted
 from apc.optional import need
 from apc.present.pictures import COLOURS
@@ -83,7 +83,7 @@ def graph_picture(diagram: Diagram) -> Any:
     return figure
 
 
-def _places(boxes: Sequence[Box], edges: Sequence[Edge]) -> _Places:
+def _places(boxes: Sequence[Box], edges: Sequence[DiagramEdge]) -> _Places:
     """Return where each box stands, what is joined to one another in columns of its own."""
     networkx = need("networkx", "plot")
     by_key = {box.key: box for box in boxes}
@@ -138,14 +138,14 @@ def _draw(ax: Any, box: Box, place: tuple[float, float, float, float], colours: 
         ax.text(left + width / 2, y, line, zorder=4, **look)
 
 
-def _colours(scene: Scene) -> dict[str, str]:
+def _colours(scene: Topology) -> dict[str, str]:
     """Return the colours of clocks, and from the other end those of groups."""
     clocks = {f"clock {clock.name}": COLOURS[1 + i % 6] for i, clock in enumerate(scene.clocks)}
     groups = {f"group {group.name}": COLOURS[-1 - i % 6] for i, group in enumerate(scene.groups)}
     return clocks | groups
 
 
-def _draw_peers(ax: Any, scene: Scene, link: SceneLink, colours: dict[str, str]) -> None:
+def _draw_peers(ax: Any, scene: Topology, link: SceneLink, colours: dict[str, str]) -> None:
     """Draw who hears whom over a link, in the colours of groups."""
     networkx = need("networkx", "plot")
     owners = [group.name for group in scene.groups for _ in range(min(group.count, MOST_PEERS))]
@@ -169,7 +169,7 @@ def _draw_peers(ax: Any, scene: Scene, link: SceneLink, colours: dict[str, str])
     ax.set_axis_off()
 
 
-def _draw_ticks(ax: Any, scene: Scene, colours: dict[str, str]) -> None:
+def _draw_ticks(ax: Any, scene: Topology, colours: dict[str, str]) -> None:
     """Draw the ticks of each clock along a frame."""
     frame = common_multiple(clock.period.number for clock in scene.clocks)
     for row, clock in enumerate(scene.clocks):

@@ -1,6 +1,7 @@
 """What hands do and feel, as text, plain data, a picture and a table.
 
-Takes: a `PassiveHands` or a `Feel`. Gives: of each its text and document; `feel_picture`, `feel_rows`.
+Takes: a `AbsoluteStability` or a `Transparency`. Gives: of each its text and document; `feel_picture`,
+`feel_rows`.
 Guarantees: what the answer leaves out stands first; no digit beyond its bound.
 Does not: compute.
 """
@@ -27,11 +28,11 @@ from apc.present.forms import (
     table,
 )
 from apc.present.pictures import COLOURS, legend_below, new_figure
-from apc.tables import Column, Tabled
+from apc.tables import TableColumn, Tabled
 
 if TYPE_CHECKING:
-    from apc.hands.frequency_response import Extremes, Feel
-    from apc.hands.passivity import PassiveHands, PassiveMode
+    from apc.hands.frequency_response import HinfGains, Transparency
+    from apc.hands.passivity import AbsoluteStability, PassiveMode
 
 Floats = NDArray[np.float64]
 
@@ -41,11 +42,11 @@ SHOWN = 12
 # Digits of a table's numbers, at most.
 DIGITS = 6
 
-# Where the root mean squares of a `Noise` are taken.
+# Where the root mean squares of a `H2Gains` are taken.
 NOISE_RMS = "at the ticks, motion between ticks not included"
 
 
-def passive_text(passive_hands: PassiveHands) -> Lines:
+def passive_text(passive_hands: AbsoluteStability) -> Lines:
     """Yield whether a scene is stable with any passive hands, in words and numbers."""
     yield from wrapped(
         f"{passive_hands.topology}: {passive_hands.verdict}{LINEARIZED if passive_hands.linearized else ''}",
@@ -77,7 +78,7 @@ def passive_text(passive_hands: PassiveHands) -> Lines:
         )
 
 
-def _worst(passive_hands: PassiveHands, worst: PassiveMode) -> str:
+def _worst(passive_hands: AbsoluteStability, worst: PassiveMode) -> str:
     """Say how the devices move that take most energy out, or need most damping."""
     moved = "all alike" if worst.name in ("common", "single") else f"in a {worst.name} mode"
     if worst.more is None:
@@ -127,13 +128,13 @@ def _mode(passive_mode: PassiveMode) -> tuple[str, ...]:
     return name, damping, needed, at, stiffness, verdict
 
 
-def passive_document(passive_hands: PassiveHands) -> Plain:
+def passive_document(passive_hands: AbsoluteStability) -> Plain:
     """Return the same as plain data."""
     modes = [{**document(mode), "damping_needed": document(mode.needed)} for mode in passive_hands.modes]
     return {"hands": "passive", **record(passive_hands, {"modes": modes})}
 
 
-def feel_text(feel: Feel) -> Lines:
+def feel_text(feel: Transparency) -> Lines:
     """Yield what is felt at a device, in words and numbers."""
     title = f"{feel.topology}: what a hand feels at {feel.at}{LINEARIZED if feel.linearized else ''}"
     yield from wrapped(title, "", "  ")
@@ -179,7 +180,7 @@ def feel_text(feel: Feel) -> Lines:
         yield from notes(f"{spread}: rms {NOISE_RMS}, for {what}, white from tick to tick")
 
 
-def _curves(feel: Feel) -> list[tuple[NDArray[np.complex128], Floats, float, bool, str]]:
+def _curves(feel: Transparency) -> list[tuple[NDArray[np.complex128], Floats, float, bool, str]]:
     """Return what is felt: responses (k,), their relative bounds (k,), a factor, if it is there, its name."""
     apart = bool(feel.copy)
     return [
@@ -192,7 +193,7 @@ def _curves(feel: Feel) -> list[tuple[NDArray[np.complex128], Floats, float, boo
     ]
 
 
-def _rows_shown(feel: Feel) -> Iterator[tuple[str, ...]]:
+def _rows_shown(feel: Transparency) -> Iterator[tuple[str, ...]]:
     """Yield some lines of the table, the first and the last among them."""
     count = len(feel.frequency_hz)
     for place in sorted({round(value) for value in np.linspace(0, count - 1, min(SHOWN, count))}):
@@ -205,7 +206,7 @@ def _rows_shown(feel: Feel) -> Iterator[tuple[str, ...]]:
         yield (f"{feel.frequency_hz[place]:.5g}", size, phase, *others, f"{feel.alias[place]:.1e}")
 
 
-def _extreme(extremes: Extremes) -> tuple[str, str]:
+def _extreme(extremes: HinfGains) -> tuple[str, str]:
     """Return a norm and what it is of."""
     peak = extremes.sampled_data
     what, unit = ("velocity", "m/s/N") if extremes.of == "velocity" else ("copies apart", "m/N")
@@ -216,7 +217,7 @@ def _extreme(extremes: Extremes) -> tuple[str, str]:
     return f"{extremes.mode}, {what}", size
 
 
-def feel_document(feel: Feel) -> Plain:
+def feel_document(feel: Transparency) -> Plain:
     """Return the same as plain data, in SI; complex numbers as pairs."""
     instead = {
         "hinf": {f"{extremes.mode} {extremes.of}": extremes for extremes in feel.hinf},
@@ -226,7 +227,7 @@ def feel_document(feel: Feel) -> Plain:
     return record(feel, instead)
 
 
-def feel_picture(feel: Feel, kind: str = "bode", ax: Any = None) -> Any:
+def feel_picture(feel: Transparency, kind: str = "bode", ax: Any = None) -> Any:
     """Draw the impedance, and what arrives elsewhere, as Bode's plot or Nyquist's; return the Figure.
 
     Into an `ax` of somebody's, of Bode's plot the magnitudes alone are drawn.
@@ -272,14 +273,14 @@ def feel_picture(feel: Feel, kind: str = "bode", ax: Any = None) -> Any:
     return size.figure
 
 
-def feel_rows(feel: Feel) -> Tabled:
+def feel_rows(feel: Transparency) -> Tabled:
     """Return the columns of a table of responses, a row a frequency, and what it is of."""
     responses = (("impedance", "N*s/m"), ("transmitted admittance", "m/s/N"), ("error per force", "m/N"))
-    headings = [Column("frequency", "Hz")]
+    headings = [TableColumn("frequency", "Hz")]
     headings += [
-        Column(f"{name} {which}", unit) for name, unit in responses for which in ("real", "imaginary")
+        TableColumn(f"{name} {which}", unit) for name, unit in responses for which in ("real", "imaginary")
     ]
-    headings += [Column(name) for name in ("alias", "bound", "transmitted bound", "error bound")]
+    headings += [TableColumn(name) for name in ("alias", "bound", "transmitted bound", "error bound")]
     curves = _curves(feel)
     parts = [part for values, *_ in curves for part in (values.real, values.imag)]
     columns = [feel.frequency_hz, *parts, feel.alias, *(bound for _, bound, *_ in curves)]

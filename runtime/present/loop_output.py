@@ -16,7 +16,7 @@ from apc.present.forms import Lines, notes, record, table
 from apc.present.network_output import recording_document
 
 if TYPE_CHECKING:
-    from apc.loop.beside import Measured, RunComparison, Ticks, WayRun
+    from apc.loop.beside import ArcRun, MeasuredLink, RunComparison, Ticks
 
 HEADINGS = ("50 %", "99 %", "99.9 %", "most")
 
@@ -65,7 +65,7 @@ def ticks_text(ticks: Sequence[Ticks]) -> Lines:
             yield from notes(f"{tick.peer}: {'; '.join(said)}")
 
 
-def _ways_text(ways: Iterable[WayRun]) -> Lines:
+def _ways_text(ways: Iterable[ArcRun]) -> Lines:
     rows = [("packets", "lost", "half within", "all within", "way")]
     for way in ways:
         came = way.came
@@ -79,7 +79,7 @@ def _ms(seconds: float) -> str:
     return f"{1e3 * seconds:.3f} ms"
 
 
-def _measured_text(measured: Measured) -> Lines:
+def _measured_text(measured: MeasuredLink) -> Lines:
     after = f"with {measured.link} heard after {1e3 * measured.delay:.6g} ms, as most of {measured.way} was"
     verdict = (
         f"{measured.analysis.verdict}, spectral radius {measured.analysis.spectral_radius:.6f} per frame"

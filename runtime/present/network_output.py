@@ -1,6 +1,6 @@
 """A verdict over an unreliable network, and what a recording of packets amounts to, as text and plain data.
 
-Takes: a `NetworkVerdict`, a `NetworkRecording`. Gives: of each its text and document; `recording_table`,
+Takes: a `MeanSquareStability`, a `LinkFit`. Gives: of each its text and document; `recording_table`,
 `link_entry`.
 Guarantees: what was not judged says why, what is taken for granted stands first; the keys are those of a
 link's entry as it is.
@@ -18,9 +18,9 @@ from apc.compiler.words import counted, wrapped
 from apc.present.forms import LINEARIZED, Lines, Plain, labelled, notes, radius_text, record, sentences
 
 if TYPE_CHECKING:
-    from apc.moments.network_verdict import NetworkVerdict
-    from apc.moments.worst import LossesInARow
-    from apc.network.recorded import NetworkRecording, Share
+    from apc.moments.network_verdict import MeanSquareStability
+    from apc.moments.worst import ConsecutiveLosses
+    from apc.network.recorded import LinkFit, Share
 
 _WORDS = {
     "stable in mean square": (
@@ -31,7 +31,7 @@ _WORDS = {
 }
 
 
-def network_text(result: NetworkVerdict) -> Lines:
+def network_text(result: MeanSquareStability) -> Lines:
     """Yield what becomes of a scene over its network, in words and numbers."""
     radius = result.mean_square_radius
     where = " over its network" if radius is None else ""
@@ -59,7 +59,7 @@ def network_text(result: NetworkVerdict) -> Lines:
     yield from notes(*result.notes)
 
 
-def _losses(losses_in_a_row: LossesInARow) -> Iterator[tuple[str, str]]:
+def _losses(losses_in_a_row: ConsecutiveLosses) -> Iterator[tuple[str, str]]:
     if losses_in_a_row.certified is not None:
         harmless = (
             f"any pattern of at most {losses_in_a_row.certified}"
@@ -75,12 +75,12 @@ def _losses(losses_in_a_row: LossesInARow) -> Iterator[tuple[str, str]]:
         yield "losses in a row", f"with none a motion {grows.replace('grow', 'grows', 1)}"
 
 
-def network_document(result: NetworkVerdict) -> Plain:
+def network_document(result: MeanSquareStability) -> Plain:
     """Return what becomes of a scene over its network as plain data."""
     return record(result, {"topology": ...})
 
 
-def recording_text(recording: NetworkRecording) -> Lines:
+def recording_text(recording: LinkFit) -> Lines:
     """Yield what a recording amounts to, in words and numbers, and a link's entry that says so."""
     of = f" by {recording.program}" if recording.program else ""
     file = Path(recording.file).name
@@ -114,20 +114,20 @@ def recording_text(recording: NetworkRecording) -> Lines:
     yield f"  or packet by packet\n    lan: {{clock: network, trace: {file}}}"
 
 
-def recording_document(recording: NetworkRecording) -> Plain:
+def recording_document(recording: LinkFit) -> Plain:
     """Return a recording as plain data: seconds, shares from 0 to 1."""
     shares = {name: getattr(recording, name) for name in ("lost", "turns_bad", "turns_good")}
     instead = {name: record(share, {"share": share.value}) for name, share in shares.items()}
     return record(recording, {"delays": ..., "entry": link_entry(recording), **instead})
 
 
-def recording_table(recording: NetworkRecording) -> str:
+def recording_table(recording: LinkFit) -> str:
     """Return all delays as the table that a link's `trace` takes."""
     rows = ("lost" if math.isinf(delay) else f"{delay * 1e3:.12g}" for delay in recording.delays)
     return "\n".join(["delay [ms]", *rows])
 
 
-def link_entry(recording: NetworkRecording) -> str:
+def link_entry(recording: LinkFit) -> str:
     """Return the entry of a link with the keys that a recording amounts to."""
     keys = ["clock: network"]
     if recording.law is not None:

@@ -21,15 +21,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import Temporary, begin_file, drop_file, finish_file, is_special, partial_name
 from apc.memory import refuse_beyond
 from apc.present.simulation_output import provenance_json
-from apc.simulation.rows_in_time import Block
+from apc.simulation.rows_in_time import OutputBlock
 from apc.simulation.simulation import Simulation
 from apc.simulation.trajectory import provenance_of
 from apc.suffixes import check_suffix
-from apc.tables import ENDS, LETTER, WRITERS, Column, Writer
+from apc.tables import ENDS, LETTER, WRITERS, TableColumn, TableWriter
 
 Floats = NDArray[np.float64]
 
@@ -41,13 +41,13 @@ COLUMN, CELL, IN_PARQUET, WAITING = 2000, 150, (24_000, 500), 32
 LABEL = 256  # bytes of a name with its unit in a MAT- or NPZ-file, without the letters themselves
 
 
-class Arrays(Writer):
+class Arrays(TableWriter):
     """Variables `time`, `values` (rows, signals), `names`, `units`, and what made them; abstract.
 
     They are written in one piece: the rows wait in the memory, and room is kept for them on the disk.
     """
 
-    def __init__(self, path: Path, columns: Sequence[Column], about: tuple[str, str]) -> None:
+    def __init__(self, path: Path, columns: Sequence[TableColumn], about: tuple[str, str]) -> None:
         super().__init__(path, columns, about)
         self.blocks: list[Floats] = []
         longest = max(len(column.name) + len(column.unit) for column in columns)
@@ -116,7 +116,10 @@ class Recording:
         self._until = 0.0  # seconds, the last row's time
         self._files: dict[Temporary, str] = {}  # temporary, and what its name adds to that of the file
         about = provenance_json(provenance_of(simulation))
-        columns = [Column("time", "s"), *(Column(signal.name, signal.unit) for signal in simulation.signals)]
+        columns = [
+            TableColumn("time", "s"),
+            *(TableColumn(signal.name, signal.unit) for signal in simulation.signals),
+        ]
         try:
             make = FORMATS[check_suffix(path, SUFFIXES, "--out")]
             self._writer = make(self._temporary(""), columns, (PROVENANCE, about))
@@ -134,7 +137,7 @@ class Recording:
         """How many rows are written, whole."""
         return self._writer.whole_rows
 
-    def take(self, block: Block) -> None:
+    def take(self, block: OutputBlock) -> None:
         """Write one block: all of it, or as many of its rows as there is room for."""
         done, step = 0, len(block.time)
         while done < len(block.time):
@@ -195,10 +198,16 @@ class Recording:
         except ApcError as failed:
             return failed
         what = f"holds the first {rows} rows only, up to {self._until:.9g} s: {_reason(error)}"
-        return ApcError(Mistake("E879", Place(str(self.path)), what)) if rows else self._failed(error)
+        return (
+            ApcError(Diagnostic("E879", SourceLocation(str(self.path)), what))
+            if rows
+            else self._failed(error)
+        )
 
     def _failed(self, error: OSError | ValueError) -> ApcError:
-        return ApcError(Mistake("E879", Place(str(self.path)), f"can't be written: {_reason(error)}"))
+        return ApcError(
+            Diagnostic("E879", SourceLocation(str(self.path)), f"can't be written: {_reason(error)}")
+        )
 
 
 def open_recording(path: Path, simulation: Simulation) -> Recording:
@@ -218,7 +227,7 @@ def open_recording(path: Path, simulation: Simulation) -> Recording:
     elif suffix == ".parquet":
         each += IN_PARQUET[0] + IN_PARQUET[1] * -(-simulation.rows // block)
     needed, what = columns * each, f"{simulation.rows:,} rows of {columns:,} columns in {path.name}"
-    refuse_beyond(needed, "E876", Place(simulation.system.origin.topology), what, "fewer --signals")
+    refuse_beyond(needed, "E876", SourceLocation(simulation.system.origin.topology), what, "fewer --signals")
     return Recording(path, simulation)
 
 

@@ -19,7 +19,7 @@ from apc.frame.display_units import as_shown
 from apc.present.analysis_output import range_document
 from apc.present.forms import MEANT, Lines, Plain, notes, picked, quantity, sentences, span, table
 from apc.present.region_picture import panel_letter, panels_picture, region_picture  # noqa: F401 -- looked up
-from apc.tables import Column, Row, Tabled
+from apc.tables import Row, TableColumn, Tabled
 
 if TYPE_CHECKING:
     from apc.regions.panels import Panel, Panels
@@ -162,15 +162,15 @@ def region_rows(region: Region) -> Tabled:
     return _columns(region), _rows(region), {}
 
 
-def _columns(region: Region) -> list[Column]:
+def _columns(region: Region) -> list[TableColumn]:
     """Return the columns of a table of boundary points."""
     x, y = (
-        Column(interval.free.label, "" if interval.unit == "1" else interval.unit)
+        TableColumn(interval.free.label, "" if interval.unit == "1" else interval.unit)
         for interval in (region.x, region.y)
     )
-    words = (Column("panel", kind="text"), Column("topology", kind="text"))
-    curve = (Column("curve", kind="count"), Column("mode", kind="text"))
-    return [*words, *curve, x, y, Column("error")]
+    words = (TableColumn("panel", kind="text"), TableColumn("topology", kind="text"))
+    curve = (TableColumn("curve", kind="count"), TableColumn("mode", kind="text"))
+    return [*words, *curve, x, y, TableColumn("error")]
 
 
 def _rows(region: Region, panel: str = "") -> Iterator[Row]:

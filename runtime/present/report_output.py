@@ -1,7 +1,7 @@
 """A report as one page of HTML, as a PDF, as text and as data; and read again from its page.
 
 Takes: a `Report`. Gives: `report_text`, `report_document`, `report_page`; `check_report_path`, `save_report`;
-`Page`, `read_page`, `split_page`, `kept_report`, `scene_again`.
+`StoredPage`, `read_page`, `split_page`, `kept_report`, `scene_again`.
 Guarantees: the page holds everything in itself and forbids its reader to load anything; what a scene says is
 text in it and never markup; its numbers stand in it as JSON too. A report read again is data: what it names
 is written nowhere but in a folder of its own.
@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, TypedDict
 
 import msgspec
 
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import RefusedError, check_target, read_file, unwritable, write_file, write_text
 from apc.compiler.timings import part
 from apc.optional import missing, need
@@ -178,7 +178,7 @@ class KeptReport(TypedDict):
     scenes: list[KeptScene]
 
 
-class Page(NamedTuple):
+class StoredPage(NamedTuple):
     """A page that was read: the HTML without its embedded data, these as JSON, and decoded."""
 
     shown: str
@@ -194,7 +194,7 @@ def split_page(text: str) -> tuple[str, str]:
     return f"{before}{begin}{end}{after}", kept
 
 
-def read_page(path: Path) -> Page:
+def read_page(path: Path) -> StoredPage:
     """Return a report's page and the data that it holds.
 
     Raises
@@ -206,14 +206,14 @@ def read_page(path: Path) -> Page:
         shown, text = split_page(read_file(path, LARGEST).decode("utf-8-sig"))
         kept = msgspec.json.decode(text, type=KeptReport)
     except RefusedError as refused:
-        raise ApcError(Mistake("E990", Place(str(path)), refused.words)) from None
+        raise ApcError(Diagnostic("E990", SourceLocation(str(path)), refused.words)) from None
     except (ValueError, RecursionError):
         raise damaged(path) from None
     if not kept["scenes"]:
         raise damaged(path, "holds no topology: nothing in it can be computed anew")
     if any(item["settings"] != kept["scenes"][0]["settings"] for item in kept["scenes"]):
         raise damaged(path, "holds topologies with different settings, which no report has")
-    return Page(shown, text, kept)
+    return StoredPage(shown, text, kept)
 
 
 def kept_report(path: Path) -> KeptReport:
@@ -223,7 +223,9 @@ def kept_report(path: Path) -> KeptReport:
 
 def damaged(path: Path, what: str = "is no report that apc has written, or is damaged") -> ApcError:
     """Return the message E990 of a page."""
-    return ApcError(Mistake("E990", Place(str(path)), what, hint="apc report scene.yaml --out report.html"))
+    return ApcError(
+        Diagnostic("E990", SourceLocation(str(path)), what, hint="apc report scene.yaml --out report.html")
+    )
 
 
 def scene_again(kept_scene: KeptScene, folder: Path) -> Path:
@@ -238,15 +240,17 @@ def scene_again(kept_scene: KeptScene, folder: Path) -> Path:
         parts = PurePosixPath(name).parts
         if not parts or name.startswith("/") or "\\" in name or ":" in name or ".." in parts:
             what = f"names a file outside of the scene's folder: {name[:80]}"
-            raise ApcError(Mistake("E990", Place(kept_scene["name"][:80]), what))
+            raise ApcError(Diagnostic("E990", SourceLocation(kept_scene["name"][:80]), what))
         path = folder.joinpath(*parts)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
         except (OSError, ValueError):
             what = f"names a file that can't be written: {name[:80]!r}"
-            raise ApcError(Mistake("E990", Place(kept_scene["name"][:80]), what)) from None
+            raise ApcError(Diagnostic("E990", SourceLocation(kept_scene["name"][:80]), what)) from None
     file = PurePosixPath(kept_scene["file"]).name
     if file not in dict(kept_scene["texts"]):
-        raise ApcError(Mistake("E990", Place(kept_scene["name"][:80]), f"holds no text of {file[:80]!r}"))
+        raise ApcError(
+            Diagnostic("E990", SourceLocation(kept_scene["name"][:80]), f"holds no text of {file[:80]!r}")
+        )
     return folder / file

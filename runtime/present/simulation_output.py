@@ -48,11 +48,11 @@ from apc.simulation.verdicts import (
 
 if TYPE_CHECKING:
     from apc.simulation.accuracy import ErrorEstimate
-    from apc.simulation.buzz import Buzz
+    from apc.simulation.buzz import LimitCycle
     from apc.simulation.decay import Fit, Oscillation
     from apc.simulation.ensemble import Ensemble, MeanSquare
     from apc.simulation.signals import Signal
-    from apc.simulation.trajectory import Played, Provenance, Trajectory
+    from apc.simulation.trajectory import Provenance, SimulationReport, Trajectory
 
 Floats = NDArray[np.float64]
 
@@ -91,7 +91,7 @@ LEAST_ERROR = 5e-7  # of a value: more digits than six are in the document
 BAND_TEXT = "last sample outside ±5 % of the range around the last value, all positions"
 
 
-def buzz_text(buzz: Buzz) -> Lines:
+def buzz_text(buzz: LimitCycle) -> Lines:
     """Yield a buzz as it is predicted beside what was played."""
     predicted = buzz.predicted
     settles = "settles" if buzz.settles else ""
@@ -114,7 +114,7 @@ def buzz_text(buzz: Buzz) -> Lines:
     yield from notes(buzz.reason, *buzz.notes)
 
 
-def played_text(played: Played) -> Lines:
+def played_text(played: SimulationReport) -> Lines:
     """Yield what `apc simulate` prints: the summary, the method if it is not exact, the error if known."""
     summary = played.summary
     units = {extent.name: extent.unit for extent in summary.extents}
@@ -159,7 +159,7 @@ def error_text(estimate: ErrorEstimate) -> str:
     return f"{about}{size}, {worst.relative:.1g} of its range ({estimate.compared})"
 
 
-def played_document(played: Played) -> Plain:
+def played_document(played: SimulationReport) -> Plain:
     """Return what `apc simulate --json` prints."""
     summary = played.summary
     fit = summary.fit
@@ -504,7 +504,7 @@ def _uncertain(value: float, error: float, unit: str) -> str:
     return measured(value, max(error, LEAST_ERROR * abs(value)), unit)
 
 
-def _facts(played: Played, units: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+def _facts(played: SimulationReport, units: Mapping[str, str]) -> Iterator[tuple[str, str]]:
     """Yield what a run amounts to, each fact with its label; `units` are those of its signals by name."""
     summary = played.summary
     moves = summary.verdict != AT_REST

@@ -1,6 +1,6 @@
 """A picture of how a scene begins: the bodies of every peer, and the surfaces between them.
 
-Takes: a `CompiledSystem`.
+Takes: a `Model`.
 Gives: `draw_actors`; `Actor`, `keep_in_sight` and `widen`, for what moves in it (see `animation`).
 Guarantees: bodies on an axis stand in a row a peer; those of a plane have a plane a peer, all to one scale,
 and a bar along the axis of each that turns.
@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.optional import need
-from apc.present.bodies import Body, Disc, Line, PeerView, moves_in_plane, positions_of, views_of
+from apc.present.bodies import Disc, DrawnBody, PeerView, SupportLine, moves_in_plane, positions_of, views_of
 from apc.present.pictures import colours_of, new_figure
 
 MM = 1e3
@@ -60,7 +60,7 @@ def _bar(angle: float) -> tuple[int, int, float]:
     return 2, 2, math.degrees(angle) - 90
 
 
-def draw_actors(system: CompiledSystem) -> tuple[Any, list[Actor]]:
+def draw_actors(system: Model) -> tuple[Any, list[Actor]]:
     """Draw how a scene begins; return the matplotlib Figure and the bodies in it, which can be moved.
 
     Raises
@@ -120,7 +120,7 @@ def _rows(views: Sequence[PeerView]) -> list[Any]:
     return [ax] * len(views)
 
 
-def _actor(ax: Any, peer: str, body: Body, row: int, colour: Any, size: int) -> Actor:
+def _actor(ax: Any, peer: str, body: DrawnBody, row: int, colour: Any, size: int) -> Actor:
     """Draw a body around the origin, shifted to its place; `size` is that of its mark, in points."""
     patches = need("matplotlib.patches", "plot")
     shift = need("matplotlib.transforms", "plot").Affine2D()
@@ -142,7 +142,7 @@ def _actor(ax: Any, peer: str, body: Body, row: int, colour: Any, size: int) -> 
     return Actor(ax, states, half, row, shift, tuple(artists), turning)
 
 
-def _draw_surface(ax: Any, surface: Disc | Line, row: int, bodies: Sequence[Body]) -> None:
+def _draw_surface(ax: Any, surface: Disc | SupportLine, row: int, bodies: Sequence[DrawnBody]) -> None:
     """Draw a fixed disc, or a line; of a plane in space where it meets that of the first body."""
     if isinstance(surface, Disc):
         place = tuple(MM * value for value in surface.centre[:2])
@@ -184,7 +184,7 @@ def widen(actor: Actor, track: NDArray[np.float64]) -> None:
         actor.ax.update_datalim([corner if len(corner) > 1 else (*corner, actor.row)])
 
 
-def _on_an_axis(system: CompiledSystem) -> list[str]:
+def _on_an_axis(system: Model) -> list[str]:
     """Return the bodies whose position is a number."""
     positions = [pair for kind in system.kinds for pair in positions_of(kind).items()]
     return list(dict.fromkeys(name.rpartition(".")[0] for name, places in positions if len(places) == 1))

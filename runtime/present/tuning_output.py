@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apc.compiler.compiled import LENGTH
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.words import counted, enumerated, in_hertz, wrapped
 from apc.frame.overrides import Override, apply
 from apc.present.analysis_output import changing_text, range_document, range_text
@@ -43,9 +43,9 @@ from apc.tuning.bound import SHARE
 from apc.tuning.demands import RADIUS, SETTLING
 
 if TYPE_CHECKING:
-    from apc.compiler.compiled import CompiledSystem
-    from apc.tuning.front import Front
-    from apc.tuning.tuner import Binding, Tuning
+    from apc.compiler.compiled import Model
+    from apc.tuning.front import ParetoFront
+    from apc.tuning.tuner import ActiveConstraint, Tuning
 
 # Digits of what is typed, and of what a limit buys.
 TYPED, BUYS = 12, 3
@@ -174,11 +174,11 @@ def _changing_lines(tuning: Tuning) -> Lines:
             yield from wrapped(f"with {'; '.join(where)}", "    ", "    ")
 
 
-def _where(binding: Binding) -> str:
+def _where(binding: ActiveConstraint) -> str:
     return ", ".join(f"{label} {quantity(value, unit)}" for label, value, unit in binding.where)
 
 
-def _binding_lines(tuning: Tuning, binding: Binding) -> Lines:
+def _binding_lines(tuning: Tuning, binding: ActiveConstraint) -> Lines:
     other = "what is felt" if tuning.felt else tuning.aim if _is_felt(tuning) else "stability"
     mode = f"{binding.shape} mode" if binding.shape else "" if math.isnan(binding.frequency_hz) else other
     if not mode and tuning.demanded and not tuning.felt:
@@ -193,12 +193,12 @@ def _binding_lines(tuning: Tuning, binding: Binding) -> Lines:
         yield from wrapped(text, "      ", "        ")
 
 
-def panels_of(system: CompiledSystem, gains: int) -> tuple[bool, bool]:
+def panels_of(system: Model, gains: int) -> tuple[bool, bool]:
     """Say whether a picture of so many gains has a stable region, and a strike: ApcError E996 if neither."""
     two, moves = gains == 2, any(state.unit == "m/s" for kind in system.kinds for state in kind.states)
     if not (two or moves):
         what = "nothing moves in this scene, and a stable region is of two gains"
-        raise ApcError(Mistake("E996", Place("--plot"), what, hint='another --free "PATH=LO:HI"'))
+        raise ApcError(Diagnostic("E996", SourceLocation("--plot"), what, hint='another --free "PATH=LO:HI"'))
     return two, moves
 
 
@@ -261,7 +261,7 @@ def _draw_struck(tuning: Tuning, ax: Any) -> None:
     ax.grid(linewidth=0.4, alpha=0.5)
 
 
-def front_text(front: Front) -> Lines:
+def front_text(front: ParetoFront) -> Lines:
     """Yield the designs as a table, those at the ends and at the knee named, in at most 80 columns."""
     best = "largest" if front.larger else "least"
     yield from wrapped(
@@ -288,7 +288,7 @@ def front_text(front: Front) -> Lines:
         yield from labelled(("knee", f"{knee} felt"))
 
 
-def front_picture(front: Front, ax: Any = None) -> Any:
+def front_picture(front: ParetoFront, ax: Any = None) -> Any:
     """Draw the front, three designs named; return the matplotlib Axes."""
     ax = new_figure((5.2, 3.8)).subplots() if ax is None else ax
     x, y = (np.array([getattr(design, name) for design in front.designs]) for name in ("felt", "value"))

@@ -1,6 +1,6 @@
 """The axes of a stable region: two parameters of a scene, and their ranges.
 
-Takes: a `CompiledSystem` and texts such as `contact.stiffness=10 N/m:3000 N/m`.
+Takes: a `Model` and texts such as `contact.stiffness=10 N/m:3000 N/m`.
 Gives: `parse_axes`; `PLACE`.
 Guarantees: a parameter that can't be an axis is refused, and said why.
 Does not: analyse.
@@ -11,14 +11,14 @@ from __future__ import annotations
 from dataclasses import replace
 from fractions import Fraction
 
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.words import with_unit
 from apc.frame.names import Range, overlap, proposed_range, unit_of
 from apc.sweeps.grid import parse_axis
 from apc.vary.timing_values import refuse_phase
 
-PLACE = Place("region")
+PLACE = SourceLocation("region")
 
 # The least width of a range, of its larger end: half the digits of a float are left to tell its points apart.
 NARROWEST = Fraction(1, 2**26)
@@ -27,7 +27,7 @@ _FORM = "contact.stiffness=10 N/m:3000 N/m"
 
 
 def parse_axes(
-    system: CompiledSystem, x: str | None, y: str | None, *, scale: Fraction = Fraction(1)
+    system: Model, x: str | None, y: str | None, *, scale: Fraction = Fraction(1)
 ) -> tuple[Range, Range]:
     """Read the two axes of a region: `PATH=LOW:HIGH` each, or the scene's own where one is left out.
 
@@ -57,18 +57,18 @@ def parse_axes(
             given = (y if letter == "x" else x) or ""
             other = given.partition("=")[0].strip()
             hint = f'--{letter} "{proposed_range(system, without=other)}"'
-            raise ApcError(Mistake("E901", PLACE, what, hint=hint))
+            raise ApcError(Diagnostic("E901", PLACE, what, hint=hint))
         name, equals, span = (part.strip() for part in text.partition("="))
         if not (equals and name and span.count(":") == 1):
             hint = f'--{letter} "{_FORM}"'
             raise ApcError(
-                Mistake("E901", PLACE, f"--{letter}", "PATH=LOW:HIGH", text[:80] or "nothing", hint)
+                Diagnostic("E901", PLACE, f"--{letter}", "PATH=LOW:HIGH", text[:80] or "nothing", hint)
             )
         try:
             axis = parse_axis(system, name, f"{span}:2")
         except ApcError as error:
             raise ApcError(
-                replace(mistake, place=Place(f"--{letter}"), hint=mistake.hint.removesuffix(":2"))
+                replace(mistake, place=SourceLocation(f"--{letter}"), hint=mistake.hint.removesuffix(":2"))
                 for mistake in error.mistakes
             ) from None
         refuse_phase(system, axis.free, PLACE, code="E903")
@@ -77,7 +77,7 @@ def parse_axes(
         if high - low < least:
             expected = with_unit(f"a width of at least {float(least):.2g}", axis.unit)
             what, got = f"the range of {axis.free.label}", with_unit(f"{float(high - low):.2g}", axis.unit)
-            raise ApcError(Mistake("E903", Place(f"--{letter}"), what, expected, got))
+            raise ApcError(Diagnostic("E903", SourceLocation(f"--{letter}"), what, expected, got))
         intervals.append(Range(axis.free, axis.unit, axis.values[0], axis.values[-1]))
     first, second = intervals
     if overlap(system, first.free, second.free):
@@ -85,5 +85,5 @@ def parse_axes(
         what = f"{item} is on both axes; a region has two parameters"
         if item != other:
             what = f"{item} and {other} are not apart: without a group it is that of all groups"
-        raise ApcError(Mistake("E902", PLACE, what))
+        raise ApcError(Diagnostic("E902", PLACE, what))
     return first, replace(second, low=second.low / scale, high=second.high / scale)

@@ -1,8 +1,8 @@
 """Boundary curves of a stable region in the unit square, to a stated accuracy.
 
 Takes: a `Eigenvalues` and the `Survey` of its cells.
-Gives: `Arc`, `trace`, `traced`; `trace_steps`, `straight_arc` for a boundary that has steps; `stable_area`,
-`relative_to`.
+Gives: `BoundaryArc`, `trace`, `traced`; `trace_steps`, `straight_arc` for a boundary that has steps;
+`stable_area`, `relative_to`.
 Guarantees: every point lies on the boundary to rounding; between its points a curve is the cubic Hermite
 interpolant through points and tangents, and that has been measured against the true boundary in the middle
 of every interval. Where one mode takes over from another the curve has a corner, solved for. Steps are known
@@ -86,7 +86,7 @@ LEAST_COORDINATE = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Arc:
+class BoundaryArc:
     """A piece of the boundary along which one mode decides, stable side on the left.
 
     `points` (k, 2) and `handles` (k − 1, 2, 2), see `curves`, are of the unit square.
@@ -155,7 +155,9 @@ class _Knots:
         return unit
 
 
-def trace(deciding: Eigenvalues, survey: Survey, *, tolerance: float, offset: Floats) -> tuple[Arc, ...]:
+def trace(
+    deciding: Eigenvalues, survey: Survey, *, tolerance: float, offset: Floats
+) -> tuple[BoundaryArc, ...]:
     """Follow the boundary through all crossings of a survey.
 
     Parameters
@@ -366,7 +368,7 @@ def _search(
     return np.concatenate([np.stack([a, new], axis=1), np.stack([new, b], axis=1)])
 
 
-def _arcs(deciding: Eigenvalues, knots: _Knots, closed: tuple[bool, ...]) -> tuple[Arc, ...]:
+def _arcs(deciding: Eigenvalues, knots: _Knots, closed: tuple[bool, ...]) -> tuple[BoundaryArc, ...]:
     """Return each chain's knots in order, cut at its corners."""
     arcs = []
     for chain, comes_back in enumerate(closed):
@@ -398,7 +400,7 @@ def _without_copies(points: Floats) -> Integers:
     return kept
 
 
-def _arc(deciding: Eigenvalues, knots: _Knots, piece: Integers, chain: int) -> Arc:
+def _arc(deciding: Eigenvalues, knots: _Knots, piece: Integers, chain: int) -> BoundaryArc:
     """Return some knots as an arc."""
     jumps = knots.jumps[piece]
     if jumps.any():
@@ -410,7 +412,7 @@ def _arc(deciding: Eigenvalues, knots: _Knots, piece: Integers, chain: int) -> A
     pairs = knots.pairs.at(piece)
     system = int(pairs.system[0])
     points, along = knots.points[piece], knots.tangents(piece)
-    return Arc(
+    return BoundaryArc(
         points=points,
         handles=handles_of(points[:-1], points[1:], along[:-1], along[1:]),
         errors=knots.error[piece[:-1]],
@@ -435,7 +437,7 @@ def trace_steps(
     survey: Survey,
     *,
     halvings: int = 0,
-) -> tuple[Arc, ...]:
+) -> tuple[BoundaryArc, ...]:
     """Follow a boundary that is known by verdicts alone, by straight lines.
 
     Over a link a packet is read at ticks only: the radius is a step function of the delay, and the boundary a
@@ -500,7 +502,7 @@ def _halved(growth: Callable[[Floats], Floats], points: Floats, errors: Floats) 
 
 def straight_arc(
     points: Floats, errors: Floats, knot: Floats, value: complex, chain: int = 0, rounding: float = 0.0
-) -> Arc:
+) -> BoundaryArc:
     """Return an arc of straight lines.
 
     Parameters
@@ -516,7 +518,7 @@ def straight_arc(
     rounding
         How far the points themselves may be off.
     """
-    return Arc(
+    return BoundaryArc(
         points=points,
         handles=straight_handles(points),
         errors=errors,
@@ -536,7 +538,7 @@ def traced(
     cells: int,
     tolerance: float,
     offset: Floats,
-) -> tuple[tuple[Arc, ...], Survey, float, float]:
+) -> tuple[tuple[BoundaryArc, ...], Survey, float, float]:
     """Survey the unit square and follow the boundary; cells are halved where a curve is lost.
 
     It was then taken for another one: two crossings lie on one side of a cell.
@@ -566,7 +568,7 @@ def traced(
     return arcs, result, area, off
 
 
-def stable_area(arcs: Sequence[Arc], survey: Survey) -> tuple[float, float]:
+def stable_area(arcs: Sequence[BoundaryArc], survey: Survey) -> tuple[float, float]:
     """Return the stable share of the unit square, by Green's theorem, and a bound on its error.
 
     ∮ x dy around the stable side: along the curves, and up the right edge where that is stable.

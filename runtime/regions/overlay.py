@@ -1,6 +1,6 @@
 """A published condition laid over two parameters of a scene: who plays which symbol, and the curve.
 
-Takes: a `CompiledSystem` and words such as
+Takes: a `Model` and words such as
 `colgate:K=contact.stiffness,B=contact.damping,b=device.damping,T=haptic.period`.
 Gives: `Overlay`, `parse_overlay`, `symbol_values`, `overlay_points`.
 Guarantees: which parameter plays which symbol is said by the user, every one of them, and never guessed;
@@ -18,15 +18,15 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem, Group
-from apc.compiler.errors import ApcError, Mistake, Place, nearest
-from apc.frame.names import Free, Range, find, unit_of, value_now
+from apc.compiler.compiled import Group, Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
+from apc.frame.names import ParameterRef, Range, find, unit_of, value_now
 from apc.frame.overrides import Override, apply
 from apc.hands.wall_conditions import CONDITIONS, MEANINGS, UNITS, PublishedCondition
 
 Floats = NDArray[np.float64]
 
-_PLACE = Place("overlay")
+_PLACE = SourceLocation("overlay")
 _FORM = "colgate:K=contact.stiffness,B=contact.damping,b=device.damping,T=haptic.period"
 
 # Lines of the plane along each axis on which the boundary is found: a curve of so many points looks smooth.
@@ -38,7 +38,7 @@ class Overlay:
     """A published condition, and what plays each of its symbols, in their order: a parameter or SI number."""
 
     condition: PublishedCondition
-    roles: tuple[Free | float, ...]
+    roles: tuple[ParameterRef | float, ...]
 
     @property
     def label(self) -> str:
@@ -46,7 +46,7 @@ class Overlay:
         return f"{self.condition.title}: {self.condition.formula}"
 
 
-def parse_overlay(system: CompiledSystem, text: str) -> Overlay:
+def parse_overlay(system: Model, text: str) -> Overlay:
     """Read `CONDITION:SYMBOL=PARAMETER,SYMBOL=QUANTITY,…`; every symbol of the condition must be given.
 
     Raises
@@ -57,31 +57,31 @@ def parse_overlay(system: CompiledSystem, text: str) -> Overlay:
     """
     name, colon, rest = (part.strip() for part in text.partition(":"))
     if not colon or not rest:
-        raise ApcError(Mistake("E886", _PLACE, "an overlay", "CONDITION:SYMBOL=NAME,…", text[:80], _FORM))
+        raise ApcError(Diagnostic("E886", _PLACE, "an overlay", "CONDITION:SYMBOL=NAME,…", text[:80], _FORM))
     condition = CONDITIONS.get(name)
     if condition is None:
         what = f"{name[:80]} is no published condition known here ({', '.join(CONDITIONS)})"
-        raise ApcError(Mistake("E886", _PLACE, what, hint=nearest(name, CONDITIONS) or _FORM))
-    result: dict[str, Free | float] = {}
+        raise ApcError(Diagnostic("E886", _PLACE, what, hint=nearest(name, CONDITIONS) or _FORM))
+    result: dict[str, ParameterRef | float] = {}
     for part in rest.split(","):
         symbol, equals, player = (piece.strip() for piece in part.partition("="))
         if not (equals and symbol and player):
-            raise ApcError(Mistake("E886", _PLACE, "a symbol", "SYMBOL=NAME", part[:80], _FORM))
+            raise ApcError(Diagnostic("E886", _PLACE, "a symbol", "SYMBOL=NAME", part[:80], _FORM))
         if symbol not in condition.symbols:
             what = f"{condition.formula} has no {symbol[:80]}; it has {', '.join(condition.symbols)}"
-            raise ApcError(Mistake("E886", _PLACE, what, hint=nearest(symbol, condition.symbols)))
+            raise ApcError(Diagnostic("E886", _PLACE, what, hint=nearest(symbol, condition.symbols)))
         if symbol in result:
-            raise ApcError(Mistake("E886", _PLACE, f"{symbol} is given twice"))
+            raise ApcError(Diagnostic("E886", _PLACE, f"{symbol} is given twice"))
         result[symbol] = _role(system, symbol, player)
     missing = [symbol for symbol in condition.symbols if symbol not in result]
     if missing:
         wanted = ", ".join(f"{symbol}, the {MEANINGS[symbol]}" for symbol in missing)
         hint = f"{text.strip()},{missing[0]}=… (a parameter or a quantity in {UNITS[missing[0]]})"
-        raise ApcError(Mistake("E886", _PLACE, f"{condition.formula} needs {wanted}", hint=hint))
+        raise ApcError(Diagnostic("E886", _PLACE, f"{condition.formula} needs {wanted}", hint=hint))
     return Overlay(condition, tuple(result[symbol] for symbol in condition.symbols))
 
 
-def _role(system: CompiledSystem, symbol: str, player: str) -> Free | float:
+def _role(system: Model, symbol: str, player: str) -> ParameterRef | float:
     """Read what plays a symbol: a quantity begins with a digit, sign or point, a parameter never does."""
     from apc.compiler.language.units import parse_unit, quantity
 
@@ -91,12 +91,12 @@ def _role(system: CompiledSystem, symbol: str, player: str) -> Free | float:
     name, unit = free.name, unit_of(system, free.name)
     if parse_unit(unit, _PLACE).dimension != parse_unit(UNITS[symbol], _PLACE).dimension:
         what = f"{symbol}, the {MEANINGS[symbol]},"
-        raise ApcError(Mistake("E204", _PLACE, what, UNITS[symbol], f"{name} in {unit}"))
+        raise ApcError(Diagnostic("E204", _PLACE, what, UNITS[symbol], f"{name} in {unit}"))
     if free.group is None:
         groups = [group for group in system.groups if name in _own_names(group)]
         if groups:
             what = f"{name} differs between peers, and {symbol} is one number"
-            raise ApcError(Mistake("E886", _PLACE, what, hint=f"{symbol}={groups[0].name}.{name}"))
+            raise ApcError(Diagnostic("E886", _PLACE, what, hint=f"{symbol}={groups[0].name}.{name}"))
     return free
 
 
@@ -105,12 +105,12 @@ def _own_names(group: Group) -> set[str]:
     return {value.name for value in group.values} | {column.name for column in group.columns}
 
 
-def symbol_values(system: CompiledSystem, overlay: Overlay) -> tuple[float, ...]:
+def symbol_values(system: Model, overlay: Overlay) -> tuple[float, ...]:
     """Return the value of each symbol with the scene's numbers, in the order of the condition's symbols."""
     return tuple(role if isinstance(role, float) else value_now(system, role) for role in overlay.roles)
 
 
-def overlay_points(system: CompiledSystem, overlay: Overlay, x: Range, y: Range) -> Floats:
+def overlay_points(system: Model, overlay: Overlay, x: Range, y: Range) -> Floats:
     """Return the boundary of an overlay's condition in the plane of two parameters, as one polyline.
 
     Parameters

@@ -15,8 +15,8 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.frame.ages import linear_sites
 from apc.frame.exchange import build_exchange
 from apc.frame.linearize import linearize
@@ -27,7 +27,7 @@ from apc.option_value import with_last_unit
 from apc.regions.axes import PLACE, parse_axes
 from apc.regions.overlay import Overlay, overlay_points, parse_overlay
 from apc.regions.stable_region import CELLS, Floats, Region, region
-from apc.result import Look, Result
+from apc.result import PlotStyle, Result
 from apc.vary.crossing import Progress
 
 # By what a parameter is moved to see which weights follow it: no round ratio, so that none of them agree.
@@ -65,7 +65,7 @@ class Panels(Result):
         regions = self.panels[0].regions
         return regions[0] if len(regions) == 1 else None
 
-    def plot(self, **look: Unpack[Look]) -> Any:
+    def plot(self, **look: Unpack[PlotStyle]) -> Any:
         """Draw all panels, as `look` says; return the matplotlib Figure."""
         return self._drawn(look=look)
 
@@ -75,7 +75,9 @@ def parse_panel(text: str) -> tuple[str, ...]:
     parts = tuple(part.strip() for part in text.split(","))
     if not all(part and "=" in part for part in parts):
         form = '--panel "lan.delay=0 ms, contact.delay=0 ms"'
-        raise ApcError(Mistake("E907", Place("--panel"), "a panel", "NAME=VALUE, …", text[:80], form))
+        raise ApcError(
+            Diagnostic("E907", SourceLocation("--panel"), "a panel", "NAME=VALUE, …", text[:80], form)
+        )
     return parts
 
 
@@ -91,16 +93,18 @@ def parse_vary(text: str) -> tuple[tuple[str, ...], ...]:
     texts = with_last_unit(values.split(","))
     if not (equals and name and all(texts)):
         form = "--vary lan.delay=0,8 ms"
-        raise ApcError(Mistake("E907", Place("--vary"), "--vary", "NAME=VALUE,VALUE,…", text[:80], form))
+        raise ApcError(
+            Diagnostic("E907", SourceLocation("--vary"), "--vary", "NAME=VALUE,VALUE,…", text[:80], form)
+        )
     return tuple((f"{name}={value}",) for value in texts)
 
 
 # A scene with a panel's settings, its axes, and what its y is multiplied by.
-_Work = tuple[CompiledSystem, tuple[Range, Range], int]
+_Work = tuple[Model, tuple[Range, Range], int]
 
 
 def compare_regions(
-    systems: Sequence[CompiledSystem],
+    systems: Sequence[Model],
     *,
     x: str | None = None,
     y: str | None = None,
@@ -161,7 +165,7 @@ def compare_regions(
     return Panels(tuple(result), normalize)
 
 
-def _refuse_set(axes: Sequence[Range], system: CompiledSystem, settings: Sequence[str]) -> None:
+def _refuse_set(axes: Sequence[Range], system: Model, settings: Sequence[str]) -> None:
     """Raise E902 when a panel sets what an axis varies."""
     for text in settings:
         free = parse_override(system, text).free
@@ -169,10 +173,10 @@ def _refuse_set(axes: Sequence[Range], system: CompiledSystem, settings: Sequenc
             all_of_it = free.group in (None, axis.free.group) and axis.free.name == free.name
             if all_of_it or axis.free.name in times_of(system, free.name):
                 what = f"{axis.free.label} is on an axis and set for the panel as well"
-                raise ApcError(Mistake("E902", PLACE, what))
+                raise ApcError(Diagnostic("E902", PLACE, what))
 
 
-def gain_factor(system: CompiledSystem, axis: Range) -> int:
+def gain_factor(system: Model, axis: Range) -> int:
     """Return how often a parameter counts: its number of others where it weighs a sum, 1 where a mean.
 
     With the mean of N − 1 others a peer is pulled as by one of them, with their sum as by all of them: the
@@ -193,7 +197,7 @@ def gain_factor(system: CompiledSystem, axis: Range) -> int:
         built = sites[group.kind]
         if not built.parameters_suffice:
             what = "the scene weighs its others one by one, so that there is no effective gain to compare at"
-            raise ApcError(Mistake("E906", PLACE, what))
+            raise ApcError(Diagnostic("E906", PLACE, what))
         before, after = (linearize(built, numbers.parameters[place][0]) for numbers in (first, second))
         for partition, tick_a, tick_b in zip(built.kind.clocks, before.ticks, after.ticks, strict=True):
             for column in np.flatnonzero((tick_a.r != tick_b.r).any(axis=0)).tolist():
@@ -207,5 +211,5 @@ def gain_factor(system: CompiledSystem, axis: Range) -> int:
                     numbers |= set(heard.tolist())
     if len(numbers) > 1:
         what = f"{axis.free.label} weighs what is heard of {' and '.join(map(str, sorted(numbers)))} others"
-        raise ApcError(Mistake("E906", PLACE, f"{what}, so that there is no one effective gain"))
+        raise ApcError(Diagnostic("E906", PLACE, f"{what}, so that there is no one effective gain"))
     return max(numbers, default=1)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from apc.eigen.eigenpairs import driving_parts
 from apc.frame.names import Range
 from apc.vary.batch import MatrixSource
-from apc.vary.leading import Part
+from apc.vary.leading import DrivingPart
 
 Floats = NDArray[np.float64]
 
@@ -66,7 +66,7 @@ class DirectFamily:
 
     evaluator: MatrixSource
     rectangle: Rectangle
-    parts: tuple[Part, ...]
+    parts: tuple[DrivingPart, ...]
     errors: tuple[Floats, ...]
 
     @property
@@ -90,7 +90,7 @@ class DirectFamily:
         return matrix[:count], slope.reshape(2, count, *slope.shape[1:])
 
 
-def _of_part(part: Part, matrices: Floats) -> Floats:
+def _of_part(part: DrivingPart, matrices: Floats) -> Floats:
     """Return the rows and columns of a part in matrices (k, n, n) of its system."""
     if len(part.states) == matrices.shape[1]:
         return matrices
@@ -111,9 +111,9 @@ def family_over(source: MatrixSource, rectangle: Rectangle, errors: Errors) -> D
     """
     corners = rectangle.values(INSIDE)
     wrong = tuple(values.max(axis=0) for values in errors(corners))
-    parts: list[Part] = []
+    parts: list[DrivingPart] = []
     for system, (error, matrix) in enumerate(zip(wrong, source.matrices(corners), strict=True)):
         driving = driving_parts(np.abs(matrix).max(axis=0) + error != 0)
-        parts += [Part(system, states) for states in driving or [np.arange(len(error))]]
+        parts += [DrivingPart(system, states) for states in driving or [np.arange(len(error))]]
     own = tuple(wrong[part.system][np.ix_(part.states, part.states)] for part in parts)
     return DirectFamily(source, rectangle, tuple(parts), own)

@@ -1,6 +1,6 @@
 """The stable region of two parameters: exact boundary curves, areas, and who is inside.
 
-Takes: a `CompiledSystem`, two parameters and their ranges.
+Takes: a `Model`, two parameters and their ranges.
 Gives: `Curve`, `Region`, `region`, `side_of_curves`.
 Guarantees: every curve comes with a bound on its distance from the boundary, the mode that makes it and that
 mode's frequency; an empty region and one without boundary are answers. What was looked at how finely is part
@@ -20,26 +20,26 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import near_start, prepare_at_start
 from apc.analysis.sides import Side, sides
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic
 from apc.compiler.timings import part
 from apc.compiler.words import counted
-from apc.eigen.closing import ClosedSystem
+from apc.eigen.closing import ClosedLoop
 from apc.eigen.spectrum import mode_near
 from apc.frame.devices import replaced_hands
 from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, prepare
-from apc.frame.names import Free, Range, notes_for_all_groups
+from apc.frame.names import ParameterRef, Range, notes_for_all_groups
 from apc.frame.overrides import apply
 from apc.network.nominal import left_out, refuse_channel_number
 from apc.regions.axes import PLACE
-from apc.regions.boundary import Arc, relative_to, stable_area, trace_steps, traced
+from apc.regions.boundary import BoundaryArc, relative_to, stable_area, trace_steps, traced
 from apc.regions.curves import between
 from apc.regions.deciding import Eigenvalues, log_magnitudes
 from apc.regions.rectangle import INSIDE, DirectFamily, Rectangle, family_over, rectangle_of
-from apc.regions.strips import BRANCHES, Striped, trace_strips
+from apc.regions.strips import BRANCHES, TracedRegion, trace_strips
 from apc.regions.survey import blurred, just_inside, survey
-from apc.result import Look, Result
+from apc.result import PlotStyle, Result
 from apc.threads import single_threaded
 from apc.vary.batch import BatchEvaluator
 from apc.vary.crossing import Progress
@@ -63,7 +63,7 @@ from apc.vary.growth import (
     judge_at,
     refuse_time,
 )
-from apc.vary.leading import Part
+from apc.vary.leading import DrivingPart
 from apc.vary.timing_values import is_scaled, reaches_period
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ CHUNK = 1024
 
 
 # What gives the closed systems at a point; none where one number decides.
-ClosedAt = Callable[[Sequence[float]], tuple[ClosedSystem, ...]]
+ClosedAt = Callable[[Sequence[float]], tuple[ClosedLoop, ...]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -182,7 +182,7 @@ class Region(Result):
     linearized: bool
     criterion: str
     left_out: tuple[str, ...]
-    system: CompiledSystem
+    system: Model
 
     @property
     def coarse(self) -> tuple[Curve, ...]:
@@ -199,7 +199,7 @@ class Region(Result):
         table: pandas.DataFrame = self._shown("table")
         return table
 
-    def plot(self, ax: Any = None, **look: Unpack[Look]) -> Any:
+    def plot(self, ax: Any = None, **look: Unpack[PlotStyle]) -> Any:
         """Draw the region into a matplotlib Axes, or a figure of its own, as `look` says; return the Axes."""
         return self._drawn(ax, look=look)
 
@@ -228,7 +228,7 @@ class Region(Result):
                 f"{axis.free.label} in {float(axis.low):g} to {float(axis.high):g} {axis.unit}"
                 for axis in (self.x, self.y)
             )
-            raise ApcError(Mistake("E904", PLACE, "a point", ranges, "one outside"))
+            raise ApcError(Diagnostic("E904", PLACE, "a point", ranges, "one outside"))
         inside, near = side_of_curves(self, points)
         if near.any():
             inside[near] = _decide(self, values[near])
@@ -237,7 +237,7 @@ class Region(Result):
 
 @part("region")
 def region(
-    system: CompiledSystem,
+    system: Model,
     axes: tuple[Range, Range],
     *,
     cells: int = CELLS,
@@ -305,7 +305,7 @@ def region(
         _refuse_two_times(system, [free[place] for place in times])
         starts = () if meant in BY_GROWTH else _starts(system, prepared, free, rectangle)
         start = starts[0].prepared if len(starts) == 1 else None
-        striped: Striped | None = None
+        striped: TracedRegion | None = None
         if not starts or times or scales:
             plane = _points_plane(system, free, rectangle, prepared, meant, stepped=bool(times))
             if meant == NOMINAL and not times:
@@ -360,7 +360,7 @@ def region(
 
 
 def _starts(
-    system: CompiledSystem, prepared: Prepared, free: tuple[Free, ...], rectangle: Rectangle
+    system: Model, prepared: Prepared, free: tuple[ParameterRef, ...], rectangle: Rectangle
 ) -> tuple[Side, ...]:
     """Return the models at the start, one for each side of a kink, with their Jacobians linearized there.
 
@@ -380,18 +380,18 @@ def _starts(
     )
 
 
-def _scales(system: CompiledSystem, free: Free) -> bool:
+def _scales(system: Model, free: ParameterRef) -> bool:
     return reaches_period(system, free) and is_scaled(system, free, delays=True)
 
 
-def _refuse_two_times(system: CompiledSystem, times: Sequence[Free]) -> None:
+def _refuse_two_times(system: Model, times: Sequence[ParameterRef]) -> None:
     """Refuse a period together with another time, unless all clocks scale with it: ApcError E903."""
     if len(times) < 2:
         return
     for free in times:
         if reaches_period(system, free) and not is_scaled(system, free):
             what = f"{free.label} is a period, and the other axis a time: their frames are too long"
-            raise ApcError(Mistake("E903", PLACE, what, hint=f"apc critical {free.label}"))
+            raise ApcError(Diagnostic("E903", PLACE, what, hint=f"apc critical {free.label}"))
 
 
 def _check_count(axis: Range, both: bool, timed: bool, meant: str, *, affine: bool) -> None:
@@ -405,7 +405,7 @@ def _check_count(axis: Range, both: bool, timed: bool, meant: str, *, affine: bo
     why = next((text for text, applies in reasons.items() if applies), "")
     if why:
         what = f"{axis.free.label} is a number of peers: no steps are drawn for {why}"
-        raise ApcError(Mistake("E903", PLACE, what, hint=f"apc critical {axis.free.label}"))
+        raise ApcError(Diagnostic("E903", PLACE, what, hint=f"apc critical {axis.free.label}"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -419,8 +419,8 @@ class _Plane:
 
 
 def _points_plane(
-    system: CompiledSystem,
-    free: tuple[Free, ...],
+    system: Model,
+    free: tuple[ParameterRef, ...],
     rectangle: Rectangle,
     prepared: Prepared,
     meant: str,
@@ -431,7 +431,7 @@ def _points_plane(
     source = RadiusEvaluator(system, free, prepared, PLACE, meant)
     # One point's bounds are enough, and dear.
     (errors,) = source.errors(rectangle.values(np.array([[0.5, 0.5]])))
-    family = DirectFamily(source, rectangle, (Part(0, np.arange(1)),), (errors[0],))
+    family = DirectFamily(source, rectangle, (DrivingPart(0, np.arange(1)),), (errors[0],))
     closed = partial(closed_at, system, free, prepared) if meant == NOMINAL else None
     # What hands can draw is known as the damping needed, which jumps.
     halvings = HALVINGS if meant == PASSIVE else 0
@@ -439,7 +439,7 @@ def _points_plane(
 
 
 def _pieces_plane(
-    system: CompiledSystem,
+    system: Model,
     source: BatchEvaluator,
     rectangle: Rectangle,
     prepared: Prepared,
@@ -449,11 +449,11 @@ def _pieces_plane(
     size = sum(len(closed.matrix) for closed in source.closed)
     pieces = PiecewiseEvaluator(system, source.free, start, size)
     (errors,) = pieces.errors(rectangle.values(np.array([[0.5, 0.5]])))
-    family = DirectFamily(pieces, rectangle, (Part(0, np.arange(size)),), (errors[0],))
+    family = DirectFamily(pieces, rectangle, (DrivingPart(0, np.arange(size)),), (errors[0],))
     return _Plane(family, partial(closed_at, system, source.free, prepared), stepped=False)
 
 
-def _surveyed(plane: _Plane, cells: int, tolerance: float, progress: Progress | None) -> Striped:
+def _surveyed(plane: _Plane, cells: int, tolerance: float, progress: Progress | None) -> TracedRegion:
     """Survey the whole rectangle and follow the boundary through it, or go by steps from cell to cell."""
     deciding = Eigenvalues(plane.family)
     looked = 0
@@ -479,7 +479,7 @@ def _surveyed(plane: _Plane, cells: int, tolerance: float, progress: Progress | 
         arcs, result, area, off = traced(deciding, samples, cells=cells, tolerance=tolerance, offset=offset)
     if off >= 1:  # of the unit square: the boundary may be anywhere in it
         raise blurred()
-    return Striped(
+    return TracedRegion(
         arcs, area, off, result.corners[0], (result.cell, result.cell), result.finest / result.cell
     )
 
@@ -497,7 +497,7 @@ def _samples(plane: _Plane, points: Floats) -> Floats:
             if plane.closed_at is not None:
                 plane.closed_at(value)
             what = "the scene's frame leaves the range of floating point numbers in part of the rectangle"
-            raise ApcError(Mistake("E905", PLACE, what, hint="a smaller range"))
+            raise ApcError(Diagnostic("E905", PLACE, what, hint="a smaller range"))
     return log_magnitudes(matrices, BRANCHES)
 
 
@@ -508,7 +508,7 @@ def _leading(plane: _Plane, point: Floats) -> complex:
     return source.leading(rectangle.values(point).tolist())
 
 
-def _curve(plane: _Plane, arc: Arc, criterion: str) -> Curve:
+def _curve(plane: _Plane, arc: BoundaryArc, criterion: str) -> Curve:
     """Return an arc in SI."""
     rectangle, values = plane.family.rectangle, arc.values
     if arc.smooth and criterion == NOMINAL and isinstance(plane.family.evaluator, RadiusEvaluator):
@@ -527,7 +527,7 @@ def _curve(plane: _Plane, arc: Arc, criterion: str) -> Curve:
     )
 
 
-def _relative_error(arc: Arc, offset: Floats) -> float:
+def _relative_error(arc: BoundaryArc, offset: Floats) -> float:
     """Return the largest distance from the boundary, relative to the coordinate it changes less."""
     size = relative_to(arc.points, arc.normals, offset)
     errors = np.maximum(np.append(arc.errors, 0.0), np.insert(arc.errors, 0, 0.0)) + arc.rounding

@@ -1,7 +1,7 @@
 """The boundary of a stable region over a delay and another parameter, strip by strip of the delay.
 
-Takes: a `CompiledSystem`, a delay's range and another parameter's.
-Gives: `Striped`, `trace_strips`.
+Takes: a `Model`, a delay's range and another parameter's.
+Gives: `TracedRegion`, `trace_strips`.
 Guarantees: within a strip the order of events stays: curves there are as right as those of two parameters
 that reach no time; between strips, where events coincide, the boundary goes straight along the delay's value.
 A number of peers goes by strips too, one each from halfway to the one before to halfway to the next.
@@ -21,13 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import lifted_groups
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.eigen.relative import relative_bounded
 from apc.eigen.spectrum import mode_near
 from apc.frame.instance import Prepared
-from apc.frame.names import Free, Range, parameter_of
+from apc.frame.names import ParameterRef, Range, parameter_of
 from apc.regions.axes import PLACE
-from apc.regions.boundary import Arc, straight_arc, traced
+from apc.regions.boundary import BoundaryArc, straight_arc, traced
 from apc.regions.curves import tangents
 from apc.regions.deciding import Eigenvalues, log_magnitudes
 from apc.regions.rectangle import DirectFamily, Rectangle, family_over, rectangle_of
@@ -35,10 +35,10 @@ from apc.regions.survey import HALVINGS
 from apc.vary.batch import batch_evaluator
 from apc.vary.counts import count_pieces
 from apc.vary.crossing import ESTIMATE, search
-from apc.vary.delays import Piece, delay_pieces, pace
+from apc.vary.delays import DelaySegment, delay_pieces, pace
 from apc.vary.evaluator import closed_at, evaluator_of_many, generic, reaches_count
 from apc.vary.growth import NOMINAL, RadiusEvaluator
-from apc.vary.line import MatrixLine
+from apc.vary.line import MatrixPath
 from apc.vary.periods import period_pieces
 from apc.vary.timing_values import reaches_period, system_with_delay
 
@@ -56,14 +56,14 @@ INSIDE = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
-class Striped:
+class TracedRegion:
     """A boundary in the unit square: the delay runs along `axis` (0: x, 1: y).
 
     `area` is the stable share of the square, `off` bounds its error, `corner` says whether (0, 0) is stable,
     `cell` are the sides of the largest cells, `finest` is the share of them that the smallest had.
     """
 
-    arcs: tuple[Arc, ...]
+    arcs: tuple[BoundaryArc, ...]
     area: float
     off: float
     corner: bool
@@ -80,14 +80,14 @@ class _Strip:
 
     start: float
     end: float
-    arcs: tuple[Arc, ...]
+    arcs: tuple[BoundaryArc, ...]
     stable: tuple[bool, bool]
     area: float
     off: float
 
 
 def trace_strips(
-    system: CompiledSystem,
+    system: Model,
     axes: tuple[Range, Range],
     axis: int,
     prepared: Prepared,
@@ -95,7 +95,7 @@ def trace_strips(
     cells: int,
     tolerance: float,
     progress: Callable[[str], None] | None = None,
-) -> Striped | None:
+) -> TracedRegion | None:
     """Follow the boundary strip by strip; None where some strip can't be had in closed form.
 
     Parameters
@@ -135,7 +135,7 @@ def trace_strips(
             listed_edges = [replace(edge, errors=edge.errors + width) for edge in listed_edges]
         edges += listed_edges
 
-    def mode_of(arc: Arc) -> str:
+    def mode_of(arc: BoundaryArc) -> str:
         value = rectangle.values(arc.knots)[0].tolist()
         closed = closed_at(system, whole.free, prepared, value)
         return mode_near(closed, complex(arc.values[0])).shape
@@ -143,7 +143,7 @@ def trace_strips(
     listed = _joined([arc for own in arcs for arc in own] + edges, mode_of)
     widest = max(strip.end - strip.start for strip in strips)
     cell = (widest / cells, 1 / cells)
-    return Striped(
+    return TracedRegion(
         arcs=tuple(replace(_swapped(arc) if axis else arc, chain=n) for n, arc in enumerate(listed)),
         area=sum((strip.end - strip.start) * strip.area for strip in strips),
         off=sum((strip.end - strip.start) * strip.off for strip in strips),
@@ -154,7 +154,7 @@ def trace_strips(
 
 
 def _strips(
-    system: CompiledSystem,
+    system: Model,
     delay: Range,
     other: Range,
     prepared: Prepared,
@@ -200,11 +200,11 @@ def _between_periods(strips: Sequence[_Strip]) -> list[_Strip]:
     return result
 
 
-def _standing(piece: Piece, other: Range, ends: Sequence[float], prepared: Prepared) -> _Strip | None:
+def _standing(piece: DelaySegment, other: Range, ends: Sequence[float], prepared: Prepared) -> _Strip | None:
     """Return a strip in which nothing depends on the delay: straight lines at the other's critical values."""
     low, high, free = float(other.low), float(other.high), other.free
     family = evaluator_of_many(piece.inside, [free], PLACE, prepared=prepared)
-    line = MatrixLine(family, prepared, np.array([parameter_of(piece.inside, free).value]), 0, low, high)
+    line = MatrixPath(family, prepared, np.array([parameter_of(piece.inside, free).value]), 0, low, high)
     result = search(line)
     if not result.stable or any(edge.proof == ESTIMATE for edge in result.edges):
         return None
@@ -231,10 +231,10 @@ def _standing(piece: Piece, other: Range, ends: Sequence[float], prepared: Prepa
 
 
 def _moving(
-    system: CompiledSystem,
+    system: Model,
     delay: Range,
     other: Range,
-    piece: Piece,
+    piece: DelaySegment,
     ends: Sequence[float],
     prepared: Prepared,
     cells: int,
@@ -259,7 +259,11 @@ def _moving(
 
 
 def _within(
-    system: CompiledSystem, free: tuple[Free, Free], prepared: Prepared, piece: Piece, rectangle: Rectangle
+    system: Model,
+    free: tuple[ParameterRef, ParameterRef],
+    prepared: Prepared,
+    piece: DelaySegment,
+    rectangle: Rectangle,
 ) -> DirectFamily | None:
     """Return the matrices over a strip, each step linear in the delay; None where other motions are free."""
     assert piece.evaluator is not None, "something depends on the delay"
@@ -284,7 +288,7 @@ def _within(
     return family_over(family, rectangle, errors)
 
 
-def _placed(arc: Arc, ends: Sequence[float]) -> Arc:
+def _placed(arc: BoundaryArc, ends: Sequence[float]) -> BoundaryArc:
     """Return an arc of a strip's unit square in that of the whole."""
     scale = np.array([ends[1] - ends[0], 1.0])
 
@@ -308,12 +312,12 @@ def _placed(arc: Arc, ends: Sequence[float]) -> Arc:
 
 def _join(
     strips: Sequence[_Strip],
-    arcs: list[list[Arc]],
+    arcs: list[list[BoundaryArc]],
     place: int,
     same: float,
     source: RadiusEvaluator,
     rectangle: Rectangle,
-) -> list[Arc]:
+) -> list[BoundaryArc]:
     """Join the curves of two strips at the edge between them; return the straight pieces along it.
 
     Ends that are one point become one; where one side of the edge is stable and the other is not, the
@@ -345,7 +349,7 @@ def _join(
     return result
 
 
-def _ended(arc: Arc, end: int, point: Floats) -> Arc:
+def _ended(arc: BoundaryArc, end: int, point: Floats) -> BoundaryArc:
     """Return an arc with one end moved by less than a tolerance or so."""
     points, errors = arc.points.copy(), arc.errors.copy()
     errors[end] += float(np.linalg.norm(points[end] - point))
@@ -362,7 +366,7 @@ def _edge_piece(
     place: int,
     source: RadiusEvaluator,
     rectangle: Rectangle,
-) -> Arc:
+) -> BoundaryArc:
     """Return a piece of the boundary along an edge between strips, and the motion that grows beside it."""
     grows = strips[place] if stable_before else strips[place - 1]
     inside = (1 if stable_before else -1) * INSIDE * (grows.end - grows.start)
@@ -374,10 +378,10 @@ def _edge_piece(
     return straight_arc(points, np.array([np.spacing(1.0)]), knot, leading)
 
 
-def _joined(arcs: Sequence[Arc], mode_of: Callable[[Arc], str]) -> list[Arc]:
+def _joined(arcs: Sequence[BoundaryArc], mode_of: Callable[[BoundaryArc], str]) -> list[BoundaryArc]:
     """Return the arcs, straight ones of one mode that follow one another as one."""
     result = [arc for arc in arcs if arc.smooth]
-    alike: dict[str, list[Arc]] = {}
+    alike: dict[str, list[BoundaryArc]] = {}
     for arc in arcs:
         if not arc.smooth:
             alike.setdefault(mode_of(arc), []).append(arc)
@@ -386,7 +390,7 @@ def _joined(arcs: Sequence[Arc], mode_of: Callable[[Arc], str]) -> list[Arc]:
     return result
 
 
-def _chained(listed: list[Arc]) -> list[Arc]:
+def _chained(listed: list[BoundaryArc]) -> list[BoundaryArc]:
     """Return straight arcs, those that follow one another as one."""
     arcs = []
     while listed:
@@ -405,7 +409,7 @@ def _chained(listed: list[Arc]) -> list[Arc]:
     return arcs
 
 
-def _after(arc: Arc, other: Arc) -> Arc:
+def _after(arc: BoundaryArc, other: BoundaryArc) -> BoundaryArc:
     """Return two arcs as one."""
     points = np.concatenate([arc.points, other.points[1:]])
     rest: dict[str, Any] = {
@@ -415,7 +419,7 @@ def _after(arc: Arc, other: Arc) -> Arc:
     return replace(arc, points=points, **rest)
 
 
-def _swapped(arc: Arc) -> Arc:
+def _swapped(arc: BoundaryArc) -> BoundaryArc:
     """Return an arc with its coordinates in the other order, and so backwards: the stable side stays left."""
     names = ("points", "handles", "errors", "knots", "values")
     backwards: dict[str, Any] = {name: getattr(arc, name)[::-1] for name in names}

@@ -22,7 +22,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 
 Floats = NDArray[np.float64]
 Node = tuple[int, int]  # lattice coordinates
@@ -70,7 +70,7 @@ class Survey:
 def blurred() -> ApcError:
     """Return the refusal of a boundary that rounding puts anywhere."""
     what = "in part of the rectangle some motion neither grows nor dies out, as far as floats can tell"
-    return ApcError(Mistake("E905", Place("region"), what, hint="some damping, or wider ranges"))
+    return ApcError(Diagnostic("E905", SourceLocation("region"), what, hint="some damping, or wider ranges"))
 
 
 def survey(log_magnitudes: Callable[[Floats], Floats], *, cells: int) -> Survey:

@@ -16,10 +16,10 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from apc.analysis.needs import needs
-from apc.answer import Answer, answer
+from apc.answer import AnalysisReport, answer
 from apc.comparison.choice import DELAY, LOSS, STIFFNESS, choose
-from apc.comparison.comparison import Comparison, compare
-from apc.compiler.compiled import CompiledSystem
+from apc.comparison.comparison import SchemeComparison, compare
+from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.compiler.timings import part
 from apc.compiler.words import counted
@@ -84,7 +84,7 @@ class Report(Result):
     shown_by = "report_output:report"
 
     scenes: tuple[SceneReport, ...]
-    comparison: Comparison | None
+    comparison: SchemeComparison | None
     refused: str
     versions: tuple[tuple[str, str], ...]
 
@@ -127,10 +127,10 @@ def _versions() -> tuple[tuple[str, str], ...]:
     return tuple(result)
 
 
-def _scene(path: Path, system: CompiledSystem, settings: Sequence[str]) -> SceneReport:
+def _scene(path: Path, system: Model, settings: Sequence[str]) -> SceneReport:
     words = " ".join(f"--set {shlex.quote(text)}" for text in settings)
     call = f"{shlex.quote(path.name)} {words}".strip()
-    made: tuple[tuple[str, Callable[[CompiledSystem, str], Section]], ...] = (
+    made: tuple[tuple[str, Callable[[Model, str], Section]], ...] = (
         ("compiled", _compiled),
         ("verdict", _verdict),
         ("limits", _limits),
@@ -157,7 +157,7 @@ def _why(error: ApcError) -> str:
     return f"{mistake.what}{wanted}"
 
 
-def _texts(system: CompiledSystem) -> Iterable[tuple[str, str]]:
+def _texts(system: Model) -> Iterable[tuple[str, str]]:
     """Yield the texts of a scene's own: the topology, its tables, its components."""
     for name, text in system.origin.texts:
         if PurePath(name).suffix and not name.endswith("/"):
@@ -167,13 +167,13 @@ def _texts(system: CompiledSystem) -> Iterable[tuple[str, str]]:
 # ---- the sections ----
 
 
-def _compiled(system: CompiledSystem, call: str) -> Section:
+def _compiled(system: Model, call: str) -> Section:
     remarks = [f"Warning: {warning}" for warning in system.warnings]
     remarks += [f"left out: {name}, as {reason}" for name, reason in system.dropped]
     return Section("compiled", f"apc compile {call.split(' --set')[0]}", tuple(remarks), (needs(system),))
 
 
-def _answered(system: CompiledSystem) -> tuple[Answer, str]:
+def _answered(system: Model) -> tuple[AnalysisReport, str]:
     """Return the analysis, proved where that can be had, and the option that proves it."""
     try:
         return answer(system, certify=True), " --certify"
@@ -181,18 +181,18 @@ def _answered(system: CompiledSystem) -> tuple[Answer, str]:
         return answer(system), ""
 
 
-def _verdict(system: CompiledSystem, call: str) -> Section:
+def _verdict(system: Model, call: str) -> Section:
     answer, option = _answered(system)
     command = f"apc analyze {call}{option} --plot eigenvalues.svg"
     return Section("verdict", command, (), (answer,), (answer.analysis,))
 
 
-def _limits(system: CompiledSystem, call: str) -> Section:
+def _limits(system: Model, call: str) -> Section:
     asked = [(axis, choice.name, choice.why) for axis, choice in choose(system, ()).items()]
     return _criticals(system, call, "limits", [item for item in asked if item[0] in (STIFFNESS, DELAY)])
 
 
-def _network(system: CompiledSystem, call: str) -> Section:
+def _network(system: Model, call: str) -> Section:
     loss = choose(system, ())[LOSS]
     channels = [link.channel for link in system.links if link.channel is not None]
     jitters = [(JITTER, channel.jitter, "") for channel in channels if channel.jitter is not None]
@@ -200,7 +200,7 @@ def _network(system: CompiledSystem, call: str) -> Section:
 
 
 def _criticals(
-    system: CompiledSystem,
+    system: Model,
     call: str,
     key: str,
     asked: Sequence[tuple[str, str, str]],
@@ -227,7 +227,7 @@ def _criticals(
     return Section(key, " && ".join(commands), tuple(remarks), tuple(results), tuple(drawn))
 
 
-def _region(system: CompiledSystem, call: str) -> Section:
+def _region(system: Model, call: str) -> Section:
     asked: list[str | None] = [None, None]
     if len(system.region) < 2:
         stiff = [free for free in coupler_parameters(system) if unit_of(system, free.name) in STIFFNESSES]
@@ -249,7 +249,7 @@ def _region(system: CompiledSystem, call: str) -> Section:
     return Section("region", command, (text,) if unreliable else (), (result,), (result,))
 
 
-def _response(system: CompiledSystem, call: str) -> Section:
+def _response(system: Model, call: str) -> Section:
     if system.peers > MOST_PLAYED:
         why = f"{counted(system.peers, 'peer', ',')} are more than the {MOST_PLAYED} that a report plays"
         return Section("response", "", refused=f"{why}; apc simulate does")
@@ -269,7 +269,7 @@ def _response(system: CompiledSystem, call: str) -> Section:
     return Section("response", command, tuple(remarks), (trajectory,), (trajectory,))
 
 
-def _feel(system: CompiledSystem, call: str) -> Section:
+def _feel(system: Model, call: str) -> Section:
     low, count = FEEL
     result = feel(system, read_frequencies(system, None, low, None, count))
     return Section("feel", f"apc feel {call} --points {count} --out feel.svg", (), (result,), (result,))

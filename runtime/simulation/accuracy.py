@@ -1,7 +1,7 @@
 """How far a simulation is from the scene's true motion: the same played again, more closely.
 
 Takes: a `Simulation`.
-Gives: `Comparison`, `SignalError`, `ErrorEstimate`, `compare_with`.
+Gives: `AccuracyEstimator`, `SignalError`, `ErrorEstimate`, `compare_with`.
 Guarantees: the two runs hear the same packets; the memory used does not grow with the duration.
 Does not: prove a bound: where a motion is unstable, or contacts are lost and made, both runs go ways of their
 own, and the estimate says so by its size.
@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.simulation.rows_in_time import Block, blocks
+from apc.simulation.rows_in_time import OutputBlock, blocks
 from apc.simulation.settings import finer
 from apc.simulation.signals import Signal
 from apc.simulation.simulation import Simulation, prepare
@@ -59,7 +59,7 @@ class ErrorEstimate:
         return max(self.signals, key=lambda signal: signal.relative, default=None)
 
 
-class Comparison:
+class AccuracyEstimator:
     """Takes the blocks of a run as they come and plays the closer one beside it."""
 
     def __init__(self, closer: Simulation, kind: str, compared: str, factor: float) -> None:
@@ -70,7 +70,7 @@ class Comparison:
         self.error, self.at = np.zeros(n), np.zeros(n)
         self.low, self.high = np.full(n, np.inf), np.full(n, -np.inf)
 
-    def take(self, block: Block) -> None:
+    def take(self, block: OutputBlock) -> None:
         """Compare one block; what only one of the runs reaches is left out."""
         other = next(self.blocks, None)
         rows = min(len(block.time), len(other.time)) if other else 0
@@ -97,7 +97,7 @@ class Comparison:
         return ErrorEstimate(self.kind, self.compared, tuple(estimates))
 
 
-def compare_with(simulation: Simulation, *, signals: Sequence[str] = ()) -> Comparison:
+def compare_with(simulation: Simulation, *, signals: Sequence[str] = ()) -> AccuracyEstimator:
     """Prepare the closer run of a simulation.
 
     Parameters
@@ -110,7 +110,7 @@ def compare_with(simulation: Simulation, *, signals: Sequence[str] = ()) -> Comp
     method, factor = finer(simulation.settings.method, all_linear=not simulation.tolerances)
     closer = prepare(simulation.system, replace(simulation.settings, method=method), signals=signals)
     if method.perturbed:
-        return Comparison(closer, "rounding", "coefficients off by one rounding", factor)
+        return AccuracyEstimator(closer, "rounding", "coefficients off by one rounding", factor)
     if method.step is not None:
-        return Comparison(closer, "method", f"half the step, {method}", factor)
-    return Comparison(closer, "method", f"tolerance {method.tolerance:g}", factor)
+        return AccuracyEstimator(closer, "method", f"half the step, {method}", factor)
+    return AccuracyEstimator(closer, "method", f"tolerance {method.tolerance:g}", factor)

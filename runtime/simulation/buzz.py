@@ -1,7 +1,7 @@
 """The buzz of one-sided contacts: as the describing function predicts it, beside the same played in time.
 
-Takes: a `CompiledSystem` whose peers have one-sided contacts.
-Gives: `Line`, `ContactBuzz`, `Played`, `Buzz`, `buzz`.
+Takes: a `Model` whose peers have one-sided contacts.
+Gives: `SpectralPeak`, `ContactLimitCycle`, `Played`, `LimitCycle`, `buzz`.
 Guarantees: what is predicted always stands beside what was played; where more than one line stands in the
 spectrum, it says so.
 Does not: find every motion: it plays one start, the scene's own.
@@ -23,17 +23,17 @@ from scipy.signal import find_peaks
 
 from apc.analysis.describing import Predicted, predict
 from apc.analysis.opened import contact_groups
-from apc.analysis.pushes import Push
-from apc.compiler.compiled import LENGTH, CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.analysis.pushes import SectorNonlinearity
+from apc.compiler.compiled import LENGTH, Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.timings import part
-from apc.eigen.peers import PeerGroup
+from apc.eigen.peers import PeerClass
 from apc.frame.exchange import build_exchange
 from apc.frame.instance import Prepared, prepare
 from apc.frame.parameters import resolve
 from apc.result import Result
 from apc.simulation.trajectory import Trajectory, simulate
-from apc.unserved import UnservedError
+from apc.unserved import NotSupportedError
 
 Floats = NDArray[np.float64]
 
@@ -64,7 +64,7 @@ FINER = 8
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class SpectralPeak:
     """A frequency of the depth that swings most, and its amplitude in m."""
 
     frequency_hz: float
@@ -72,7 +72,7 @@ class Line:
 
 
 @dataclass(frozen=True, slots=True)
-class ContactBuzz:
+class ContactLimitCycle:
     """A contact as it was played, and its depth as predicted under its load.
 
     `load_n` is its mean push; `depth_m` is from the least to the largest, `in_contact` the share of the time
@@ -87,7 +87,7 @@ class ContactBuzz:
 
 
 @dataclass(frozen=True, slots=True)
-class Buzz(Result):
+class LimitCycle(Result):
     """A limit cycle of contacts, predicted and played for `played_s` seconds.
 
     `predicted` is None where `reason` says why. `lines` are those of the spectrum, the largest first, none
@@ -103,8 +103,8 @@ class Buzz(Result):
     played_s: float
     bounded: bool
     steady: bool
-    lines: tuple[Line, ...]
-    contacts: tuple[ContactBuzz, ...]
+    lines: tuple[SpectralPeak, ...]
+    contacts: tuple[ContactLimitCycle, ...]
     notes: tuple[str, ...]
 
     @property
@@ -125,7 +125,7 @@ class _Measured:
 
 
 @part("buzz")
-def buzz(system: CompiledSystem, *, prepared: Prepared | None = None) -> Buzz:
+def buzz(system: Model, *, prepared: Prepared | None = None) -> LimitCycle:
     """Predict the buzz of a scene's one-sided contacts, and play it.
 
     Parameters
@@ -142,7 +142,7 @@ def buzz(system: CompiledSystem, *, prepared: Prepared | None = None) -> Buzz:
     """
     try:
         groups = contact_groups(system, prepared or prepare(system))
-    except UnservedError as why:
+    except NotSupportedError as why:
         raise _refused(system, str(why)) from None
     if not any(pushes for _, pushes in groups):
         raise _refused(system, "nothing touches")
@@ -154,7 +154,7 @@ def buzz(system: CompiledSystem, *, prepared: Prepared | None = None) -> Buzz:
     predicted, reason = None, ""
     try:
         predicted = predict(system, groups)
-    except UnservedError as why:
+    except NotSupportedError as why:
         reason = str(why)
     seconds = _seconds(system)
     names = [item.name for item in measured] + [state for item in measured for state in item.states]
@@ -165,7 +165,7 @@ def buzz(system: CompiledSystem, *, prepared: Prepared | None = None) -> Buzz:
     return replace(result, notes=(*result.notes, BY_CHANCE))
 
 
-def _seconds(system: CompiledSystem) -> Fraction:
+def _seconds(system: Model) -> Fraction:
     """Return how long to play, in whole seconds: `LONGEST`, or less of many peers."""
     timings = {timing.name: timing.value for timing in system.timings}
     tick = min(timings[clock.period] for clock in system.clocks)
@@ -175,13 +175,13 @@ def _seconds(system: CompiledSystem) -> Fraction:
     return Fraction(min(most, LONGEST))
 
 
-def _refused(system: CompiledSystem, why: str) -> ApcError:
+def _refused(system: Model, why: str) -> ApcError:
     what = f"no buzz to predict: {why}"
-    return ApcError(Mistake("E864", Place(system.origin.topology), what, hint="apc simulate"))
+    return ApcError(Diagnostic("E864", SourceLocation(system.origin.topology), what, hint="apc simulate"))
 
 
 def _contacts(
-    system: CompiledSystem, groups: Sequence[tuple[PeerGroup, tuple[Push, ...]]]
+    system: Model, groups: Sequence[tuple[PeerClass, tuple[SectorNonlinearity, ...]]]
 ) -> list[_Measured]:
     """Return the contacts that are measured, those of the first peers of each group."""
     exchange = build_exchange(system, resolve(system).timings)
@@ -214,7 +214,7 @@ def _compare(
     reason: str,
     played: Trajectory,
     measured: Sequence[_Measured],
-) -> Buzz:
+) -> LimitCycle:
     """Lay what is predicted, or why nothing is, beside what was played."""
     first = len(played.time) - len(played.time) // MEASURED
     bounded = not played.summary.stopped
@@ -228,7 +228,7 @@ def _compare(
     window = np.hanning(len(time))
     loads = [float(push @ window / window.sum()) for push in pushes]
     contacts = tuple(
-        ContactBuzz(
+        ContactLimitCycle(
             name=item.name,
             load_n=load,
             depth_m=float(np.ptp(depth)),
@@ -249,10 +249,12 @@ def _compare(
     else:
         notes = tuple(_notes(predicted, bounded=bounded, steady=steady, lines=lines))
     end = float(played.time[-1])
-    return Buzz(topology, predicted, reason, end, bounded, steady, lines, contacts, notes)
+    return LimitCycle(topology, predicted, reason, end, bounded, steady, lines, contacts, notes)
 
 
-def _notes(predicted: Predicted | None, *, bounded: bool, steady: bool, lines: Sequence[Line]) -> list[str]:
+def _notes(
+    predicted: Predicted | None, *, bounded: bool, steady: bool, lines: Sequence[SpectralPeak]
+) -> list[str]:
     """Say what a prediction is worth beside what was played."""
     texts = []
     if not bounded:
@@ -279,20 +281,20 @@ def _notes(predicted: Predicted | None, *, bounded: bool, steady: bool, lines: S
     return texts
 
 
-def _lines(time: Floats, values: Floats) -> tuple[Line, ...]:
+def _lines(time: Floats, values: Floats) -> tuple[SpectralPeak, ...]:
     """Return the lines of a spectrum, multiples of each and mixtures of two left out."""
     step = float(time[-1] - time[0]) / (len(time) - 1)
     window, size = np.hanning(len(time)), FINER * len(time)
     spectrum = 2 / window.sum() * np.abs(np.fft.rfft((values - values.mean()) * window, size))
     apart = 2 / (step * len(time))  # what a window of this length tells apart
     places, _ = find_peaks(spectrum, height=SECOND * spectrum[1:-1].max())
-    lines: list[Line] = []
+    lines: list[SpectralPeak] = []
     for place in places[np.argsort(-spectrum[places])].tolist():
         near = np.log(spectrum[place - 1 : place + 2])
         aside = 0.5 * (near[0] - near[2]) / (near[0] - 2 * near[1] + near[2])
         frequency = float(place + aside) / (size * step)
         if not _is_mixed(frequency, [line.frequency_hz for line in lines], apart):
-            lines.append(Line(frequency, float(np.exp(near[1] - 0.25 * (near[0] - near[2]) * aside))))
+            lines.append(SpectralPeak(frequency, float(np.exp(near[1] - 0.25 * (near[0] - near[2]) * aside))))
     return tuple(lines)
 
 

@@ -15,7 +15,7 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import Kind
+from apc.compiler.compiled import PeerType
 from apc.simulation.simulation import Simulation
 
 Floats = NDArray[np.float64]
@@ -30,7 +30,7 @@ def driven_until(simulation: Simulation) -> float:
     """Return the last instant in s at which an equation changes with time alone, 0 if none does."""
     end = float(simulation.settings.duration)
     until = 0.0
-    functions: dict[Kind, list[Any]] = {}
+    functions: dict[PeerType, list[Any]] = {}
     for member, forces in zip(simulation.population.members, simulation.forces, strict=True):
         kind = simulation.topology.kinds[simulation.topology.groups[member.group].kind]
         if kind not in functions:
@@ -43,7 +43,7 @@ def driven_until(simulation: Simulation) -> float:
     return until
 
 
-def _functions(kind: Kind) -> Iterator[Any]:
+def _functions(kind: PeerType) -> Iterator[Any]:
     """Yield the functions of a kind over (…, p, t)."""
     yield kind.derivative
     for clock in kind.clocks:

@@ -1,7 +1,7 @@
 """Many runs of one scene, each with packets of its own, and what they have in common.
 
-Takes: a `CompiledSystem`, its `Settings`, how many runs.
-Gives: `Run`, `Ensemble`, `MeanSquare`, `play_many`; `share_interval`.
+Takes: a `Model`, its `Settings`, how many runs.
+Gives: `EnsembleRun`, `Ensemble`, `MeanSquare`, `play_many`; `share_interval`.
 Guarantees: run k is the same whoever plays it, in whatever order, however many there are; a share and a mean
 stand with how far chance may have moved them; on Ctrl-C the runs that are done are kept.
 Does not: keep rows: to see run k, play it alone.
@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.elements import is_linear
-from apc.compiler.compiled import LENGTH, CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import LENGTH, Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.timings import part
 from apc.frame import instance
 from apc.frame.finite_equations import finite_equations
@@ -43,7 +43,7 @@ from apc.simulation.driven import driven_until
 from apc.simulation.rows_in_time import blocks
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
-from apc.simulation.summary import BAND, Watch
+from apc.simulation.summary import BAND, SummaryAccumulator
 from apc.simulation.verdicts import AT_REST, DECAYS, DIVERGES, OSCILLATES
 from apc.threads import single_threaded
 
@@ -58,7 +58,7 @@ RUN = 300  # bytes of a run that is over
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class EnsembleRun:
     """One run: its number, its verdict as in `summary`, and some numbers in SI, None where there is none.
 
     `copies_apart` is the largest distance between the peers' copies of a position at the end.
@@ -111,7 +111,7 @@ class Ensemble(Result):
     topology: str
     duration: Fraction
     seed: int
-    runs: tuple[Run, ...]
+    runs: tuple[EnsembleRun, ...]
     interrupted: bool = False
     mean_square: MeanSquare | None = None
 
@@ -160,7 +160,7 @@ def share_interval(count: int, total: int) -> tuple[float, float]:
 
 @part("play")
 def play_many(
-    system: CompiledSystem,
+    system: Model,
     settings: Settings,
     *,
     runs: int,
@@ -188,16 +188,18 @@ def play_many(
         E876 too many runs to keep; E894 nothing in the scene is left to chance; E895 a process ended without
         a word; and those of `simulation.prepare`.
     """
-    refuse_beyond(RUN * runs, "E876", Place(system.origin.topology), f"{runs:,} runs", "fewer --runs")
+    refuse_beyond(
+        RUN * runs, "E876", SourceLocation(system.origin.topology), f"{runs:,} runs", "fewer --runs"
+    )
     if not any(link.channel is not None for link in system.links):
         what = f"nothing in {system.name} is left to chance: every run would be the same"
         hint = f"links: {{{system.links[0].name}: {{…, loss: 2 %}}}}" if system.links else "apc simulate"
-        raise ApcError(Mistake("E894", Place(system.origin.topology), what, hint=hint))
+        raise ApcError(Diagnostic("E894", SourceLocation(system.origin.topology), what, hint=hint))
     seed = system.experiment.seed if settings.seed is None else settings.seed
     settings = replace(settings, seed=seed)
     parts = [range(first, min(first + PART, runs)) for first in range(0, runs, PART)]
-    place = Place(system.origin.topology)
-    done: list[Run] = []
+    place = SourceLocation(system.origin.topology)
+    done: list[EnsembleRun] = []
     interrupted = False
     try:
         with _workers(system, settings, min(jobs, len(parts)), place) as workers:
@@ -214,7 +216,7 @@ def play_many(
     return Ensemble(system.name, settings.duration, seed, tuple(done), interrupted, mean_square)
 
 
-def _mean_square(system: CompiledSystem) -> MeanSquare | None:
+def _mean_square(system: Model) -> MeanSquare | None:
     """Return the verdict in mean square, None where no packet is lost or late."""
     if not unreliable(system):
         return None
@@ -232,17 +234,17 @@ def _mean_square(system: CompiledSystem) -> MeanSquare | None:
 
 
 def _workers(
-    system: CompiledSystem, settings: Settings, jobs: int, place: Place
-) -> AbstractContextManager[Workers[range, list[Run]]]:
+    system: Model, settings: Settings, jobs: int, place: SourceLocation
+) -> AbstractContextManager[Workers[range, list[EnsembleRun]]]:
     """Return who plays: this process, or some that are started afresh."""
     if jobs == 1:
         return nullcontext(this_process(_runs, prepare(system, settings)))
     what = "a process that played runs ended without a word: stopped from outside, or out of memory"
-    lost = Mistake("E895", place, what, hint="--jobs 1")
+    lost = Diagnostic("E895", place, what, hint="--jobs 1")
     return local_processes(_runs_of_model, (model_bytes(system), settings), jobs, lost)
 
 
-def _runs_of_model(shared: tuple[bytes, Settings], numbers: range) -> list[Run]:
+def _runs_of_model(shared: tuple[bytes, Settings], numbers: range) -> list[EnsembleRun]:
     return _runs(_opened(*shared), numbers)
 
 
@@ -251,17 +253,17 @@ def _opened(model: bytes, settings: Settings) -> Simulation:
     return prepare(model_of_bytes(model), settings)
 
 
-def _runs(simulation: Simulation, numbers: range) -> list[Run]:
+def _runs(simulation: Simulation, numbers: range) -> list[EnsembleRun]:
     """Play some runs."""
     player, runs = simulation.player(), []
     lengths = {signal.local for signal in simulation.signals if signal.unit == LENGTH}
     until = driven_until(simulation)
     for number in numbers:
-        watch = Watch(simulation, until)
+        watch = SummaryAccumulator(simulation, until)
         for block in blocks(simulation, run=number, player=player):
             watch.take(block.time, block.values)
         summary = watch.summary(block)
         force = None if summary.largest_force is None else summary.largest_force[1]
         copies = max((distance for name, distance in summary.copies if name in lengths), default=None)
-        runs.append(Run(number, summary.verdict, summary.settled, force, copies))
+        runs.append(EnsembleRun(number, summary.verdict, summary.settled, force, copies))
     return runs

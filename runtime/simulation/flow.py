@@ -1,6 +1,6 @@
 """The continuous states of a kind that are moved by a numerical method, and the function that moves them.
 
-Takes: a `Kind`, a `Method`; for scales, the scene's numbers.
+Takes: a `PeerType`, a `Method`; for scales, the scene's numbers.
 Gives: `Flow`, `Tolerance`, `flow_of`, `rows_to_move`; `stepped`, methods of a fixed step; `state_scales`,
 `integrals`.
 Guarantees: only the states that no chain of equations ties to what is not linear keep their exact transition,
@@ -32,9 +32,9 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem, Kind
+from apc.compiler.compiled import Model, PeerType
 from apc.compiler.interpolation import jacobian
-from apc.frame.jacobians import SiteJacobians
+from apc.frame.jacobians import SubsystemJacobians
 from apc.frame.linearize import start_values
 from apc.simulation.integrate import Integrated
 from apc.simulation.propagate import nonlinear_rows
@@ -79,7 +79,7 @@ class Flow:
         assert self.method.tolerance is not None
         return Integrated(self.rate, self.scale, self.method.tolerance, duration)
 
-    def tolerances(self, kind: Kind) -> tuple[Tolerance, ...]:
+    def tolerances(self, kind: PeerType) -> tuple[Tolerance, ...]:
         """Return the tolerances of its states, none if the step is fixed."""
         if self.method.tolerance is None:
             return ()
@@ -89,14 +89,14 @@ class Flow:
         )
 
 
-def rows_to_move(kind: Kind, method: Method) -> tuple[int, ...]:
+def rows_to_move(kind: PeerType, method: Method) -> tuple[int, ...]:
     """Return the states of a kind that a method moves itself."""
     if method.name == EXACT:
         return ()
     return nonlinear_rows(kind) if method.name == WHERE_NEEDED else tuple(range(len(kind.states)))
 
 
-def flow_of(kind: Kind, method: Method, rows: Sequence[int], scale: Floats) -> Flow | None:
+def flow_of(kind: PeerType, method: Method, rows: Sequence[int], scale: Floats) -> Flow | None:
     """Return what a method moves of a kind, None if that is nothing.
 
     Parameters
@@ -209,7 +209,7 @@ def integrals(rate: Any) -> tuple[tuple[int, int], ...]:
 
 
 def state_scales(
-    system: CompiledSystem, kind: Kind, site: SiteJacobians, vectors: Sequence[Floats]
+    system: Model, kind: PeerType, site: SubsystemJacobians, vectors: Sequence[Floats]
 ) -> Floats:
     """Return the scale of every state (n_x,), in SI.
 

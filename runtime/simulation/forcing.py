@@ -1,7 +1,7 @@
 """What forces that change with time alone add to a site's motion, next to exact.
 
 Takes: the `Rates` of a kind, a parameter vector, when intervals begin and how long they last.
-Gives: `SiteForcing`, `site_forcing`, `impulses`.
+Gives: `SubsystemForcing`, `site_forcing`, `impulses`.
 Guarantees: an interval is split where a comparison of `time` switches (a step, a corner of a ramp, a row of
 a table), so that what is integrated is smooth; an impulse is right to `AGREE` of the largest of those
 integrated at once, and where a force jumps at an instant that is not known beforehand, to `LOST`.
@@ -23,7 +23,7 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.frame.discretize import exponential
 from apc.frame.exact import ROWS, evaluate_exact
 from apc.frame.jacobians import guards_of, lookups_of
@@ -42,7 +42,7 @@ MOST_NUMBERS = 2**21  # of the exponentials that are held at once
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SiteForcing:
+class SubsystemForcing:
     """The forces on one site, of which x' = A x + g(t).
 
     `matrix` is A (n_x, n_x); `force` gives the rows `pushed` of g at a time, the others are zero; at
@@ -56,7 +56,7 @@ class SiteForcing:
     durations: tuple[float, ...]
 
 
-def site_forcing(rates: Rates, parameters: Floats, durations: Sequence[Fraction]) -> SiteForcing:
+def site_forcing(rates: Rates, parameters: Floats, durations: Sequence[Fraction]) -> SubsystemForcing:
     """Return the forces on a site.
 
     Parameters
@@ -83,7 +83,7 @@ def site_forcing(rates: Rates, parameters: Floats, durations: Sequence[Fraction]
                 breaks.append((zeros - casadi.substitute(at, t, 0)) / pace)
     at = np.asarray(casadi.evalf(casadi.vertcat(type_(0, 1), *breaks)), np.float64).reshape(-1)
     n_x = len(rates.pattern)
-    return SiteForcing(
+    return SubsystemForcing(
         matrix=np.asarray(rates.matrices(parameters), np.float64).reshape(n_x, -1, order="F")[:, :n_x],
         pushed=pushed,
         force=casadi.Function("force", [t], [casadi.densify(g[list(pushed)])]),
@@ -92,7 +92,7 @@ def site_forcing(rates: Rates, parameters: Floats, durations: Sequence[Fraction]
     )
 
 
-def impulses(site: SiteForcing, starts: Floats, which: Integers) -> Floats:
+def impulses(site: SubsystemForcing, starts: Floats, which: Integers) -> Floats:
     """Return c of every interval (intervals, n_x).
 
     Parameters
@@ -116,7 +116,7 @@ def impulses(site: SiteForcing, starts: Floats, which: Integers) -> Floats:
     return result
 
 
-def _impulses_of_length(site: SiteForcing, duration: float, starts: Floats) -> Floats:
+def _impulses_of_length(site: SubsystemForcing, duration: float, starts: Floats) -> Floats:
     """Return c of intervals of one length (intervals, n_x)."""
     total = np.zeros((len(starts), len(site.matrix)))
     whose, low, high = _parts(site, duration, starts)
@@ -128,7 +128,7 @@ def _impulses_of_length(site: SiteForcing, duration: float, starts: Floats) -> F
     return total
 
 
-def _parts(site: SiteForcing, duration: float, starts: Floats) -> tuple[Integers, Floats, Floats]:
+def _parts(site: SubsystemForcing, duration: float, starts: Floats) -> tuple[Integers, Floats, Floats]:
     """Return the parts into which breaks, and what fades, cut intervals: whose each is, from where to where.
 
     Times are in seconds before the interval's end, which stay exact where something dies out at once.
@@ -149,7 +149,7 @@ def _parts(site: SiteForcing, duration: float, starts: Floats) -> tuple[Integers
     return whose[:-1][inside], ends[:-1][inside], ends[1:][inside]
 
 
-def _integrated(site: SiteForcing, until: Floats, low: Floats, high: Floats) -> Floats:
+def _integrated(site: SubsystemForcing, until: Floats, low: Floats, high: Floats) -> Floats:
     """Integrate parts of intervals that end at `until`, from `high` to `low` seconds before, all (k,)."""
     equal, which = np.unique(np.stack([low, high]), axis=1, return_inverse=True)
     which = which.reshape(-1)
@@ -190,4 +190,6 @@ def _too_fast(begin: Floats, end: Floats) -> ApcError:
         f"a force changes too fast: from {float(begin.min()):.6g} s to {float(end.max()):.6g} s it would be "
         f"looked at in more than {MOST_PIECES:,} places"
     )
-    return ApcError(Mistake("E871", Place("simulation"), what, hint="a lower frequency, or a constant force"))
+    return ApcError(
+        Diagnostic("E871", SourceLocation("simulation"), what, hint="a lower frequency, or a constant force")
+    )

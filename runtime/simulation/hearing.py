@@ -1,8 +1,8 @@
 """Who hears what in a frame of all peers, told as a list of operations on columns of packets.
 
 Takes: the members of a population, the exchange between them, the routes over unreliable links.
-Gives: `Hearing`, `hearing_of`; the operations `Complete`, `Weighed`, `Deliver`, `Look`; what they read,
-`Packet` and `Arrived`.
+Gives: `ExchangeProgram`, `hearing_of`; the operations `CompleteGraphSum`, `WeightedSum`, `Deliver`,
+`PairwiseReduction`; what they read, `PacketKey` and `Arrived`.
 Guarantees: sums and means over a complete graph cost one addition a peer, over any other graph one product
 an arc; a reduction that looks at each pair of peers costs one evaluation a pair; who sends nothing counts in
 no mean. A sender is heard by the packet that the schedule says, or, on an unreliable link, the timetable;
@@ -24,18 +24,18 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from apc.compiler.weights import sum_weights
-from apc.frame.exchange import Exchange, check_mean
-from apc.frame.schedule import Heard, Selected, Sent, Way
+from apc.frame.exchange import CommunicationGraph, check_mean
+from apc.frame.schedule import CouplingTerm, ReceivedSample, SentSample, UncertainSample
 from apc.network.timetable import Route
 from apc.simulation.pairs import Pairwise
-from apc.simulation.program import Member
+from apc.simulation.program import GroupProgram
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
-class Packet:
+class PacketKey:
     """The packet `key` as all peers sent it `lag` frames ago."""
 
     key: int
@@ -50,11 +50,11 @@ class Arrived:
     row: int
 
 
-Source = Packet | Arrived
+Source = PacketKey | Arrived
 
 
 @dataclass(frozen=True, slots=True)
-class Complete:
+class CompleteGraphSum:
     """A row of what a member hears is the sum of a packet over `ranges` of columns, over `divisor`.
 
     Its own packet is left out if `own` says that it sends one.
@@ -62,14 +62,14 @@ class Complete:
 
     member: int
     row: int
-    packet: Packet
+    packet: PacketKey
     ranges: tuple[tuple[int, int], ...]  # columns from one up to another
     own: bool
     divisor: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Weighed:
+class WeightedSum:
     """A row of what a member hears is `weights` (peers, columns of the source) times its source."""
 
     member: int
@@ -87,12 +87,13 @@ class Deliver:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Look:
+class PairwiseReduction:
     """A row of what a member hears is a function of itself and of each sender, evaluated arc by arc.
 
-    `function` is a place among `Hearing.functions`; `pairwise` says what of the member it takes. What is
-    heard are the columns `senders` of the `sources`, a channel each, `missing` says which of them are (None:
-    none). The values are joined by the `operator`, with those of the arcs before unless it is the `first`.
+    `function` is a place among `ExchangeProgram.functions`; `pairwise` says what of the member it takes. What
+    is heard are the columns `senders` of the `sources`, a channel each, `missing` says which of them are
+    (None: none). The values are joined by the `operator`, with those of the arcs before unless it is the
+    `first`.
     """
 
     member: int
@@ -108,11 +109,11 @@ class Look:
     weights: Floats
 
 
-Operation = Complete | Weighed | Deliver | Look
+Operation = CompleteGraphSum | WeightedSum | Deliver | PairwiseReduction
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Hearing:
+class ExchangeProgram:
     """What is sent and heard in a frame.
 
     `first` (members + 1,) are the members' first columns and the number of all, `column_of` (N,) the column
@@ -124,7 +125,7 @@ class Hearing:
 
     first: Integers
     column_of: Integers
-    keys: tuple[Sent, ...]
+    keys: tuple[SentSample, ...]
     sent: tuple[tuple[int, ...], ...]
     ring: int
     start: Floats
@@ -135,7 +136,9 @@ class Hearing:
     segments: tuple[tuple[Operation, ...], ...]
 
 
-def hearing_of(exchange: Exchange, members: Sequence[Member], routes: Sequence[Route]) -> Hearing:
+def hearing_of(
+    exchange: CommunicationGraph, members: Sequence[GroupProgram], routes: Sequence[Route]
+) -> ExchangeProgram:
     """Find out what is sent and heard in a frame.
 
     Parameters
@@ -170,7 +173,9 @@ class _Arcs:
 class _Listing:
     """Collects the operations; what several of them use is found once."""
 
-    def __init__(self, exchange: Exchange, members: Sequence[Member], routes: Sequence[Route]) -> None:
+    def __init__(
+        self, exchange: CommunicationGraph, members: Sequence[GroupProgram], routes: Sequence[Route]
+    ) -> None:
         self.exchange, self.members, self.routes = exchange, members, tuple(routes)
         self.route_of = {(route.link, route.clock): place for place, route in enumerate(routes)}
         self.first = np.cumsum([0, *(member.count for member in members)])
@@ -190,22 +195,22 @@ class _Listing:
             for link in exchange.links
         }
         self.functions: dict[int, tuple[int, object]] = {}
-        self.arcs: dict[tuple[int, Way, str], _Arcs] = {}
+        self.arcs: dict[tuple[int, CouplingTerm, str], _Arcs] = {}
 
-    def hearing(self) -> Hearing:
+    def hearing(self) -> ExchangeProgram:
         start = np.zeros((len(self.keys), self.exchange.peers))
         for g, member in enumerate(self.members):
             for key, sent in enumerate(self.keys):
                 start[key, self.first[g] : self.first[g + 1]] = _first_packet(member, sent.link, sent.channel)
         channels = tuple(
             np.array([
-                [self.key_of[Sent(route.link, c, slot)] for slot in range(route.slots)] for c in channel
+                [self.key_of[SentSample(route.link, c, slot)] for slot in range(route.slots)] for c in channel
             ])
             for route, channel in zip(self.routes, self.channels, strict=True)
         )  # fmt: skip
         depths = [depth for member in self.members for depth in member.program.schedule.depths]
         segments = tuple(self._segment(i) for i in range(len(self.members[0].program.segments)))
-        return Hearing(
+        return ExchangeProgram(
             first=self.first,
             column_of=self.column_of,
             keys=self.keys,
@@ -241,7 +246,7 @@ class _Listing:
                 rows = [received[row] for row in pairwise.heard]
                 pairs += [(rows[0], look) for look in self._looks(g, place, pairwise, rows)]
             for heard, operation in pairs:
-                if isinstance(heard, Selected):
+                if isinstance(heard, UncertainSample):
                     group = before if heard.way.before else late
                     group.setdefault((self.route_of[heard.way.link, heard.clock], heard.tick), []).append(
                         operation
@@ -252,15 +257,15 @@ class _Listing:
             operations += [*before.get((route, tick), ()), Deliver(route, tick), *late.get((route, tick), ())]
         return tuple(operations)
 
-    def _source(self, row: Heard | Selected) -> Source:
+    def _source(self, row: ReceivedSample | UncertainSample) -> Source:
         """Return what a row of the schedule reads."""
-        if isinstance(row, Heard):
-            return Packet(self.key_of[row.sent], row.lag)
+        if isinstance(row, ReceivedSample):
+            return PacketKey(self.key_of[row.sent], row.lag)
         route = self.route_of[row.way.link, row.clock]
         channel = self.channels[route]
         return Arrived(route, len(channel) if row.gap else channel.index(row.channel))
 
-    def _heard(self, listener: int, place: int, row: Heard | Selected) -> Operation:
+    def _heard(self, listener: int, place: int, row: ReceivedSample | UncertainSample) -> Operation:
         """Return what makes a row of a plain sum or mean."""
         way, source = row.way, self._source(row)
         if isinstance(source, Arrived) or not self.exchange.is_complete(way.link):
@@ -270,7 +275,7 @@ class _Listing:
             )
             shape = (self.members[listener].count, width)
             weights = csr_array((arcs.weights, (arcs.receivers, arcs.senders)), shape=shape)
-            return Weighed(listener, place, source, weights)
+            return WeightedSum(listener, place, source, weights)
         sending, group = self.sending[way.link], self.members[listener].group
         senders = [
             h
@@ -281,10 +286,10 @@ class _Listing:
         if way.operator == "mean":
             divisor = float(np.diff(self.first)[sending].sum() - int(sending[listener]))
         ranges = tuple((int(self.first[h]), int(self.first[h + 1])) for h in senders)
-        return Complete(listener, place, source, ranges, listener in senders, divisor)
+        return CompleteGraphSum(listener, place, source, ranges, listener in senders, divisor)
 
     def _looks(
-        self, listener: int, place: int, pairwise: Pairwise, rows: Sequence[Heard | Selected]
+        self, listener: int, place: int, pairwise: Pairwise, rows: Sequence[ReceivedSample | UncertainSample]
     ) -> list[Operation]:
         """Return what makes a row of what a member makes of each pair, one delay after the other."""
         function, _ = self.functions.setdefault(
@@ -294,9 +299,9 @@ class _Listing:
         for delay in dict.fromkeys(row.way.delay for row in rows):
             listed = [row for row in rows if row.way.delay == delay]
             arcs = self._arcs(listener, listed[0])
-            gaps = [self._source(row) for row in listed if isinstance(row, Selected) and row.gap]
+            gaps = [self._source(row) for row in listed if isinstance(row, UncertainSample) and row.gap]
             looks.append(
-                Look(
+                PairwiseReduction(
                     member=listener,
                     row=place,
                     function=function,
@@ -304,7 +309,7 @@ class _Listing:
                     operator=listed[0].way.operator,
                     first=not looks,
                     sources=tuple(
-                        self._source(row) for row in listed if isinstance(row, Heard) or not row.gap
+                        self._source(row) for row in listed if isinstance(row, ReceivedSample) or not row.gap
                     ),
                     missing=next((source for source in gaps if isinstance(source, Arrived)), None),
                     senders=arcs.senders,
@@ -316,9 +321,9 @@ class _Listing:
 
     # ---- who hears whom
 
-    def _arcs(self, listener: int, row: Heard | Selected) -> _Arcs:
+    def _arcs(self, listener: int, row: ReceivedSample | UncertainSample) -> _Arcs:
         """Return whom each peer of a member hears on a way, and what it weighs them by."""
-        way, clock = row.way, row.clock if isinstance(row, Selected) else ""
+        way, clock = row.way, row.clock if isinstance(row, UncertainSample) else ""
         key = (listener, way, clock)
         if key not in self.arcs:
             senders, receivers, weights, members = self._all_arcs(listener, way.link, clock)
@@ -359,7 +364,7 @@ class _Listing:
             self.member_of[pairs[:, 0]],
         )
 
-    def _checked(self, listener: int, way: Way, receivers: Integers, weights: Floats) -> Floats:
+    def _checked(self, listener: int, way: CouplingTerm, receivers: Integers, weights: Floats) -> Floats:
         """Return what the weights of each peer of a member add up to.
 
         Refuses a mean, maximum or minimum over nobody, or a mean whose weights add up to 0.
@@ -374,7 +379,7 @@ class _Listing:
         return np.asarray(totals)
 
 
-def _first_packet(member: Member, link: str, channel: str) -> Floats:
+def _first_packet(member: GroupProgram, link: str, channel: str) -> Floats:
     """Return what each peer of a member sends at the start (count,), 0 where it sends nothing."""
     sent = next((send.channels for send in member.program.kind.sends if send.link == link), ())
     if channel not in sent:

@@ -1,7 +1,7 @@
 """All peers' frames in machine code: the kernels as loops over peers, and the engine that plays them.
 
-Takes: a `Population`, the packets of its unreliable links.
-Gives: `library_of`, `Library`, `Machine`; `program_text`, the C text; `straight_lines`.
+Takes: a `HeterogeneousGroup`, the packets of its unreliable links.
+Gives: `library_of`, `LoadedLibrary`, `CompiledEngine`; `program_text`, the C text; `straight_lines`.
 Guarantees: the numbers of `stepwise` to a few roundings of the sums; the text depends on what a peer does in
 a frame, not on how many peers there are or on their numbers.
 Does not: compile (see `native`), or play kernels that are not straight code, such as solvers.
@@ -23,9 +23,17 @@ from numpy.typing import NDArray
 
 from apc.compiler.interpolation import table_of
 from apc.compiler.plain import PlainFunction, straight
-from apc.simulation.hearing import Arrived, Complete, Deliver, Look, Operation, Source, Weighed
+from apc.simulation.hearing import (
+    Arrived,
+    CompleteGraphSum,
+    Deliver,
+    Operation,
+    PairwiseReduction,
+    Source,
+    WeightedSum,
+)
 from apc.simulation.native import native
-from apc.simulation.population import Memory, Played, Population, Told
+from apc.simulation.population import DeliverySource, FrameRows, Population, PopulationState
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -257,14 +265,14 @@ def _number(value: float) -> str:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Library:
+class LoadedLibrary:
     """The compiled text of a population; `kernels` are the places of the segments' kernels, by their `id`."""
 
     loaded: ctypes.CDLL
     kernels: Mapping[int, int]
 
 
-def library_of(population: Population) -> Library | None:
+def library_of(population: Population) -> LoadedLibrary | None:
     """Return what plays a population in machine code, None where that can't be had."""
     segments = {
         id(segment): (segment, m.program) for m in population.members for segment in m.program.segments
@@ -280,7 +288,7 @@ def library_of(population: Population) -> Library | None:
     loaded = native(program_text(kernels, [straight(look) for look in looks]), many=many)
     if loaded is None:
         return None
-    return Library(loaded, {key: place for place, key in enumerate(segments)})
+    return LoadedLibrary(loaded, {key: place for place, key in enumerate(segments)})
 
 
 def _is_worth_it(function: Any) -> bool:
@@ -290,11 +298,14 @@ def _is_worth_it(function: Any) -> bool:
     return bool(function.n_instructions() + rows <= MOST_OPERATIONS)
 
 
-class Machine(Memory):
+class CompiledEngine(PopulationState):
     """The memory of all peers, and the library that plays them in it."""
 
     def __init__(
-        self, library: Library, population: Population, timetable: Callable[[int], Told] | None
+        self,
+        library: LoadedLibrary,
+        population: Population,
+        timetable: Callable[[int], DeliverySource] | None,
     ) -> None:
         """Lay out what the library reads.
 
@@ -303,7 +314,7 @@ class Machine(Memory):
         library
             The population's.
         population, timetable
-            As of `Memory`.
+            As of `PopulationState`.
         """
         super().__init__(population, timetable)
         self._play = library.loaded.play
@@ -343,8 +354,8 @@ class Machine(Memory):
         )
         self.rows = self.work = np.empty((0, 0))  # of the last call
 
-    def play(self, first: int, count: int, pushes: Sequence[Floats | None]) -> Played:
-        """Play the frames from number `first` on (see `Player`)."""
+    def play(self, first: int, count: int, pushes: Sequence[Floats | None]) -> FrameRows:
+        """Play the frames from number `first` on (see `FrameEngine`)."""
         population = self.population
         for g, impulses in enumerate(pushes):
             if impulses is not None:
@@ -360,7 +371,7 @@ class Machine(Memory):
         self.work[:] = 0.0
         addresses = self.rows.ctypes.data, self.work.ctypes.data
         self._play(self.plan.ctypes.data, first, count, *addresses)
-        return Played(self.rows, self.work, count)
+        return FrameRows(self.rows, self.work, count)
 
     # ---- the layout
 
@@ -410,7 +421,7 @@ class Machine(Memory):
         record = np.zeros(1, OPERATION)[0]
         return _set(record, kind=KINDS.index(kind), **dict(zip("abcdefg", whole, strict=False)), **fields)
 
-    def _moved(self, g: int, index: int, library: Library) -> Any:
+    def _moved(self, g: int, index: int, library: LoadedLibrary) -> Any:
         """Return what moves a member over a segment."""
         population = self.population
         segment = population.members[g].program.segments[index]
@@ -426,11 +437,11 @@ class Machine(Memory):
 
     def _heard(self, operation: Operation) -> Any:
         match operation:
-            case Complete(g, row, packet, ranges, own, divisor):
+            case CompleteGraphSum(g, row, packet, ranges, own, divisor):
                 where = (g, packet.key, packet.lag, len(ranges), int(own))
                 to = self.heard[g][row]
                 return self._operation("complete", *where, x=divisor, p=self._whole(ranges), v=to)
-            case Weighed(g, row, source, weights):
+            case WeightedSum(g, row, source, weights):
                 fields = {
                     "p": self._whole(weights.indptr),
                     "q": self._whole(weights.indices),
@@ -442,7 +453,7 @@ class Machine(Memory):
                 return self._operation("deliver", route, tick)
         return self._look(operation)
 
-    def _look(self, look: Look) -> Any:
+    def _look(self, look: PairwiseReduction) -> Any:
         """Return what looks at each pair."""
         member = self.population.members[look.member]
         carry, constants = self.carries[look.member], int(self.members["constants"][look.member])

@@ -16,8 +16,8 @@ from typing import Any
 
 import casadi
 
-from apc.compiler.compiled import CompiledSystem, Kind
-from apc.frame.exchange import Exchange
+from apc.compiler.compiled import Model, PeerType
+from apc.frame.exchange import CommunicationGraph
 from apc.frame.jacobians import edge_name
 
 
@@ -36,7 +36,7 @@ class Pairwise:
     now: int
 
 
-def pair_function(kind: Kind, partition: int, receive: int) -> tuple[Any, tuple[int, ...]]:
+def pair_function(kind: PeerType, partition: int, receive: int) -> tuple[Any, tuple[int, ...]]:
     """Build what a receive (of a clock partition of a kind) evaluates for each sender.
 
     Returns
@@ -77,7 +77,7 @@ def _rows(symbols: Any, places: Sequence[int]) -> Any:
     return casadi.vertcat(*(symbols[place] for place in places)) if places else casadi.SX(0, 1)
 
 
-def count_pairs(system: CompiledSystem, exchange: Exchange) -> int:
+def count_pairs(system: Model, exchange: CommunicationGraph) -> int:
     """Return how many pairs of peers look at each other at a tick, over all links."""
     links = {
         receive.link

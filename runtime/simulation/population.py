@@ -1,8 +1,8 @@
 """All peers of a scene over one frame: each one's program, and what they hear of each other.
 
-Takes: a `CompiledSystem`, who hears whom, and the members, with their programs.
-Gives: `Population`, `build_population`; `Played`, `Player`; `Memory`, `Told`; `exchanges_within`,
-`instants_within`, `refuse_unheard_of`.
+Takes: a `Model`, who hears whom, and the members, with their programs.
+Gives: `Population`, `build_population`; `FrameRows`, `FrameEngine`; `PopulationState`, `DeliverySource`;
+`exchanges_within`, `instants_within`, `refuse_unheard_of`.
 Guarantees: what many peers have in common is kept once.
 Does not: play it (see `stepwise`, `machine`).
 
@@ -19,13 +19,13 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
-from apc.frame.exchange import Exchange
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
+from apc.frame.exchange import CommunicationGraph
 from apc.frame.schedule import Propagate, Schedule, Tick
-from apc.network.timetable import START, Route, Seen
-from apc.simulation.hearing import Hearing, hearing_of
-from apc.simulation.program import Member, timed_events
+from apc.network.timetable import START, DeliveredPackets, Route
+from apc.simulation.hearing import ExchangeProgram, hearing_of
+from apc.simulation.program import GroupProgram, timed_events
 
 Floats = NDArray[np.float64]
 
@@ -38,8 +38,8 @@ class Population:
     work is added up.
     """
 
-    members: tuple[Member, ...]
-    hearing: Hearing
+    members: tuple[GroupProgram, ...]
+    hearing: ExchangeProgram
     quantum: Fraction
     frame: int
     marks: int
@@ -49,7 +49,7 @@ class Population:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Played:
+class FrameRows:
     """Some frames: `rows` (frames · marks, width), `work` (frames, parts) in J until each begins.
 
     Only the first `frames` could be played.
@@ -60,20 +60,20 @@ class Played:
     frames: int
 
 
-class Told(Protocol):
+class DeliverySource(Protocol):
     """What says which packets the ticks of each route see, as a `Timetable` does; time only goes forward."""
 
-    def take(self, until: int) -> tuple[Seen, ...]:
+    def take(self, until: int) -> tuple[DeliveredPackets, ...]:
         """Return what each route's ticks see, from where the last call ended to before `until`, in quanta."""
 
 
-class Player(Protocol):
+class FrameEngine(Protocol):
     """Plays a population, frame after frame; the runs of one seed differ in their packets."""
 
     def begin(self, run: int) -> None:
         """Go back to time 0 of the run of a number."""
 
-    def play(self, first: int, count: int, pushes: Sequence[Floats | None]) -> Played:
+    def play(self, first: int, count: int, pushes: Sequence[Floats | None]) -> FrameRows:
         """Play the frames from number `first` on; of the members with impulses `pushes` are these.
 
         They are (frames, rows, sites). What is returned may be written over by the next call.
@@ -83,14 +83,14 @@ class Player(Protocol):
         """Say whether all that moves, recorded or not, is still a number; its work may not be."""
 
 
-class Memory:
+class PopulationState:
     """What all peers remember from frame to frame, in arrays that stay where they are.
 
     `packets` (ring, keys, peers) are those of the last frames; `carries` are of each member (rows, peers);
-    `held` and `effective` are of each route, as of `Hearing`, and the number of the packet in effect.
+    `held` and `effective` are of each route, as of `ExchangeProgram`, and the number of the packet in effect.
     """
 
-    def __init__(self, population: Population, timetable: Callable[[int], Told] | None) -> None:
+    def __init__(self, population: Population, timetable: Callable[[int], DeliverySource] | None) -> None:
         """Make it, at time 0 of the first run; `timetable` gives the packets of a run, None without any."""
         hearing, self.population, self.timetable = population.hearing, population, timetable
         self.packets = np.empty((hearing.ring, *hearing.start.shape))
@@ -100,7 +100,7 @@ class Memory:
         self.begin(0)
 
     def begin(self, run: int) -> None:
-        """Go back to time 0 (see `Player`)."""
+        """Go back to time 0 (see `FrameEngine`)."""
         hearing, members = self.population.hearing, self.population.members
         self.table = None if self.timetable is None else self.timetable(run)
         self.packets[:] = hearing.start
@@ -111,12 +111,12 @@ class Memory:
         for carry, member in zip(self.carries, members, strict=True):
             carry[:] = member.each(member.carry).T
 
-    def seen_until(self, until: int) -> tuple[Seen, ...]:
+    def seen_until(self, until: int) -> tuple[DeliveredPackets, ...]:
         """Return what the ticks see in the frames before number `until`, from the last that was asked for."""
         return self.table.take(until * self.population.frame) if self.table else ()
 
     def in_range(self) -> bool:
-        """Say whether all that moves is still a number (see `Player`)."""
+        """Say whether all that moves is still a number (see `FrameEngine`)."""
         members = zip(self.carries, self.population.members, strict=True)
         moving = (carry[: member.program.layout.work.start] for carry, member in members)
         return all(bool(np.isfinite(array).all()) for array in (self.packets, *moving))
@@ -155,7 +155,7 @@ def instants_within(schedules: Sequence[Schedule]) -> tuple[int, ...]:
     return tuple(sorted(numbers))
 
 
-def refuse_unheard_of(system: CompiledSystem) -> None:
+def refuse_unheard_of(system: Model) -> None:
     """Refuse a peer that has nothing of its own to stand in for what an unreliable link loses."""
     zero = {link.name for link in system.links if link.channel and link.channel.on_loss == "zero"}
     for kind in system.kinds:
@@ -166,14 +166,18 @@ def refuse_unheard_of(system: CompiledSystem) -> None:
                         f"{receive.name} hears {receive.link}, over which its peer sends nothing: it has no "
                         "value of its own to stand in for a missing one"
                     )
-                    raise ApcError(Mistake("E893", Place(system.origin.topology), what, hint="on_loss: hold"))
+                    raise ApcError(
+                        Diagnostic("E893", SourceLocation(system.origin.topology), what, hint="on_loss: hold")
+                    )
                 if receive.link in zero and receive.before:
                     what = f"{receive.name}: what stood in for a missing value at the tick before is not kept"
-                    raise ApcError(Mistake("E893", Place(system.origin.topology), what, hint="on_loss: hold"))
+                    raise ApcError(
+                        Diagnostic("E893", SourceLocation(system.origin.topology), what, hint="on_loss: hold")
+                    )
 
 
 def build_population(
-    exchange: Exchange, members: Sequence[Member], routes: Sequence[Route] = ()
+    exchange: CommunicationGraph, members: Sequence[GroupProgram], routes: Sequence[Route] = ()
 ) -> Population:
     """Join the programs of all groups by the packets between them.
 

@@ -2,7 +2,7 @@
 
 Takes: sites' parameters, what each interval does to them, their start values; which of a
 group's different sites each peer is.
-Gives: `Program`, `Segment`, `Layout`; `Member`, `build_member`; `timed_events`, `seconds_at`.
+Gives: `Program`, `Segment`, `Layout`; `GroupProgram`, `build_member`; `timed_events`, `seconds_at`.
 Guarantees: the carry at time 0 is what was never computed, as zero, and the states where they start; what
 many peers have in common is kept once.
 Does not: write the steps (see `writing`), or know the other members (see `frame_packets`, `population`).
@@ -24,10 +24,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import Kind
-from apc.frame.jacobians import SiteJacobians
+from apc.compiler.compiled import PeerType
+from apc.frame.jacobians import SubsystemJacobians
 from apc.frame.linearize import start_values
-from apc.frame.schedule import Event, Propagate, Schedule, Value
+from apc.frame.schedule import ClockedValue, Event, Propagate, Schedule
 from apc.simulation.pairs import Pairwise
 from apc.simulation.propagate import Rates
 from apc.simulation.signals import LocalSignal
@@ -47,7 +47,7 @@ class Layout:
     states: int
     outputs: tuple[tuple[int, int], ...]
     holds: int
-    later: tuple[Value, ...]
+    later: tuple[ClockedValue, ...]
     parts: tuple[str, ...]
 
     @property
@@ -92,7 +92,7 @@ class Program:
     are what segments integrate by, which has to outlive them.
     """
 
-    kind: Kind
+    kind: PeerType
     schedule: Schedule
     rates: Rates
     layout: Layout
@@ -133,7 +133,7 @@ def seconds_at(schedule: Schedule, frame: Any, now: int) -> Any:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Member:
+class GroupProgram:
     """Peers of one group of the scene in a population.
 
     `peers` (count,) are their numbers in the scene. `rows` (count,) says which of the different sites each
@@ -163,12 +163,12 @@ class Member:
 def build_member(
     group: int,
     peers: NDArray[np.int64],
-    site: SiteJacobians,
+    site: SubsystemJacobians,
     rows: NDArray[np.int64],
     vectors: Floats,
     program: Program,
     transitions: Sequence[Floats],
-) -> Member:
+) -> GroupProgram:
     """Collect what some peers of a group bring to a population.
 
     Parameters
@@ -196,7 +196,7 @@ def build_member(
             if (p, output) in layout.outputs:  # else its clock never ticks
                 carry[:, layout.states + layout.outputs.index((p, output))] = value
     states, still = carry[:, : layout.states].T, np.zeros((layout.holds, len(vector)))
-    return Member(
+    return GroupProgram(
         group=group,
         peers=peers,
         program=program,

@@ -1,6 +1,6 @@
 """What a site's continuous states do from event to event: the exact transition of a linear partition.
 
-Takes: a `Kind` and parameter vectors.
+Takes: a `PeerType` and parameter vectors.
 Gives: `Rates`, `rates`, `transition_rows`, `perturbed`; `exact_rates`; `nonlinear_rows`.
 Guarantees: no step size; every entry of a transition is right to the last digit but one.
 Does not: integrate what is not linear (see `flow`), or know what changes with time alone (see `forcing`).
@@ -19,8 +19,8 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import Kind
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import PeerType
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.interpolation import jacobian
 from apc.frame.discretize import discretize
 from apc.frame.exact import evaluate_exact
@@ -43,7 +43,7 @@ class Rates:
     entries.
     """
 
-    kind: Kind
+    kind: PeerType
     matrices: Any  # casadi.Function
     rate: Any  # casadi.Function
     timed: bool
@@ -55,7 +55,7 @@ class Rates:
         return np.flatnonzero(self.pattern[:, -1])
 
 
-def nonlinear_rows(kind: Kind) -> tuple[int, ...]:
+def nonlinear_rows(kind: PeerType) -> tuple[int, ...]:
     """Return the states whose equations are not linear, and all that equations tie to them."""
     moving, _, t, speed = _symbols(kind)
     curved = _curved(speed, moving, t)
@@ -66,7 +66,7 @@ def nonlinear_rows(kind: Kind) -> tuple[int, ...]:
     return tuple(np.flatnonzero(together[:, curved].any(axis=1)).tolist())
 
 
-def rates(kind: Kind, moved: Sequence[int] = ()) -> Rates:
+def rates(kind: PeerType, moved: Sequence[int] = ()) -> Rates:
     """Take the linear continuous equations of a kind apart.
 
     Parameters
@@ -176,7 +176,7 @@ def transition_rows(rates_of: Rates, vectors: Floats, durations: Sequence[Fracti
     return tuple(matrix[which.reshape(-1)] for matrix in result)
 
 
-def _symbols(kind: Kind) -> tuple[Any, Any, Any, Any]:
+def _symbols(kind: PeerType) -> tuple[Any, Any, Any, Any]:
     """Return (x, u), p and t as symbols, and the rates of change."""
     type_: Any = casadi.SX if kind.derivative.is_a("SXFunction") else casadi.MX
     n_x, n_u = len(kind.states), len(kind.holds)
@@ -205,7 +205,7 @@ def _closure(a: Pattern) -> Pattern:
     return reach
 
 
-def _nonlinear(kind: Kind, rows: Sequence[int], speed: Any, moving: Any, p: Any) -> ApcError:
+def _nonlinear(kind: PeerType, rows: Sequence[int], speed: Any, moving: Any, p: Any) -> ApcError:
     """Return the mistake that names the states and the parts whose equations are not linear."""
     involved = []
     for row in rows:
@@ -225,4 +225,4 @@ def _nonlinear(kind: Kind, rows: Sequence[int], speed: Any, moving: Any, p: Any)
         "there can be simulated exactly"
     )
     hint = "no --method (what is linear stays exact), or a part that computes its force at ticks of a clock"
-    return ApcError(Mistake("E870", Place(kind.name), what, hint=hint))
+    return ApcError(Diagnostic("E870", SourceLocation(kind.name), what, hint=hint))

@@ -1,6 +1,6 @@
 """A scene played in time: blocks of rows.
 
-Takes: a `Simulation`. Gives: `Block`, `blocks`; `instants_of`, `pushes`, `unsolved`.
+Takes: a `Simulation`. Gives: `OutputBlock`, `blocks`; `instants_of`, `pushes`, `unsolved`.
 Guarantees: a row for time 0 and for every tick of the fastest clock until the end, values before the tick;
 the memory used does not grow with the duration; no number that is not finite is given out.
 Does not: keep, write or judge what comes out (see `trajectory`, `recording`, `summary`).
@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.simulation.forcing import impulses
-from apc.simulation.population import Player
+from apc.simulation.population import FrameEngine
 from apc.simulation.simulation import Simulation
 
 Floats = NDArray[np.float64]
@@ -26,7 +26,7 @@ MOST_NAMED = 6  # states in a message
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Block:
+class OutputBlock:
     """Some rows: `time` (rows,) in seconds, `values` (rows, signals) in SI.
 
     `work` (parts,) is what the parts have done until the last frame that begins by then, over all peers, in
@@ -42,7 +42,9 @@ class Block:
     stopped_at: float = 0.0
 
 
-def blocks(simulation: Simulation, *, run: int = 0, player: Player | None = None) -> Iterator[Block]:
+def blocks(
+    simulation: Simulation, *, run: int = 0, player: FrameEngine | None = None
+) -> Iterator[OutputBlock]:
     """Play a scene from time 0 and yield its rows, block by block.
 
     Parameters
@@ -81,7 +83,7 @@ def blocks(simulation: Simulation, *, run: int = 0, player: Player | None = None
             stopped, stopped_at = name, float(time[stop])
         elif played.frames == length and instants[-1] <= last and not player.in_range():
             stopped, stopped_at = "what is not recorded", float(time[-1])
-        yield Block(time[:stop], values[:stop], done, stopped, stopped_at)
+        yield OutputBlock(time[:stop], values[:stop], done, stopped, stopped_at)
         if stopped:
             return
         if played.frames < length:
@@ -90,18 +92,18 @@ def blocks(simulation: Simulation, *, run: int = 0, player: Player | None = None
 
 def unsolved(simulation: Simulation, frame: int) -> ApcError:
     """Return the mistake of a frame that could not be played."""
-    place = Place(simulation.system.origin.topology)
+    place = SourceLocation(simulation.system.origin.topology)
     at = f"after {float(frame * simulation.frame * simulation.quantum):g} s"
     if not simulation.tolerances:
         what = f"an equation has no solution, or a loop none that Newton's method finds, {at}"
-        return ApcError(Mistake("E872", place, what))
+        return ApcError(Diagnostic("E872", place, what))
     states = ", ".join(tolerance.state for tolerance in simulation.tolerances[:MOST_NAMED])
     what = (
         f"the motion of {states} can't be integrated {at}: it grows without measure, an equation there has "
         "no value, or a force jumps to and fro without end"
     )
     hint = "dry friction by tanh in the place of sign; --method semi-implicit:0.1ms shows what happens"
-    return ApcError(Mistake("E871", place, what, hint=hint))
+    return ApcError(Diagnostic("E871", place, what, hint=hint))
 
 
 def pushes(simulation: Simulation, first: int) -> list[Floats | None]:

@@ -21,9 +21,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.compiler.digits import plain_float
-from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
 from apc.compiler.words import no_more
 
 EXACT, RK4, SEMI_IMPLICIT, CVODES = "exact", "rk4", "semi-implicit", "cvodes"
@@ -93,16 +93,16 @@ def parse_method(text: str) -> Method:
         E910 no such method, E911 a step that is none, E912 a tolerance that is none.
     """
     name, colon, size = (part.strip() for part in text.partition(":"))
-    place = Place("--method")
+    place = SourceLocation("--method")
     if name not in EXAMPLES:
         meant = nearest(name, EXAMPLES) or EXACT
         expected = f"one of {', '.join(EXAMPLES)}"
         got = text[:80] or "nothing"
-        raise ApcError(Mistake("E910", place, "the method", expected, got, EXAMPLES[meant]))
+        raise ApcError(Diagnostic("E910", place, "the method", expected, got, EXAMPLES[meant]))
     if name == EXACT:
         if colon:
             expected = "exact alone, which has no step"
-            raise ApcError(Mistake("E910", place, "the method", expected, text[:80], EXACT))
+            raise ApcError(Diagnostic("E910", place, "the method", expected, text[:80], EXACT))
         return Method(EXACT)
     if name == CVODES:
         return Method(CVODES, tolerance=_tolerance(size, place))
@@ -111,18 +111,18 @@ def parse_method(text: str) -> Method:
 
     if not size:
         expected = "a step"
-        raise ApcError(Mistake("E911", place, name, expected, "none", EXAMPLES[name]))
+        raise ApcError(Diagnostic("E911", place, name, expected, "none", EXAMPLES[name]))
     try:
         step = Fraction(quantity(size, place, what=f"the step of {name}", unit="s").value)
     except ApcError as error:
         raise ApcError([replace(mistake, hint=EXAMPLES[name]) for mistake in error.mistakes]) from None
     if step <= 0:
         expected, got = "more than 0 s", size[:80]
-        raise ApcError(Mistake("E911", place, f"the step of {name}", expected, got, EXAMPLES[name]))
+        raise ApcError(Diagnostic("E911", place, f"the step of {name}", expected, got, EXAMPLES[name]))
     return Method(name, step=step)
 
 
-def _tolerance(text: str, place: Place) -> float:
+def _tolerance(text: str, place: SourceLocation) -> float:
     try:
         value = plain_float(text)
     except ValueError:
@@ -130,11 +130,11 @@ def _tolerance(text: str, place: Place) -> float:
     if not TIGHTEST <= value <= LOOSEST:
         expected = f"a number from {TIGHTEST:g} to {LOOSEST:g}"
         what, got = "the relative tolerance of cvodes", text[:80] or "none"
-        raise ApcError(Mistake("E912", place, what, expected, got, EXAMPLES[CVODES]))
+        raise ApcError(Diagnostic("E912", place, what, expected, got, EXAMPLES[CVODES]))
     return value
 
 
-def check_step(system: CompiledSystem, method: Method, fastest: Fraction, longest: Fraction) -> None:
+def check_step(system: Model, method: Method, fastest: Fraction, longest: Fraction) -> None:
     """Refuse a step that the scene has no room for.
 
     Parameters
@@ -155,14 +155,14 @@ def check_step(system: CompiledSystem, method: Method, fastest: Fraction, longes
     """
     if method.step is None:
         return
-    place, what = Place(system.origin.topology), f"the step of {method.name}"
+    place, what = SourceLocation(system.origin.topology), f"the step of {method.name}"
     if method.step > fastest:
         expected = f"at most the period of the fastest clock, {_ms(fastest)}"
         hint = f"--method {method.name}:{no_more(1000 * fastest)}ms"
-        raise ApcError(Mistake("E913", place, what, expected, _ms(method.step), hint))
+        raise ApcError(Diagnostic("E913", place, what, expected, _ms(method.step), hint))
     if longest / method.step > MOST_STEPS:
         expected = f"at least {_ms(longest / MOST_STEPS)}, a millionth of the time between two events"
-        raise ApcError(Mistake("E913", place, what, expected, _ms(method.step)))
+        raise ApcError(Diagnostic("E913", place, what, expected, _ms(method.step)))
 
 
 def _ms(seconds: Fraction) -> str:

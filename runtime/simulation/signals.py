@@ -1,7 +1,7 @@
 """What is recorded of a simulation: what a site has to record, names such as `left[2].cube.x`, the choice.
 
-Takes: a `Kind` and its `Schedule`; patterns of names.
-Gives: `LocalSignal`, `local_signals`; `Signal`, `Choice`, `choose`, `signals_of`; `sent_states`,
+Takes: a `PeerType` and its `Schedule`; patterns of names.
+Gives: `LocalSignal`, `local_signals`; `Signal`, `SignalSelection`, `choose`, `signals_of`; `sent_states`,
 `ticking_partitions`.
 Guarantees: a value that acts later than it is computed is two signals, any other is one; signals stand by
 group, peer and site, in the scene's order, whatever the order of the patterns; a pattern that fits nothing is
@@ -19,9 +19,9 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem, Kind
-from apc.compiler.errors import ApcError, Mistake, Place, nearest
-from apc.frame.schedule import Act, Propagate, Schedule, Tick
+from apc.compiler.compiled import Model, PeerType
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
+from apc.frame.schedule import HoldUpdate, Propagate, Schedule, Tick
 
 EXAMPLE = "'cube.x', 'left[2].*' or '*.v'"
 
@@ -40,7 +40,7 @@ class LocalSignal:
     place: tuple[int, ...]
 
 
-def local_signals(kind: Kind, schedule: Schedule) -> tuple[LocalSignal, ...]:
+def local_signals(kind: PeerType, schedule: Schedule) -> tuple[LocalSignal, ...]:
     """Return what can be recorded of a site.
 
     A value that a hold puts out as soon as it is computed is one signal; one that acts later is two:
@@ -71,7 +71,7 @@ def local_signals(kind: Kind, schedule: Schedule) -> tuple[LocalSignal, ...]:
     return tuple(signals)
 
 
-def sent_states(kind: Kind) -> tuple[int, ...]:
+def sent_states(kind: PeerType) -> tuple[int, ...]:
     """Return the states, by their places, that a site sends to others as they are."""
     numbers = []
     for sending in kind.sends:
@@ -101,7 +101,7 @@ def _late_holds(schedule: Schedule) -> set[int]:
             computed = set()
         elif isinstance(event, Tick):
             computed.add((event.partition, event.index))
-        elif isinstance(event, Act) and (event.value.partition, event.value.index) not in computed:
+        elif isinstance(event, HoldUpdate) and (event.value.partition, event.value.index) not in computed:
             late.add(event.hold)
     return late
 
@@ -128,7 +128,7 @@ class Signal:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Choice:
+class SignalSelection:
     """What is recorded of a group: `locals`, of every peer; `wanted` (peers, locals) says which are kept."""
 
     locals: tuple[LocalSignal, ...]
@@ -136,8 +136,8 @@ class Choice:
 
 
 def choose(
-    system: CompiledSystem, available: Sequence[Sequence[LocalSignal]], patterns: Sequence[str]
-) -> tuple[Choice, ...]:
+    system: Model, available: Sequence[Sequence[LocalSignal]], patterns: Sequence[str]
+) -> tuple[SignalSelection, ...]:
     """Choose the signals that fit some pattern, all of them if there is none.
 
     Parameters
@@ -170,14 +170,14 @@ def choose(
                 used |= {pattern} if any(fits) else set()
         recorded = np.flatnonzero(wanted.any(axis=0))
         locals_ = tuple(local_signals[place] for place in recorded.tolist())
-        choices.append(Choice(locals_, np.ascontiguousarray(wanted[:, recorded])))
+        choices.append(SignalSelection(locals_, np.ascontiguousarray(wanted[:, recorded])))
     for pattern in patterns:
         if pattern not in used:
             _refuse(system, available, pattern)
     return tuple(choices)
 
 
-def signals_of(system: CompiledSystem, choices: Sequence[Choice]) -> tuple[Signal, ...]:
+def signals_of(system: Model, choices: Sequence[SignalSelection]) -> tuple[Signal, ...]:
     """Return the chosen signals, in order."""
     return tuple(
         Signal(group.name, peer + 1, local.name, local.unit, local.role)
@@ -193,7 +193,7 @@ def _test(pattern: str) -> re.Pattern[str]:
     return re.compile(re.escape(pattern.strip()).replace(r"\*", ".*").replace(r"\?", "."))
 
 
-def _refuse(system: CompiledSystem, available: Sequence[Sequence[LocalSignal]], pattern: str) -> None:
+def _refuse(system: Model, available: Sequence[Sequence[LocalSignal]], pattern: str) -> None:
     names = dict.fromkeys(local.name for local_signals in available for local in local_signals)
     names |= dict.fromkeys(
         f"{group.name}[1].{local.name}"
@@ -202,4 +202,4 @@ def _refuse(system: CompiledSystem, available: Sequence[Sequence[LocalSignal]], 
     )
     what = f"no signal fits {pattern[:80]!r}; the signals of a peer are {', '.join(list(names)[:12])}"
     hint = f"--signals {nearest(pattern, names)}" if nearest(pattern, names) else f"names such as {EXAMPLE}"
-    raise ApcError(Mistake("E873", Place(system.origin.topology), what, hint=hint))
+    raise ApcError(Diagnostic("E873", SourceLocation(system.origin.topology), what, hint=hint))

@@ -1,6 +1,6 @@
 """A scene made ready to be played in time: all peers, what they hear, what is recorded, who plays them.
 
-Takes: a `CompiledSystem`, its `Settings`, the signals wanted.
+Takes: a `Model`, its `Settings`, the signals wanted.
 Gives: `Simulation`, `prepare`; `check_length`, `size_note`, what it will come to.
 Guarantees: time is counted in whole quanta; what would not fit the memory is refused before it is built.
 Does not: play it (see `blocks`).
@@ -17,44 +17,44 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.timings import part
 from apc.compiler.words import no_more
 from apc.frame.ages import stamped
-from apc.frame.exchange import Exchange, build_exchange
+from apc.frame.exchange import CommunicationGraph, build_exchange
 from apc.frame.finite_equations import finite_equations
-from apc.frame.jacobians import SiteJacobians, jacobians
-from apc.frame.parameters import Numbers, resolve
+from apc.frame.jacobians import SubsystemJacobians, jacobians
+from apc.frame.parameters import ResolvedNumbers, resolve
 from apc.frame.schedule import Propagate, Schedule
 from apc.frame.scheduling import build_schedules
 from apc.memory import refuse_beyond
 from apc.network.nominal import refuse_range
-from apc.network.timetable import Luck, Route, Timetable, luck_of, routes_of
+from apc.network.timetable import ArrivalProcess, Route, Timetable, luck_of, routes_of
 from apc.simulation.flow import Flow, Tolerance, flow_of, rows_to_move, state_scales
-from apc.simulation.forcing import SiteForcing, site_forcing
-from apc.simulation.machine import Library, Machine, library_of
+from apc.simulation.forcing import SubsystemForcing, site_forcing
+from apc.simulation.machine import CompiledEngine, LoadedLibrary, library_of
 from apc.simulation.pairs import count_pairs
 from apc.simulation.population import (
-    Player,
+    FrameEngine,
     Population,
     build_population,
     exchanges_within,
     instants_within,
     refuse_unheard_of,
 )
-from apc.simulation.program import Member, Program, build_member
+from apc.simulation.program import GroupProgram, Program, build_member
 from apc.simulation.propagate import perturbed, rates, transition_rows
 from apc.simulation.settings import CVODES, EXACT, WHERE_NEEDED, Method, Settings, check_step
 from apc.simulation.signals import (
-    Choice,
     Signal,
+    SignalSelection,
     choose,
     local_signals,
     sent_states,
     signals_of,
 )
-from apc.simulation.stepwise import Stepwise
+from apc.simulation.stepwise import InterpretedEngine
 from apc.simulation.writing import build_program
 
 Floats = NDArray[np.float64]
@@ -93,14 +93,14 @@ class Simulation:
     `tolerances` are of the states that CVODES moves, `sent` the names of those that peers send as they are.
     """
 
-    system: CompiledSystem
-    topology: CompiledSystem
+    system: Model
+    topology: Model
     settings: Settings
     population: Population
     signals: tuple[Signal, ...]
     order: Integers
-    forces: tuple[tuple[SiteForcing, ...], ...]
-    lucks: tuple[Luck, ...]
+    forces: tuple[tuple[SubsystemForcing, ...], ...]
+    lucks: tuple[ArrivalProcess, ...]
     seed: int
     tolerances: tuple[Tolerance, ...]
     sent: tuple[str, ...]
@@ -108,7 +108,7 @@ class Simulation:
     frame: int
     marks: tuple[int, ...]
     ticks_at_zero: bool
-    library: Library | None
+    library: LoadedLibrary | None
     length: int
 
     @property
@@ -124,19 +124,19 @@ class Simulation:
         """How many rows there are at most: those of whole frames."""
         return (int(self.settings.duration / self.quantum) // self.frame + 1) * len(self.marks)
 
-    def player(self) -> Player:
+    def player(self) -> FrameEngine:
         """Return what plays it, with memory of its own."""
         routes = self.population.hearing.routes
         timetable = partial(Timetable, routes, self.lucks, seed=self.seed)
         packets = (lambda run: timetable(run=run)) if routes else None
         if self.library is not None:
-            return Machine(self.library, self.population, packets)
-        return Stepwise(self.population, packets)
+            return CompiledEngine(self.library, self.population, packets)
+        return InterpretedEngine(self.population, packets)
 
 
 @part("prepare")
 def prepare(
-    system: CompiledSystem,
+    system: Model,
     settings: Settings,
     *,
     signals: Sequence[str] = (),
@@ -196,7 +196,7 @@ def prepare(
     )
 
 
-def check_length(system: CompiledSystem, duration: Fraction, *, runs: int = 1) -> None:
+def check_length(system: Model, duration: Fraction, *, runs: int = 1) -> None:
     """Refuse to play so long that no one will wait for it.
 
     Parameters
@@ -221,7 +221,9 @@ def check_length(system: CompiledSystem, duration: Fraction, *, runs: int = 1) -
     each = f" in each of {runs:,} runs" if runs > 1 else ""
     expected = f"at most {longest:.6g} s{each}: a row a tick, {MOST_ROWS:,} in all"
     got, hint = f"{float(duration):.6g} s", f'--duration "{no_more(longest)} s"'
-    raise ApcError(Mistake("E915", Place(system.origin.topology), "the duration", expected, got, hint))
+    raise ApcError(
+        Diagnostic("E915", SourceLocation(system.origin.topology), "the duration", expected, got, hint)
+    )
 
 
 def size_note(simulation: Simulation, *, decimal: bool) -> str:
@@ -242,23 +244,23 @@ def size_note(simulation: Simulation, *, decimal: bool) -> str:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Plan:
+class SimulationPlan:
     """What the peers of a scene do in a frame, before a function of it is built.
 
     `sites` are the Jacobians of each kind, `flows` what the method moves of it, `schedules` what happens in a
     frame of each group; `routes` are what is heard over unreliable links.
     """
 
-    system: CompiledSystem
-    numbers: Numbers
-    exchange: Exchange
-    sites: tuple[SiteJacobians, ...]
+    system: Model
+    numbers: ResolvedNumbers
+    exchange: CommunicationGraph
+    sites: tuple[SubsystemJacobians, ...]
     flows: tuple[Flow | None, ...]
     routes: tuple[Route, ...]
     schedules: tuple[Schedule, ...]
 
 
-def plan_of(system: CompiledSystem, method: Method) -> Plan:
+def plan_of(system: Model, method: Method) -> SimulationPlan:
     """Find out what happens in a frame, and refuse what can't be played.
 
     The plan's system is `stamped`: where ages are asked for, packets say when they were sent.
@@ -278,10 +280,10 @@ def plan_of(system: CompiledSystem, method: Method) -> Plan:
         schedules = tuple(replace(schedule, quantum=ROW / schedule.frame) for schedule in schedules)
     _check_size(system, exchange, schedules)
     _check_step(system, numbers, schedules, method)
-    return Plan(system, numbers, exchange, sites, flows, routes, schedules)
+    return SimulationPlan(system, numbers, exchange, sites, flows, routes, schedules)
 
 
-def _choices(plan: Plan, signals: Sequence[str]) -> tuple[Choice, ...]:
+def _choices(plan: SimulationPlan, signals: Sequence[str]) -> tuple[SignalSelection, ...]:
     """Return what is recorded of each group; refuse more than fits the memory."""
     system = plan.system
     available = [
@@ -293,7 +295,9 @@ def _choices(plan: Plan, signals: Sequence[str]) -> tuple[Choice, ...]:
     return choices
 
 
-def _members(plan: Plan, choices: Sequence[Choice], method: Method, *, live: bool) -> list[Member]:
+def _members(
+    plan: SimulationPlan, choices: Sequence[SignalSelection], method: Method, *, live: bool
+) -> list[GroupProgram]:
     """Return the groups as members of a population, those peers that are recorded apart from the others."""
     system, numbers, flows = plan.system, plan.numbers, plan.flows
     linear = [rates(kind, flow.rows if flow else ()) for kind, flow in zip(system.kinds, flows, strict=True)]
@@ -330,7 +334,7 @@ def _chunk_length(population: Population, duration: Fraction) -> int:
     return -(-frames // -(-frames // most))
 
 
-def _order(system: CompiledSystem, population: Population, signals: Sequence[Signal]) -> Integers:
+def _order(system: Model, population: Population, signals: Sequence[Signal]) -> Integers:
     """Return where each signal stands in a row of a population."""
     starts = np.cumsum([0] + [group.count for group in system.groups])
     column_of = {
@@ -342,7 +346,7 @@ def _order(system: CompiledSystem, population: Population, signals: Sequence[Sig
     return np.array([column_of[signal.group, signal.peer, signal.local] for signal in signals], np.int64)
 
 
-def _ticks_at_zero(system: CompiledSystem, numbers: Numbers) -> bool:
+def _ticks_at_zero(system: Model, numbers: ResolvedNumbers) -> bool:
     """Say whether the fastest clock ticks at time 0."""
     if not system.clocks:
         return True
@@ -351,7 +355,10 @@ def _ticks_at_zero(system: CompiledSystem, numbers: Numbers) -> bool:
 
 
 def _check_size(
-    system: CompiledSystem, exchange: Exchange, schedules: Sequence[Schedule], choices: Sequence[Choice] = ()
+    system: Model,
+    exchange: CommunicationGraph,
+    schedules: Sequence[Schedule],
+    choices: Sequence[SignalSelection] = (),
 ) -> None:
     """Refuse so many peers, or so many of them recorded, that one frame of them would not fit the memory."""
     total = sum(
@@ -366,12 +373,16 @@ def _check_size(
     total += NUMBERS_A_PAIR * count_pairs(system, exchange)
     what = f"{system.peers:,} peers hold {total:,} numbers in a frame, which"
     refuse_beyond(
-        NUMBER * total, "E874", Place(system.origin.topology), what, "fewer peers, or fewer --signals"
+        NUMBER * total,
+        "E874",
+        SourceLocation(system.origin.topology),
+        what,
+        "fewer peers, or fewer --signals",
     )
 
 
 def _flow(
-    system: CompiledSystem, numbers: Numbers, place: int, site: SiteJacobians, method: Method
+    system: Model, numbers: ResolvedNumbers, place: int, site: SubsystemJacobians, method: Method
 ) -> Flow | None:
     """Return what the method moves of a kind, None if that is nothing."""
     kind = system.kinds[place]
@@ -387,7 +398,7 @@ def _flow(
     return flow_of(kind, method, rows, state_scales(system, kind, site, vectors))
 
 
-def _tolerances(system: CompiledSystem, flows: Sequence[Flow | None]) -> tuple[Tolerance, ...]:
+def _tolerances(system: Model, flows: Sequence[Flow | None]) -> tuple[Tolerance, ...]:
     """Return the tolerances of all states, each state of several kinds once, with the smallest."""
     result: dict[str, Tolerance] = {}
     for kind, flow in zip(system.kinds, flows, strict=True):
@@ -398,7 +409,7 @@ def _tolerances(system: CompiledSystem, flows: Sequence[Flow | None]) -> tuple[T
 
 
 def _check_step(
-    system: CompiledSystem, numbers: Numbers, schedules: Sequence[Schedule], method: Method
+    system: Model, numbers: ResolvedNumbers, schedules: Sequence[Schedule], method: Method
 ) -> None:
     fastest = min((numbers.timings[clock.period] for clock in system.clocks), default=ROW)
     lengths = [
@@ -410,7 +421,7 @@ def _check_step(
     check_step(system, method, fastest, max(lengths, default=fastest))
 
 
-def _forces(member: Member) -> tuple[SiteForcing, ...]:
+def _forces(member: GroupProgram) -> tuple[SubsystemForcing, ...]:
     """Return the forces that change with time on each different site of a group; none if none does."""
     program = member.program
     if not program.impulse_rows:

@@ -1,7 +1,7 @@
 """All peers' frames one by one: CasADi's virtual machine moves the peers, NumPy what they hear.
 
-Takes: a `Population`, the packets of its unreliable links.
-Gives: `Stepwise`.
+Takes: a `HeterogeneousGroup`, the packets of its unreliable links.
+Gives: `InterpretedEngine`.
 Guarantees: any kernel can be played, solvers too; a frame that can't be is told, and those before are kept.
 Does not: run fast: where there is a compiler and every kernel is straight code, see `machine`.
 """
@@ -16,10 +16,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.network.timetable import Seen
-from apc.simulation.hearing import Arrived, Complete, Deliver, Look, Operation, Source, Weighed
-from apc.simulation.population import Memory, Played, Population, Told
-from apc.simulation.program import Member, Segment, seconds_at
+from apc.network.timetable import DeliveredPackets
+from apc.simulation.hearing import (
+    Arrived,
+    CompleteGraphSum,
+    Deliver,
+    Operation,
+    PairwiseReduction,
+    Source,
+    WeightedSum,
+)
+from apc.simulation.population import DeliverySource, FrameRows, Population, PopulationState
+from apc.simulation.program import GroupProgram, Segment, seconds_at
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -28,13 +36,13 @@ Flags = NDArray[np.bool_]
 JOINS = {"max": np.fmax, "min": np.fmin}
 
 
-class Stepwise(Memory):
+class InterpretedEngine(PopulationState):
     """What moves all peers in their memory, one run at a time."""
 
     def __init__(
         self,
         population: Population,
-        timetable: Callable[[int], Told] | None,
+        timetable: Callable[[int], DeliverySource] | None,
         moving: Sequence[int] | None = None,
     ) -> None:
         """Make it ready.
@@ -42,7 +50,7 @@ class Stepwise(Memory):
         Parameters
         ----------
         population, timetable
-            As of `Memory`.
+            As of `PopulationState`.
         moving
             The members that are moved, all if not given: those who play the others bring their packets.
         """
@@ -56,8 +64,8 @@ class Stepwise(Memory):
             for layout in layouts
         ]
 
-    def play(self, first: int, count: int, pushes: Sequence[Floats | None]) -> Played:
-        """Play the frames from number `first` on (see `Player`)."""
+    def play(self, first: int, count: int, pushes: Sequence[Floats | None]) -> FrameRows:
+        """Play the frames from number `first` on (see `FrameEngine`)."""
         population, marks = self.population, self.population.marks
         rows = np.full((count * marks, population.width), np.nan)
         work = np.zeros((count, len(population.parts)))
@@ -72,21 +80,21 @@ class Stepwise(Memory):
                 of_frame = rows[n * marks : (n + 1) * marks]
                 ticks = [slice(n * route.ticks, (n + 1) * route.ticks) for route in routes if taken]
                 seen = tuple(
-                    Seen(packets.packets[at], packets.missing[at])
+                    DeliveredPackets(packets.packets[at], packets.missing[at])
                     for packets, at in zip(taken, ticks, strict=True)
                 )
                 try:
                     for index in range(len(population.hearing.segments)):
                         self._segment(first + n, index, seen, of_frame, now)
                 except RuntimeError:
-                    return Played(rows, work, n)
-        return Played(rows, work, count)
+                    return FrameRows(rows, work, n)
+        return FrameRows(rows, work, count)
 
     def _segment(
         self,
         number: int,
         index: int,
-        seen: tuple[Seen, ...],
+        seen: tuple[DeliveredPackets, ...],
         rows: Floats,
         pushes: Sequence[Floats | None],
     ) -> None:
@@ -122,21 +130,21 @@ class Stepwise(Memory):
         return np.asarray(self.packets[(number - source.lag) % self.population.hearing.ring, source.key])
 
     def _hear(
-        self, operation: Operation, number: int, heard: Sequence[Floats], seen: tuple[Seen, ...]
+        self, operation: Operation, number: int, heard: Sequence[Floats], seen: tuple[DeliveredPackets, ...]
     ) -> None:
         match operation:
-            case Complete(g, place, packet, ranges, own, divisor):
+            case CompleteGraphSum(g, place, packet, ranges, own, divisor):
                 row, first = self._row(packet, number), self.population.hearing.first
                 total = sum(np.add.reduce(row[begin:end]) for begin, end in ranges)
                 heard[g][place] = (total - (row[first[g] : first[g + 1]] if own else 0.0)) / divisor
-            case Weighed(g, place, source, weights):
+            case WeightedSum(g, place, source, weights):
                 heard[g][place] = weights @ self._row(source, number)
             case Deliver(route, tick):
                 self._deliver(route, *self._sees(route, tick, seen))
-            case Look():
+            case PairwiseReduction():
                 self._look(operation, number, heard[operation.member][operation.row])
 
-    def _sees(self, place: int, tick: int, seen: tuple[Seen, ...]) -> tuple[Integers, Flags]:
+    def _sees(self, place: int, tick: int, seen: tuple[DeliveredPackets, ...]) -> tuple[Integers, Flags]:
         """Return the packets that a tick sees on a route, and which are missing."""
         return seen[place].packets[tick], seen[place].missing[tick]
 
@@ -156,7 +164,7 @@ class Stepwise(Memory):
         if route.zero:
             held[:-1, missing], held[-1] = 0.0, missing
 
-    def _look(self, look: Look, number: int, result: Floats) -> None:
+    def _look(self, look: PairwiseReduction, number: int, result: Floats) -> None:
         """Join what a member makes of each pair to `result` (peers,)."""
         member, count = self.population.members[look.member], len(look.senders)
         joined = JOINS.get(look.operator)
@@ -183,7 +191,7 @@ class Stepwise(Memory):
 class _Moving:
     """A segment of a member's program, mapped over its peers, with the memory that CasADi works in."""
 
-    def __init__(self, member: Member, segment: Segment) -> None:
+    def __init__(self, member: GroupProgram, segment: Segment) -> None:
         kernel, count = segment.kernel, member.count
         self.impulses = kernel.numel_in("impulses")
         self.heard = len(segment.heard) + len(segment.pairs)

@@ -1,6 +1,6 @@
 """A peer that is struck: its device moves as the scene begins.
 
-Takes: a `CompiledSystem` and the name of a peer.
+Takes: a `Model` and the name of a peer.
 Gives: `strike`, `impulse_text`; `SPEED`, `WATCHED`.
 Guarantees: all else begins as the scene says.
 Does not: play it (see `trajectory`).
@@ -14,8 +14,8 @@ from fractions import Fraction
 
 import numpy as np
 
-from apc.compiler.compiled import Column, CompiledSystem, Kind
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model, PeerColumn, PeerType
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.simulation.signals import sent_states
 
 # How fast the struck device starts, in m/s, and how long that is watched, in s, where the scene says nothing.
@@ -35,7 +35,7 @@ def impulse_text(name: str) -> str:
     return f"{name} starts with {SPEED * MM:g} mm/s more than in the topology."
 
 
-def strike(system: CompiledSystem, peer: str = "") -> tuple[CompiledSystem, str]:
+def strike(system: Model, peer: str = "") -> tuple[Model, str]:
     """Return the scene with a peer's device moving by `SPEED` at the start, and the name of what moves.
 
     Parameters
@@ -57,16 +57,18 @@ def strike(system: CompiledSystem, peer: str = "") -> tuple[CompiledSystem, str]
     if place < 0 or not 1 <= number <= system.groups[place].count:
         what = f"there is no peer {peer.strip()[:60]} to strike"
         raise ApcError(
-            Mistake("E983", Place(system.name), what, hint=f'--strike "{names[max(place, 0)]}[1]"')
+            Diagnostic(
+                "E983", SourceLocation(system.name), what, hint=f'--strike "{names[max(place, 0)]}[1]"'
+            )
         )
     group = system.groups[place]
-    kind: Kind = system.kinds[group.kind]
+    kind: PeerType = system.kinds[group.kind]
     sent = sent_states(kind)
     moving = [row for row, state in enumerate(kind.states) if state.unit == "m/s"]
     own = [row for row in moving if row not in sent] or moving
     if not own:
         what = f"nothing of {group.name} has a velocity that a push could change"
-        raise ApcError(Mistake("E983", Place(system.name), what))
+        raise ApcError(Diagnostic("E983", SourceLocation(system.name), what))
     state = kind.states[own[0]]
     known = {column.name: column.values for column in group.columns}
     present = [
@@ -76,7 +78,7 @@ def strike(system: CompiledSystem, peer: str = "") -> tuple[CompiledSystem, str]
     values[number - 1] += SPEED
     columns = (
         *(column for column in group.columns if column.name != state.start),
-        Column(state.start, values),
+        PeerColumn(state.start, values),
     )
     changed = replace(group, columns=columns)
     groups = (*system.groups[:place], changed, *system.groups[place + 1 :])

@@ -1,6 +1,7 @@
 """What a simulated motion amounts to, in numbers and a word: verdict, settling time, frequency, extremes.
 
-Takes: the rows of a simulation, as they come. Gives: `Watch`, `Summary`, `Extent`, `Broken`; `agreed`.
+Takes: the rows of a simulation, as they come. Gives: `SummaryAccumulator`, `Summary`, `SignalRange`,
+`Broken`; `agreed`.
 Guarantees: the memory used does not grow with the duration.
 Does not: prove anything: a verdict holds for the duration that was simulated (see `analysis` for proof).
 
@@ -41,7 +42,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import Analysis, analyze
-from apc.compiler.compiled import ANGLES, LENGTH, CompiledSystem, Group
+from apc.compiler.compiled import ANGLES, LENGTH, Group, Model
 from apc.compiler.errors import ApcError
 from apc.eigen.spectrum import DRIFTS as RADIUS_DRIFTS
 from apc.eigen.spectrum import STABLE as RADIUS_STABLE
@@ -49,7 +50,7 @@ from apc.frame.jacobians import jacobians
 from apc.network.nominal import unreliable
 from apc.simulation.decay import Fit, fit_motion
 from apc.simulation.driven import driven_until
-from apc.simulation.rows_in_time import Block
+from apc.simulation.rows_in_time import OutputBlock
 from apc.simulation.signals import Signal
 from apc.simulation.simulation import Simulation
 from apc.simulation.verdicts import (
@@ -94,7 +95,7 @@ class Broken:
 
 
 @dataclass(frozen=True, slots=True)
-class Extent:
+class SignalRange:
     """First, last, lowest and highest value of a signal in SI; `settled` is its settling time or None."""
 
     name: str
@@ -134,12 +135,12 @@ class Summary:
     rows: int
     signals: int
     end: float
-    extents: tuple[Extent, ...]
+    extents: tuple[SignalRange, ...]
     broken: tuple[Broken, ...] = ()
     unrecorded: int = 0
 
 
-class Watch:
+class SummaryAccumulator:
     """Evaluates a simulation's rows as they pass and keeps extremes, group by group of rows."""
 
     def __init__(self, simulation: Simulation, until: float | None = None) -> None:
@@ -198,7 +199,7 @@ class Watch:
         began = over.any(axis=0) & np.isnan(self.beyond)
         self.beyond[began] = time[over.argmax(axis=0)[began]]
 
-    def summary(self, block: Block) -> Summary:
+    def summary(self, block: OutputBlock) -> Summary:
         """Return what the rows amount to; `block` is the last."""
         assert self.rows, "a simulation has a row at time 0"
         number = (self.rows - 1) // self.width + 1
@@ -209,7 +210,9 @@ class Watch:
         signals = self.signals
         numbers = np.stack([self.first, self.last, low.min(axis=0), high.max(axis=0)], axis=1).tolist()
         extents = tuple(
-            Extent(signal.name, signal.unit, first, last, least, most, None if np.isnan(since) else since)
+            SignalRange(
+                signal.name, signal.unit, first, last, least, most, None if np.isnan(since) else since
+            )
             for signal, since, (first, last, least, most) in zip(
                 signals, settled.tolist(), numbers, strict=True
             )
@@ -249,7 +252,7 @@ class Watch:
         )
 
     def _verdict(
-        self, block: Block, moved: Sequence[Extent], fit: Fit | None, end: float, *, settled: bool
+        self, block: OutputBlock, moved: Sequence[SignalRange], fit: Fit | None, end: float, *, settled: bool
     ) -> tuple[str, str]:
         """Return the verdict, and why it is not determined."""
         if block.stopped:
@@ -330,7 +333,7 @@ class Watch:
         return tuple(sorted(broken, key=lambda limit: limit.first_s))
 
 
-def _limits(system: CompiledSystem, signals: Sequence[Signal]) -> list[tuple[int, str, float]]:
+def _limits(system: Model, signals: Sequence[Signal]) -> list[tuple[int, str, float]]:
     """Return the columns of signals that have a limit, its name and its value, those of each peer its own."""
     groups = {group.name: group for group in system.groups}
     common = {parameter.name: parameter.value for parameter in system.parameters}
@@ -354,7 +357,7 @@ def _number(group: Group, peer: int, name: str, common: dict[str, float]) -> flo
     return next((value.value for value in group.values if value.name == name), common[name])
 
 
-def agreed(summary: Summary, system: CompiledSystem) -> Summary:
+def agreed(summary: Summary, system: Model) -> Summary:
     """Return the summary of a motion, not determined where it contradicts the analysis of a linear topology.
 
     Parameters
@@ -404,13 +407,13 @@ def is_position(signal: Signal) -> bool:
     return signal.role == "state" and signal.unit in POSITIONS
 
 
-def _positions(system: CompiledSystem) -> int:
+def _positions(system: Model) -> int:
     """Return how many positions there are in a scene."""
     each = [sum(state.unit in POSITIONS for state in kind.states) for kind in system.kinds]
     return sum(group.count * each[group.kind] for group in system.groups)
 
 
-def _overshoot(extents: Sequence[Extent]) -> tuple[str, float] | None:
+def _overshoot(extents: Sequence[SignalRange]) -> tuple[str, float] | None:
     """Return the largest excess over the last value, as a part of the step from the first."""
     beyonds = []
     for extent in extents:

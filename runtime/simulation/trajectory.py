@@ -1,6 +1,6 @@
 """A scene played in time, as a person gets it: rows, columns with names and units, and what made them.
 
-Takes: a `Simulation`. Gives: `Played`, `Trajectory`, `Provenance`, `provenance_of`, `simulate`.
+Takes: a `Simulation`. Gives: `SimulationReport`, `Trajectory`, `Provenance`, `provenance_of`, `simulate`.
 Guarantees: no number is NaN or infinite; what diverges is kept up to the last finite row, and says so.
 Does not: write files, or draw (see `present`).
 """
@@ -16,20 +16,20 @@ from typing import Any, Protocol, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.timings import part
 from apc.distribution import versions
 from apc.memory import refuse_beyond
 from apc.option_value import option_value
-from apc.result import Look, Result
+from apc.result import PlotStyle, Result
 from apc.simulation.accuracy import ErrorEstimate, compare_with
 from apc.simulation.flow import Tolerance
-from apc.simulation.rows_in_time import Block, blocks
+from apc.simulation.rows_in_time import OutputBlock, blocks
 from apc.simulation.settings import DEFAULT, EXACT, WHERE_NEEDED, Method, Settings
 from apc.simulation.signals import Signal
 from apc.simulation.simulation import Simulation, check_length, prepare
-from apc.simulation.summary import Summary, Watch, agreed
+from apc.simulation.summary import Summary, SummaryAccumulator, agreed
 
 Floats = NDArray[np.float64]
 
@@ -57,7 +57,7 @@ class Provenance:
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Played(Result):
+class SimulationReport(Result):
     """What a run amounts to, its rows left out; `interrupted` says that it ended before its time.
 
     `error` is there if it was asked for.
@@ -73,7 +73,7 @@ class Played(Result):
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Trajectory(Played):
+class Trajectory(SimulationReport):
     """Rows over time: `time` (rows,) in seconds, `values` (rows, signals) in SI, a column a signal.
 
     A row holds what was before the tick at its time.
@@ -98,7 +98,7 @@ class Trajectory(Played):
         """Return an xarray Dataset over `time`, a variable a signal with its unit as attribute."""
         return self._shown("dataset")
 
-    def plot(self, ax: Any = None, **look: Unpack[Look]) -> Any:
+    def plot(self, ax: Any = None, **look: Unpack[PlotStyle]) -> Any:
         """Draw a panel a quantity, or all signals into one Axes, as `look` says; return the Figure.
 
         Parameters
@@ -124,7 +124,7 @@ def provenance_of(simulation: Simulation) -> Provenance:
     )
 
 
-def parameters_of(system: CompiledSystem) -> tuple[tuple[str, float, str], ...]:
+def parameters_of(system: Model) -> tuple[tuple[str, float, str], ...]:
     """Return the parameters of a scene, its groups and peers: name, value in SI, unit."""
     parameters = [(parameter.name, parameter.value, parameter.unit) for parameter in system.parameters]
     for group in system.groups:
@@ -139,7 +139,7 @@ def parameters_of(system: CompiledSystem) -> tuple[tuple[str, float, str], ...]:
     return tuple(parameters)
 
 
-def texts_of(system: CompiledSystem) -> str:
+def texts_of(system: Model) -> str:
     """Return the SHA-256 of all texts of a scene."""
     texts = "\n".join(f"{name} {digest}" for name, digest in system.origin.digests)
     return hashlib.sha256(texts.encode("utf-8", "surrogateescape")).hexdigest()
@@ -148,7 +148,7 @@ def texts_of(system: CompiledSystem) -> str:
 class Sink(Protocol):
     """What takes the blocks of a simulation as they come."""
 
-    def take(self, block: Block) -> None:
+    def take(self, block: OutputBlock) -> None:
         """Take one block."""
 
 
@@ -159,12 +159,12 @@ class Keeper:
         numbers = simulation.rows * len(simulation.signals)
         what = f"{len(simulation.signals):,} signals over {float(simulation.settings.duration):g} s"
         hint = "fewer --signals, a shorter --duration, or --out FILE.parquet alone"
-        refuse_beyond(NUMBER * numbers, "E876", Place(simulation.system.origin.topology), what, hint)
+        refuse_beyond(NUMBER * numbers, "E876", SourceLocation(simulation.system.origin.topology), what, hint)
         self.signals = len(simulation.signals)
         self.time: list[Floats] = []
         self.values: list[Floats] = []
 
-    def take(self, block: Block) -> None:
+    def take(self, block: OutputBlock) -> None:
         """Keep one block."""
         self.time.append(block.time)
         self.values.append(block.values)
@@ -185,7 +185,7 @@ def play(
     progress
         Is told the simulated time, in seconds, after each block.
     """
-    watch, interrupted = Watch(simulation), False
+    watch, interrupted = SummaryAccumulator(simulation), False
     try:
         for block in blocks(simulation):
             watch.take(block.time, block.values)
@@ -204,7 +204,7 @@ def play(
 
 
 def simulate(
-    system: CompiledSystem,
+    system: Model,
     *,
     duration: Fraction | None = None,
     signals: Sequence[str] = (),
@@ -283,7 +283,7 @@ def parse_duration(text: str) -> Fraction:
     return option_value("--duration", text, what="duration", unit="s")
 
 
-def duration_of(system: CompiledSystem, duration: Fraction | None, *, runs: int = 1) -> Fraction:
+def duration_of(system: Model, duration: Fraction | None, *, runs: int = 1) -> Fraction:
     """Return how long to play a scene, the experiment's duration unless one is given.
 
     Parameters
@@ -304,11 +304,13 @@ def duration_of(system: CompiledSystem, duration: Fraction | None, *, runs: int 
     if number is None:
         what = "the scene says no duration"
         hint = 'experiment: {duration: 3 s}  (or --duration "3 s")'
-        raise ApcError(Mistake("E877", Place(system.origin.topology), what, hint=hint))
+        raise ApcError(Diagnostic("E877", SourceLocation(system.origin.topology), what, hint=hint))
     if number <= 0:
         expected, got = "more than 0 s", f"{float(number):g} s"
         raise ApcError(
-            Mistake("E877", Place(system.origin.topology), "the duration", expected=expected, got=got)
+            Diagnostic(
+                "E877", SourceLocation(system.origin.topology), "the duration", expected=expected, got=got
+            )
         )
     check_length(system, number, runs=runs)
     return number

@@ -15,17 +15,17 @@ from typing import Any
 import casadi
 import numpy as np
 
-from apc.compiler.compiled import Kind
+from apc.compiler.compiled import PeerType
 from apc.frame.jacobians import edge_name
 from apc.frame.schedule import (
-    Act,
+    ClockedValue,
     Event,
+    HoldUpdate,
     Propagate,
     Schedule,
-    Selected,
-    Send,
+    SendEvent,
     Tick,
-    Value,
+    UncertainSample,
     remembered,
     shifted,
 )
@@ -62,7 +62,7 @@ def build_program(
         What moves the states that have no exact transition.
     """
     segments = _cut(timed_events(schedule), cuts)
-    writer = _Writer(rates, schedule, recorded, flow, segments)
+    writer = _SegmentWriter(rates, schedule, recorded, flow, segments)
     return Program(
         kind=rates.kind,
         schedule=schedule,
@@ -80,21 +80,23 @@ def _cut(events: Timed, cuts: Sequence[int]) -> list[Timed]:
     """Return the events of each segment."""
     # Sends come first of what happens at an instant, whatever the group.
     ends = [
-        sum(now < cut or (now == cut and isinstance(event, Send)) for now, event in events)
+        sum(now < cut or (now == cut and isinstance(event, SendEvent)) for now, event in events)
         for cut in sorted(cuts)
     ]
     return [events[begin:end] for begin, end in zip([0, *ends], [*ends, len(events)], strict=True)]
 
 
 def _layout(
-    kind: Kind, schedule: Schedule, segments: Sequence[Timed], recorded: Sequence[LocalSignal]
+    kind: PeerType, schedule: Schedule, segments: Sequence[Timed], recorded: Sequence[LocalSignal]
 ) -> Layout:
     """Return the rows of the carry; it is the same between any two segments."""
     seen = {signal.place for signal in recorded if signal.role == "output"}
-    before = remembered([event.value for event in schedule.events if isinstance(event, Act)], schedule.ticks)
+    before = remembered(
+        [event.value for event in schedule.events if isinstance(event, HoldUpdate)], schedule.ticks
+    )
     passed = set(before)  # and what is computed in another segment than it is needed in
     for events in segments:
-        needed = {event.value for _, event in events if isinstance(event, Act)}
+        needed = {event.value for _, event in events if isinstance(event, HoldUpdate)}
         if events is segments[-1]:
             needed |= {shifted(value, schedule.ticks) for value in before}
         computed = {(event.partition, event.index) for _, event in events if isinstance(event, Tick)}
@@ -115,7 +117,7 @@ def _layout(
     )
 
 
-class _Writer:
+class _SegmentWriter:
     """Writes one segment after the other; of what is known at the end of one the carry goes into the next."""
 
     def __init__(
@@ -241,12 +243,12 @@ class _Writer:
         match event:
             case Propagate(duration):
                 self._propagate(now, self.durations.index(duration))
-            case Act(hold, value):
+            case HoldUpdate(hold, value):
                 # What was never computed acts as zero: so the carry begins.
                 u = casadi.vertsplit(self.u)
                 u[hold] = self.values[value]
                 self.u = _column(self.type_, u)
-            case Send(partition, rows):
+            case SendEvent(partition, rows):
                 everything = self._of_site(self.kind.sends[partition].send, now)
                 self.sent |= {row: everything[channel] for channel, row in rows}
             case Tick(partition, index, heard):
@@ -259,14 +261,14 @@ class _Writer:
                 r = _column(self.type_, received)
                 outputs = computing.tick(self.x, self.u, m, r, self._p(), self._time(now))
                 for o in range(len(computing.outputs)):
-                    self.newest[partition, o] = self.values[Value(partition, o, index)] = outputs[o]
+                    self.newest[partition, o] = self.values[ClockedValue(partition, o, index)] = outputs[o]
 
     def _sum(self, now: int, rows: Sequence[int]) -> Any:
         total = self.type_(0)
         for row in rows:
             heard = self.schedule.received[row]
             weight: Any = 1
-            if isinstance(heard, Selected) and heard.gap:
+            if isinstance(heard, UncertainSample) and heard.gap:
                 # What a site would itself send at this moment stands in for what it misses.
                 sending = next(send for send in self.kind.sends if send.link == heard.way.link)
                 weight = self._of_site(sending.send, now)[sending.channels.index(heard.channel)]

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Future
 from contextlib import contextmanager
 
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.distribution import install_line
 from apc.processes import Result, Shared, Task, Workers
 
@@ -45,13 +45,13 @@ def cluster_workers(
     ApcError
         E888 distributed isn't installed, nobody answers at the address, or the cluster has no workers.
     """
-    place = Place(address[:80])
+    place = SourceLocation(address[:80])
     form = "--cluster tcp://HOST:8786"
     if not _ADDRESS.fullmatch(address):
-        raise ApcError(Mistake("E888", place, "a scheduler's address", "HOST:PORT", address[:80], form))
+        raise ApcError(Diagnostic("E888", place, "a scheduler's address", "HOST:PORT", address[:80], form))
     if importlib.util.find_spec("distributed") is None:
         what = "a cluster needs Dask's distributed, here and on its workers"
-        raise ApcError(Mistake("E888", place, what, hint=install_line("cluster")))
+        raise ApcError(Diagnostic("E888", place, what, hint=install_line("cluster")))
     import distributed
 
     # What goes wrong is told once, by us.
@@ -63,17 +63,17 @@ def cluster_workers(
         certificate = distributed.Security().get_connection_args("client").get("ssl_context")
         if address.startswith("tls://") and certificate is None:  # a client without one never ends well
             what = "Dask has no certificate for it (distributed.comm.tls in its own configuration)"
-            raise ApcError(Mistake("E888", place, what, hint=form))
+            raise ApcError(Diagnostic("E888", place, what, hint=form))
         try:
             client = distributed.Client(address, timeout=PATIENCE_S, set_as_default=False)
         except (OSError, ValueError) as error:
             what = f"no Dask scheduler answers there within {PATIENCE_S} s"
-            raise ApcError(Mistake("E888", place, what, hint=form)) from error
+            raise ApcError(Diagnostic("E888", place, what, hint=form)) from error
         with client:
             try:
                 client.wait_for_workers(1, timeout=PATIENCE_S)
             except TimeoutError as error:
-                raise ApcError(Mistake("E888", place, "the cluster there has no workers")) from error
+                raise ApcError(Diagnostic("E888", place, "the cluster there has no workers")) from error
             executor = client.get_executor(pure=False)
             # A task like the others: to scatter it would wait for every worker, frozen ones included.
             with warnings.catch_warnings():
@@ -95,7 +95,7 @@ def _taken(shared: Shared) -> Shared:
     return shared
 
 
-def _trouble(error: BaseException, place: Place) -> ApcError | None:
+def _trouble(error: BaseException, place: SourceLocation) -> ApcError | None:
     """Return what to tell of a part that did not come back."""
     from distributed import KilledWorker
     from distributed.comm import CommClosedError
@@ -108,4 +108,4 @@ def _trouble(error: BaseException, place: Place) -> ApcError | None:
         what = "the workers of the cluster can't load apc: install the same version there"
     else:
         return None
-    return ApcError(Mistake("E888", place, what))
+    return ApcError(Diagnostic("E888", place, what))

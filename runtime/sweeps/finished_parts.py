@@ -1,6 +1,7 @@
 """The finished parts of a sweep on disk, so that nothing is computed twice.
 
-Takes: the target of a sweep, a description of the sweep, cells as they come. Gives: `Parts`, `open_parts`.
+Takes: the target of a sweep, a description of the sweep, cells as they come. Gives: `SweepParts`,
+`open_parts`.
 Guarantees: a part is there whole or not at all, whatever moment the process is killed at; what is damaged, or
 was not written by this user's apc for this sweep, counts as not there; nothing else in the folder is touched.
 Does not: compute, or write the target.
@@ -26,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import RefusedError, is_special, read_file, unlink_link, unwritable, write_bytes
 from apc.compiler.seal import seal
 from apc.npz import read_arrays
@@ -39,7 +40,7 @@ _OWN = os.urandom(32)  # seals what this process alone takes up, where the user 
 
 
 @dataclass(frozen=True, slots=True)
-class Parts:
+class SweepParts:
     """The folder of parts of the sweep of this digest; see `open_parts`."""
 
     folder: Path
@@ -132,7 +133,7 @@ def _unpacked(result: Mapping[str, NDArray[Any]]) -> Cells:
     return tuple(texts[next(codes)] if text else next(numbers) for text in result["is_text"].tolist())
 
 
-def open_parts(target: Path, description: Mapping[str, Any]) -> Parts:
+def open_parts(target: Path, description: Mapping[str, Any]) -> SweepParts:
     """Return the parts of a sweep, those finished before included.
 
     Parameters
@@ -150,5 +151,7 @@ def open_parts(target: Path, description: Mapping[str, Any]) -> Parts:
     folder = target.with_name(target.name + SUFFIX)
     if os.path.lexists(folder) and (folder.is_symlink() or not folder.is_dir()):
         what = "is there and is no folder, where apc sweep keeps its parts"
-        raise ApcError(Mistake("E885", Place(str(folder)), what, hint=f"another --out than {target}"))
-    return Parts(folder, hashlib.sha256(json.dumps(description).encode()).hexdigest())
+        raise ApcError(
+            Diagnostic("E885", SourceLocation(str(folder)), what, hint=f"another --out than {target}")
+        )
+    return SweepParts(folder, hashlib.sha256(json.dumps(description).encode()).hexdigest())

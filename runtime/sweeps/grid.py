@@ -1,6 +1,6 @@
 """Which parameters a sweep varies, and every combination of their values.
 
-Takes: a `CompiledSystem`, names of parameters, and texts such as `0 N/m:3000 N/m:11` or `0, 8 ms`.
+Takes: a `Model`, names of parameters, and texts such as `0 N/m:3000 N/m:11` or `0, 8 ms`.
 Gives: `GridAxis`, `Grid`, `parse_axis`, `build_grid`, `check_size`.
 Guarantees: values are exact rationals in SI; the order of points is that of the axes as given, the last one
 turning fastest; what can be known to be out of bounds is told before any point is computed.
@@ -17,14 +17,14 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
-from apc.frame.names import Free, find, unit_of
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
+from apc.frame.names import ParameterRef, find, unit_of
 from apc.frame.overrides import Override, apply
 from apc.option_value import option_values
 from apc.vary.evaluator import reaches_count
 
-PLACE = Place("sweep")
+PLACE = SourceLocation("sweep")
 
 # Of a range that does not say how many: ten steps, so that the ends and the middle are round numbers.
 DEFAULT_COUNT = 11
@@ -39,7 +39,7 @@ _FORM = "--over contact.stiffness='100 N/m:3000 N/m:30'"
 class GridAxis:
     """One swept parameter; `values` in SI, in the order swept."""
 
-    free: Free
+    free: ParameterRef
     unit: str
     values: tuple[Fraction, ...]
 
@@ -82,11 +82,11 @@ class Grid:
 def build_grid(axes: Sequence[GridAxis]) -> Grid:
     """Return the grid of some axes. Raises ApcError E883 when they make none, or one too large."""
     if not axes:
-        raise ApcError(Mistake("E883", PLACE, "nothing is swept", hint=_FORM))
+        raise ApcError(Diagnostic("E883", PLACE, "nothing is swept", hint=_FORM))
     labels = [axis.free.label for axis in axes]
     for place, label in enumerate(labels):
         if label in labels[:place]:
-            raise ApcError(Mistake("E883", PLACE, f"{label} is swept twice"))
+            raise ApcError(Diagnostic("E883", PLACE, f"{label} is swept twice"))
     _refuse_many([len(axis.values) for axis in axes])
     return Grid(tuple(axes))
 
@@ -110,10 +110,10 @@ def _refuse_many(counts: Sequence[int]) -> None:
     if points > MOST_POINTS:
         sizes = " × ".join(f"{count:,}" for count in counts)
         got = f"{sizes} = {points:,}" if len(counts) > 1 else sizes
-        raise ApcError(Mistake("E883", PLACE, "a sweep", f"at most {MOST_POINTS:,} points", got))
+        raise ApcError(Diagnostic("E883", PLACE, "a sweep", f"at most {MOST_POINTS:,} points", got))
 
 
-def parse_axis(system: CompiledSystem, name: str, text: str) -> GridAxis:
+def parse_axis(system: Model, name: str, text: str) -> GridAxis:
     """Read the values of a swept parameter.
 
     Parameters
@@ -149,7 +149,7 @@ def _whole_numbers(label: str, values: Sequence[Fraction], *, every: bool) -> tu
     low, high = values[0], values[-1]
     if low.denominator != 1 or high.denominator != 1:
         got = f"{float(low):g} to {float(high):g}"
-        raise ApcError(Mistake("E881", PLACE, f"the range of {label}", "whole numbers", got))
+        raise ApcError(Diagnostic("E881", PLACE, f"the range of {label}", "whole numbers", got))
     if every:
         _refuse_many([int(high - low) + 1])
         return tuple(Fraction(count) for count in range(int(low), int(high) + 1))
@@ -161,7 +161,7 @@ def _list(label: str, unit: str, text: str) -> tuple[Fraction, ...]:
     for place, value in enumerate(values):
         if value in values[:place]:
             got = f"{float(value):g} {unit} twice"
-            raise ApcError(Mistake("E881", PLACE, f"the list of {label}", "different values", got))
+            raise ApcError(Diagnostic("E881", PLACE, f"the list of {label}", "different values", got))
     return values
 
 
@@ -173,7 +173,9 @@ def _range(label: str, unit: str, text: str) -> tuple[Fraction, ...]:
     if logarithmic:
         rest = rest[:-1]
     if len(rest) > 1:
-        raise ApcError(Mistake("E881", PLACE, what, "LOW:HIGH:COUNT or LOW:HIGH:COUNT:log", text[:80], _FORM))
+        raise ApcError(
+            Diagnostic("E881", PLACE, what, "LOW:HIGH:COUNT or LOW:HIGH:COUNT:log", text[:80], _FORM)
+        )
     count = _count(what, rest[0].strip()) if rest else DEFAULT_COUNT
     low, high = option_values(
         label, unit, ends, PLACE, rest="".join(f":{part}" for part in text.split(":")[2:])
@@ -181,12 +183,12 @@ def _range(label: str, unit: str, text: str) -> tuple[Fraction, ...]:
     if low >= high:
         got = f"{ends[0].strip()} to {ends[1].strip()}"
         expected = "its lower end first, and the upper above it"
-        raise ApcError(Mistake("E881", PLACE, what, expected, got))
+        raise ApcError(Diagnostic("E881", PLACE, what, expected, got))
     if not logarithmic:
         return tuple(low + (high - low) * step / (count - 1) for step in range(count))
     if low <= 0:
         got = f"{float(low):g} {unit}"
-        raise ApcError(Mistake("E881", PLACE, what, "a lower end above 0 for equal ratios", got))
+        raise ApcError(Diagnostic("E881", PLACE, what, "a lower end above 0 for equal ratios", got))
     ratio = float(high / low)
     # The shortest decimal of the float, so that a table shows it whole; the ends are those given.
     inner = (Fraction(repr(float(low) * ratio ** (step / (count - 1)))) for step in range(1, count - 1))
@@ -196,11 +198,11 @@ def _range(label: str, unit: str, text: str) -> tuple[Fraction, ...]:
 def _count(what: str, text: str) -> int:
     """Read the number of values: a single value is written as a value, not as a range."""
     if not (text.isascii() and text.isdecimal() and len(text) <= MOST_DIGITS and int(text) >= 2):
-        raise ApcError(Mistake("E881", PLACE, what, "2 values or more", text[:40] or "nothing", _FORM))
+        raise ApcError(Diagnostic("E881", PLACE, what, "2 values or more", text[:40] or "nothing", _FORM))
     return int(text)
 
 
-def _check_bounds(system: CompiledSystem, axis: GridAxis, value: Fraction) -> None:
+def _check_bounds(system: Model, axis: GridAxis, value: Fraction) -> None:
     """Raise what `apply` says of this value itself, whatever the other axes are.
 
     What it says of the value together with others (a phase beyond its clock's period, something that depends

@@ -1,7 +1,7 @@
 """What a sweep can compute at each of its points.
 
-Takes: a `CompiledSystem` and a name such as `analyze` or `critical:coordination.stiffness`.
-Gives: `Quantity`, `QUANTITIES`, `find_quantity`, `faulty`; `BEGINNINGS`, `by_criterion`.
+Takes: a `Model` and a name such as `analyze` or `critical:coordination.stiffness`.
+Gives: `SweepQuantity`, `QUANTITIES`, `find_quantity`, `faulty`; `BEGINNINGS`, `by_criterion`.
 Guarantees: what all points share is prepared once; a row does not depend on the parts computed before; a
 point that can't be computed is a row that says why; a number that isn't finite is left out of a row.
 Does not: choose points, or hold results.
@@ -16,29 +16,29 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
 from apc.eigen.spectrum import finite
 from apc.frame.names import find, unit_of
 from apc.frame.overrides import apply
 from apc.sweeps.grid import Grid
-from apc.tables import Column, Row
+from apc.tables import Row, TableColumn
 from apc.vary.growth import MEAN_SQUARE, NOMINAL, PASSIVE
-from apc.vary.many import FAULT, ManyAnalyses, Varied, by_matrices, many_analyses
+from apc.vary.many import FAULT, ManyAnalyses, SweptParameter, by_matrices, many_analyses
 
-PLACE = Place("sweep")
+PLACE = SourceLocation("sweep")
 
 # How the name of a quantity begins that is by another criterion than the nominal one.
 BEGINNINGS = {MEAN_SQUARE: "in mean square: ", PASSIVE: "with passive hands: "}
 
 Cells = tuple[NDArray[Any], ...]
 
-VERDICT = Column("verdict", "", "text")
-MESSAGE = Column("message", "", "text")
+VERDICT = TableColumn("verdict", "", "text")
+MESSAGE = TableColumn("message", "", "text")
 
 
 @dataclass(frozen=True, slots=True)
-class Quantity:
+class SweepQuantity:
     """A result of every point: `cells` gives those of some points of a grid, an array for each of `columns`.
 
     Of numbers and counts it is one of floats, NaN where a point has none; of texts one of objects. The first
@@ -46,12 +46,12 @@ class Quantity:
     takes next to no time, so that many make a part of the work.
     """
 
-    columns: tuple[Column, ...]
+    columns: tuple[TableColumn, ...]
     cells: Callable[[Grid, Sequence[int]], Cells]
     quick: bool = False
 
 
-def find_quantity(system: CompiledSystem, text: str) -> Quantity:
+def find_quantity(system: Model, text: str) -> SweepQuantity:
     """Return the quantity a text names, ready to be evaluated with any numbers of the system.
 
     Parameters
@@ -72,7 +72,7 @@ def find_quantity(system: CompiledSystem, text: str) -> Quantity:
     make = QUANTITIES.get(name.strip())
     if make is None:
         what = f"{name[:80] or 'an empty name'} is nothing a sweep computes ({', '.join(QUANTITIES)})"
-        raise ApcError(Mistake("E884", PLACE, what, hint=nearest(name, QUANTITIES)))
+        raise ApcError(Diagnostic("E884", PLACE, what, hint=nearest(name, QUANTITIES)))
     if criterion != NOMINAL:
         make = _BY_GROWTH[criterion, name.strip()]
     return make(system, argument.strip())
@@ -83,23 +83,23 @@ def by_criterion(text: str, criterion: str) -> str:
     return BEGINNINGS.get(criterion, "") + text
 
 
-def faulty(columns: tuple[Column, ...], error: ApcError) -> Row:
+def faulty(columns: tuple[TableColumn, ...], error: ApcError) -> Row:
     """Return the row of a point at fault: the message's code as its verdict, and the message."""
     first = error.mistakes[0]
     return (FAULT + first.code, *(None for _ in columns[1:-1]), first.sentence)
 
 
-def _analyze(system: CompiledSystem, argument: str) -> Quantity:
+def _analyze(system: Model, argument: str) -> SweepQuantity:
     """Return the verdict, the spectral radius, and how the leading mode moves."""
     if argument:
-        raise ApcError(Mistake("E884", PLACE, "analyze", "no parameter", argument[:80], "--of analyze"))
+        raise ApcError(Diagnostic("E884", PLACE, "analyze", "no parameter", argument[:80], "--of analyze"))
     columns = (
         VERDICT,
-        Column("spectral_radius", "", "number"),
-        Column("spectral_radius_error", "", "number"),
-        Column("rigid_modes", "", "count"),
-        Column("frequency", "Hz", "number"),
-        Column("damping_ratio", "", "number"),
+        TableColumn("spectral_radius", "", "number"),
+        TableColumn("spectral_radius_error", "", "number"),
+        TableColumn("rigid_modes", "", "count"),
+        TableColumn("frequency", "Hz", "number"),
+        TableColumn("damping_ratio", "", "number"),
         MESSAGE,
     )
     made: list[tuple[Grid, ManyAnalyses]] = []
@@ -107,7 +107,7 @@ def _analyze(system: CompiledSystem, argument: str) -> Quantity:
     def cells(grid: Grid, points: Sequence[int]) -> Cells:
         if not made or made[0][0] is not grid:
             varied = [
-                Varied(axis.free, np.array([float(value) for value in axis.values]), exact)
+                SweptParameter(axis.free, np.array([float(value) for value in axis.values]), exact)
                 for axis in grid.axes
                 for exact in [axis.values.__getitem__]
             ]
@@ -121,52 +121,52 @@ def _analyze(system: CompiledSystem, argument: str) -> Quantity:
             rows.message,
         )
 
-    return Quantity(columns, cells, by_matrices(system))
+    return SweepQuantity(columns, cells, by_matrices(system))
 
 
 def _finite(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(np.isfinite(numbers), numbers, np.nan)
 
 
-def _growth(system: CompiledSystem, argument: str) -> Quantity:
+def _growth(system: Model, argument: str) -> SweepQuantity:
     """Return the verdict in mean square and what second moments grow by in a frame."""
     from apc.frame.instance import prepare  # the nominal quantities need none of it
     from apc.moments.network_verdict import growth, verdict_of
 
     if argument:
-        raise ApcError(Mistake("E884", PLACE, "analyze", "no parameter", argument[:80], "--of analyze"))
+        raise ApcError(Diagnostic("E884", PLACE, "analyze", "no parameter", argument[:80], "--of analyze"))
     columns = (
         VERDICT,
-        Column("mean_square_radius", "", "number"),
-        Column("mean_square_radius_error", "", "number"),
+        TableColumn("mean_square_radius", "", "number"),
+        TableColumn("mean_square_radius_error", "", "number"),
         MESSAGE,
     )
     prepared = prepare(system)
 
-    def evaluate(changed: CompiledSystem) -> Row:
+    def evaluate(changed: Model) -> Row:
         with np.errstate(all="ignore"):
             result = growth(changed, prepared)
         error = max(result.high - result.radius, result.radius - result.low)
         return (verdict_of(result), finite(result.radius), finite(error), result.why or result.note)
 
-    return Quantity(columns, _one_by_one(system, columns, evaluate))
+    return SweepQuantity(columns, _one_by_one(system, columns, evaluate))
 
 
-def _passive(system: CompiledSystem, argument: str) -> Quantity:
+def _passive(system: Model, argument: str) -> SweepQuantity:
     """Return the verdict with every passive hand, and how much damping of each device could be spared."""
     from apc.hands.passivity import passive_hands  # the nominal quantities need none of it
 
     if argument:
-        raise ApcError(Mistake("E884", PLACE, "analyze", "no parameter", argument[:80], "--of analyze"))
+        raise ApcError(Diagnostic("E884", PLACE, "analyze", "no parameter", argument[:80], "--of analyze"))
     columns = (
         VERDICT,
-        Column("spare_damping", "N*s/m", "number"),
-        Column("spare_damping_error", "N*s/m", "number"),
-        Column("frequency", "Hz", "number"),
+        TableColumn("spare_damping", "N*s/m", "number"),
+        TableColumn("spare_damping_error", "N*s/m", "number"),
+        TableColumn("frequency", "Hz", "number"),
         MESSAGE,
     )
 
-    def evaluate(changed: CompiledSystem) -> Row:
+    def evaluate(changed: Model) -> Row:
         hands = passive_hands(changed)
         worst = hands.worst
         if worst is None or worst.more is None or worst.error is None:
@@ -179,15 +179,15 @@ def _passive(system: CompiledSystem, argument: str) -> Quantity:
             "",
         )
 
-    return Quantity(columns, _one_by_one(system, columns, evaluate))
+    return SweepQuantity(columns, _one_by_one(system, columns, evaluate))
 
 
-def _critical_by(criterion: str) -> Callable[[CompiledSystem, str], Quantity]:
+def _critical_by(criterion: str) -> Callable[[Model, str], SweepQuantity]:
     return lambda system, argument: _critical(system, argument, criterion)
 
 
 def _one_by_one(
-    system: CompiledSystem, columns: tuple[Column, ...], evaluate: Callable[[CompiledSystem], Row]
+    system: Model, columns: tuple[TableColumn, ...], evaluate: Callable[[Model], Row]
 ) -> Callable[[Grid, Sequence[int]], Cells]:
     """Return what evaluates some points of a grid, each by itself."""
 
@@ -206,25 +206,25 @@ def _one_by_one(
     return cells
 
 
-def _critical(system: CompiledSystem, argument: str, criterion: str = "nominal") -> Quantity:
+def _critical(system: Model, argument: str, criterion: str = "nominal") -> SweepQuantity:
     """Return the value at which the verdict changes with one parameter, and on which side it is stable."""
     from apc.vary.critical_values import critical  # a sweep of verdicts needs none of it
 
     if not argument:
         form = "--of critical:coordination.stiffness"
-        raise ApcError(Mistake("E884", PLACE, "critical", "a parameter", "nothing", form))
+        raise ApcError(Diagnostic("E884", PLACE, "critical", "a parameter", "nothing", form))
     unit = unit_of(system, find(system, argument, PLACE).name)
     shown = "" if unit == "1" else unit
     columns = (
         VERDICT,
-        Column("value", shown, "number"),
-        Column("error", shown, "number"),
-        Column("crossings", "", "count"),
-        Column("proof", "", "text"),
+        TableColumn("value", shown, "number"),
+        TableColumn("error", shown, "number"),
+        TableColumn("crossings", "", "count"),
+        TableColumn("proof", "", "text"),
         MESSAGE,
     )
 
-    def evaluate(changed: CompiledSystem) -> Row:
+    def evaluate(changed: Model) -> Row:
         result = critical(changed, argument, criterion=criterion)
         if result.value is None or result.error is None:
             return (result.verdict, None, None, 0, None, "")
@@ -232,15 +232,15 @@ def _critical(system: CompiledSystem, argument: str, criterion: str = "nominal")
         proof = next(crossing.proof for crossing in result.crossings if crossing.value == result.value)
         return (verdict, finite(result.value), finite(result.error), len(result.crossings), proof, "")
 
-    return Quantity(columns, _one_by_one(system, columns, evaluate))
+    return SweepQuantity(columns, _one_by_one(system, columns, evaluate))
 
 
-QUANTITIES: Mapping[str, Callable[[CompiledSystem, str], Quantity]] = {
+QUANTITIES: Mapping[str, Callable[[Model, str], SweepQuantity]] = {
     "analyze": _analyze,
     "critical": _critical,
 }
 
-_BY_GROWTH: Mapping[tuple[str, str], Callable[[CompiledSystem, str], Quantity]] = {
+_BY_GROWTH: Mapping[tuple[str, str], Callable[[Model, str], SweepQuantity]] = {
     (MEAN_SQUARE, "analyze"): _growth,
     (MEAN_SQUARE, "critical"): _critical_by(MEAN_SQUARE),
     (PASSIVE, "analyze"): _passive,

@@ -1,6 +1,6 @@
 """One result at every combination of some parameters' values, with what is finished kept as it comes.
 
-Takes: a `CompiledSystem`, the values of each swept parameter, what to compute.
+Takes: a `Model`, the values of each swept parameter, what to compute.
 Gives: `Sweep`, `sweep`; `part_points`.
 Guarantees: the same rows in the same order whoever computes them, interrupted or not; a sweep with a target
 takes up its finished parts; the target is written when all of it is there, and its parts are removed then.
@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import near_start
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import is_special
 from apc.compiler.timings import part
 from apc.frame.names import notes_for_all_groups
@@ -30,17 +30,17 @@ from apc.memory import refuse_beyond
 from apc.network.nominal import left_out, refuse_channel_number
 from apc.processes import Patience, Workers, cores, local_processes, model_bytes, results, this_process
 from apc.result import Result
-from apc.sweeps.finished_parts import Parts, open_parts
+from apc.sweeps.finished_parts import SweepParts, open_parts
 from apc.sweeps.grid import Grid, build_grid, check_size, parse_axis
 from apc.sweeps.quantities import BEGINNINGS, Cells, by_criterion, find_quantity
 from apc.sweeps.work import Computed, Work, compute_part, program_versions
-from apc.tables import BLOCK, Column, check_table_path, read_table, write_table
+from apc.tables import BLOCK, TableColumn, check_table_path, read_table, write_table
 from apc.vary.growth import MEAN_SQUARE, NOMINAL, PASSIVE, criterion_of, refuse_time
 
 if TYPE_CHECKING:
     import pandas
 
-PLACE = Place("sweep")
+PLACE = SourceLocation("sweep")
 
 # Points of a part: a third of a second of analyses, which is what a kill can cost; more where points are
 # quick, as long as there are parts for all who compute; and no more files in a folder than one likes to list.
@@ -50,7 +50,7 @@ MOST_PARTS = 10_000
 
 Progress = Callable[[int, int], None]  # points done, points in all
 
-LOST = Mistake(
+LOST = Diagnostic(
     "E889",
     PLACE,
     "a process that computed ended without a word: stopped from outside, out of memory, or started by a "
@@ -74,7 +74,7 @@ class Sweep(Result):
     topology: str
     of: str
     grid: Grid
-    listed: tuple[Column, ...]
+    listed: tuple[TableColumn, ...]
     held: Cells | None
     counts: Counter[str]
     messages: Counter[str]
@@ -126,7 +126,7 @@ CELL = 32
 
 @part("points")
 def sweep(
-    system: CompiledSystem,
+    system: Model,
     over: Mapping[str, str | Sequence[str]],
     *,
     of: str = "analyze",
@@ -182,11 +182,11 @@ def sweep(
             refuse_channel_number(system, axis.free, PLACE, instead=f"--in {MEAN_SQUARE}")
         if axis.free.label == of.partition(":")[2].strip():
             what = f"{axis.free.label} is swept: there is nothing to look for at one value of it"
-            raise ApcError(Mistake("E884", PLACE, what, hint="--of critical:PATH with another parameter"))
+            raise ApcError(Diagnostic("E884", PLACE, what, hint="--of critical:PATH with another parameter"))
     if out is not None:
         check_table_path(out, "out=")
     if jobs is not None and jobs < 1:
-        raise ApcError(Mistake("E889", PLACE, "the number of processes", "1 or more", str(jobs)))
+        raise ApcError(Diagnostic("E889", PLACE, "the number of processes", "1 or more", str(jobs)))
     width = len(grid.axes) + len(quantity.columns)
     what = f"{grid.points:,} points of {width} columns"
     filed = _in_a_file(out)
@@ -199,7 +199,7 @@ def sweep(
     parts = _kept(out, made_of)
     whose = Whose(jobs or cores(), cluster, patience or Patience())
     notes = _compute_missing(work, parts, whose, progress)
-    columns = (*(Column(axis.heading) for axis in grid.axes), *quantity.columns)
+    columns = (*(TableColumn(axis.heading) for axis in grid.axes), *quantity.columns)
     counts = Counter[str](), Counter[str]()
     blocks, held = _blocks(work, parts, [column.kind for column in columns], counts), None
     if isinstance(parts, _Memory):
@@ -207,7 +207,7 @@ def sweep(
         blocks = ([column[at : at + BLOCK] for column in held] for at in range(0, grid.points, BLOCK))
     if out is not None:
         write_table(out, columns, blocks, made_of)
-    if isinstance(parts, Parts):
+    if isinstance(parts, SweepParts):
         parts.remove()
     return Sweep(system.name, of, grid, columns, held, *counts, out, made_of, notes)
 
@@ -220,13 +220,13 @@ def part_points(points: int, *, quick: bool) -> int:
     points
         Of the whole sweep.
     quick
-        As of `quantities.Quantity`.
+        As of `quantities.SweepQuantity`.
     """
     most = min(points // SHARES, QUICK_POINTS) if quick else 0
     return max(PART_POINTS, most, -(-points // MOST_PARTS))
 
 
-def _description(system: CompiledSystem, work: Work) -> dict[str, Any]:
+def _description(system: Model, work: Work) -> dict[str, Any]:
     """Return what a sweep is, as plain data: two with the same description have the same rows."""
     parameters = {parameter.name: parameter.value for parameter in system.parameters}
     parameters |= {timing.name: float(timing.value) for timing in system.timings}
@@ -261,7 +261,7 @@ def _description(system: CompiledSystem, work: Work) -> dict[str, Any]:
 
 
 class _Memory:
-    """Parts that are nowhere but here, as `finished_parts.Parts` are on disk."""
+    """Parts that are nowhere but here, as `finished_parts.SweepParts` are on disk."""
 
     def __init__(self) -> None:
         self._cells: dict[int, Cells] = {}
@@ -276,7 +276,7 @@ class _Memory:
         return set(self._cells)
 
 
-_Kept = Parts | _Memory
+_Kept = SweepParts | _Memory
 
 
 def _in_a_file(out: Path | None) -> bool:
@@ -332,12 +332,12 @@ def _workers(work: Work, jobs: int, cluster: str | None) -> AbstractContextManag
     return local_processes(compute_part, work, jobs, LOST)
 
 
-def _other_versions(computed: Computed, cluster: str | None) -> Mistake:
+def _other_versions(computed: Computed, cluster: str | None) -> Diagnostic:
     """Return the message for numbers that come from other libraries than those here."""
     here = dict(program_versions())
     other = [f"{name} {got} (here {here[name]})" for name, got in computed.versions if here[name] != got]
     what = f"a worker has {', '.join(other)}: the same numbers can't be promised; install the same there"
-    return Mistake("E888", Place(cluster or "sweep"), what)
+    return Diagnostic("E888", SourceLocation(cluster or "sweep"), what)
 
 
 def _blocks(

@@ -19,7 +19,7 @@ from apc.compiler.cache import program_digest
 from apc.distribution import versions
 from apc.processes import model_of_bytes
 from apc.sweeps.grid import Grid
-from apc.sweeps.quantities import Cells, Quantity, find_quantity
+from apc.sweeps.quantities import Cells, SweepQuantity, find_quantity
 from apc.threads import single_threaded
 
 # What makes the numbers: with another version of one of them, the last digits may be others.
@@ -53,7 +53,7 @@ class Work:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Computed:
-    """The cells of a part (see `quantities.Quantity`), and the versions of what computed them."""
+    """The cells of a part (see `quantities.SweepQuantity`), and the versions of what computed them."""
 
     part: int
     cells: Cells
@@ -79,5 +79,5 @@ def program_versions() -> tuple[tuple[str, str], ...]:
 
 
 @lru_cache(maxsize=1)
-def _opened(model: bytes, of: str) -> Quantity:
+def _opened(model: bytes, of: str) -> SweepQuantity:
     return find_quantity(model_of_bytes(model), of)

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.box_proof import TOGETHER, open_questions
-from apc.analysis.cells import Cell, OpenSystem, matrices_over
-from apc.compiler.compiled import CompiledSystem
+from apc.analysis.cells import Cell, ParametricClosedLoop, matrices_over
+from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.eigen.enclosure import least_radius
 from apc.frame.instance import Prepared
@@ -31,7 +31,7 @@ GAINS, ENTRIES = 3, 600_000
 
 
 def none_better(
-    scenes: Sequence[CompiledSystem],
+    scenes: Sequence[Model],
     prepared: Prepared,
     gains: Sequence[Range],
     aim: int,
@@ -83,7 +83,7 @@ def none_better(
 
 
 def _looked(
-    questions: Sequence[OpenSystem], cells: Sequence[Cell]
+    questions: Sequence[ParametricClosedLoop], cells: Sequence[Cell]
 ) -> tuple[NDArray[np.bool_], NDArray[np.intp], int]:
     """Return which cells are proved unstable, along which gain each varies most, and entries looked at."""
     unstable, size = np.zeros(len(cells), dtype=np.bool_), 0

@@ -1,7 +1,7 @@
 """An aim against what a hand feels: the best of the one for every bound on the other (a Pareto front).
 
-Takes: a `CompiledSystem`, `Demands`, and the quantity that their aim is weighed against.
-Gives: `Design`, `Front`, `front`.
+Takes: a `Model`, `TuningSpec`, and the quantity that their aim is weighed against.
+Gives: `Design`, `ParetoFront`, `front`.
 Guarantees: each design is that of `tune` with its bound as a demand, proved or not as there.
 Does not: say that no designs lie beyond.
 """
@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic
 from apc.frame.instance import prepare
 from apc.result import Result
-from apc.tuning.demands import AGAINST, FELT, Aim, Demands, Felt
-from apc.tuning.limits import Limits
+from apc.tuning.demands import AGAINST, FELT, Objective, TransparencyMetric, TuningSpec
+from apc.tuning.limits import ConstraintSet
 from apc.tuning.tuner import Tuning, tune
 from apc.vary.crossing import Progress
 
@@ -42,7 +42,7 @@ class Design:
 
 
 @dataclass(frozen=True, slots=True)
-class Front(Result):
+class ParetoFront(Result):
     """Designs from the least that is felt to the best of the aim; `knee` is the place of the one between.
 
     The knee is farthest from the straight line between the ends, each axis counted from one end to the other.
@@ -70,14 +70,14 @@ class Front(Result):
 
 
 def front(
-    system: CompiledSystem,
-    demands: Demands,
-    against: Felt,
+    system: Model,
+    demands: TuningSpec,
+    against: TransparencyMetric,
     *,
     points: int = POINTS,
     seconds: float = float("inf"),
     progress: Progress | None = None,
-) -> Front:
+) -> ParetoFront:
     """Return the best of an aim for each of several bounds on what a hand feels.
 
     Parameters
@@ -97,7 +97,7 @@ def front(
         E996 what is felt is least where the aim is best.
     """
     until = time.monotonic() + seconds
-    limits = Limits(system, prepare(system), replace(demands, felt=(against,)))
+    limits = ConstraintSet(system, prepare(system), replace(demands, felt=(against,)))
     every = limits.every()
 
     def felt(gains: Floats) -> float:
@@ -106,16 +106,16 @@ def front(
         return max(float(limits.measured(*point, limits.demands)[0, 0, 0]) for point in points)
 
     best = tune(system, demands, seconds=seconds, progress=progress)
-    least = Aim(against.label, len(demands.free), False, FELT[against.name][0], ((1.0, against),))
+    least = Objective(against.label, len(demands.free), False, FELT[against.name][0], ((1.0, against),))
     other = tune(system, replace(demands, aim=least), seconds=until - time.monotonic(), progress=progress)
     low, high = other.best, felt(np.array([float(gain.value) for gain in best.gains]))
     if not (best.met and other.met):
         what = f"no gains were found in these ranges that meet all demands, whatever {against.label} is"
-        raise ApcError(Mistake("E996", AGAINST, what))
+        raise ApcError(Diagnostic("E996", AGAINST, what))
     if not 0 < low < high * (1 - SAME):
         what = f"the best {demands.aim.label} is the best for {against.label}, too"
         what = f"{against.label} can be below 0: there are no bounds in equal ratios" if low <= 0 else what
-        raise ApcError(Mistake("E996", AGAINST, what))
+        raise ApcError(Diagnostic("E996", AGAINST, what))
     designs, notes = [_design(best, high)], best.notes
     for place, bound in enumerate(np.geomspace(high, low * LEAST, points)[1:].tolist(), 1):
         left = until - time.monotonic()
@@ -127,7 +127,7 @@ def front(
         if tuning.met:
             designs.append(_design(tuning, felt(np.array([float(gain.value) for gain in tuning.gains]))))
     designs.sort(key=lambda design: design.felt)
-    return Front(
+    return ParetoFront(
         topology=system.name,
         aim=demands.aim.label,
         unit=best.unit,

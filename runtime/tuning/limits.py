@@ -1,7 +1,7 @@
 """How far gains are from what limits them, in scenarios of all else that they have to bear.
 
-Takes: a `CompiledSystem` and `Demands`.
-Gives: `Scenario`, `Rows`, `Limits`.
+Takes: a `Model` and `TuningSpec`.
+Gives: `Scenario`, `ConstraintValues`, `ConstraintSet`.
 Guarantees: a value below 0 is a demand that is met, in floats; slopes are those of the values.
 Does not: choose scenarios, or prove (see `tuner`).
 
@@ -27,16 +27,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import prepare_at_start
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic
 from apc.eigen.eigenpairs import eigenvalues
 from apc.frame.instance import Prepared
 from apc.frame.overrides import Override, apply
 from apc.hands.frequency_response import COUPLED, feel
 from apc.moments.changing_delay import loop_gain
 from apc.threads import load_pool
-from apc.tuning.demands import HINF, PLACE, SUBJECT, Aim, Demands, Felt
-from apc.unserved import UnservedError
+from apc.tuning.demands import HINF, PLACE, SUBJECT, Objective, TransparencyMetric, TuningSpec
+from apc.unserved import NotSupportedError
 from apc.vary.batch import BatchEvaluator, MatrixSource
 from apc.vary.delay_box import standing_delays
 from apc.vary.evaluator import evaluator_of_many
@@ -51,7 +51,7 @@ MODES = 4
 # The step of a difference, of a range: what it cuts off and what rounding leaves of it are then alike.
 STEP = 1e-6
 
-# Responses as `Feel` has them, and their bounds; in what of it all else is; less than any size.
+# Responses as `Transparency` has them, and their bounds; in what of it all else is; less than any size.
 RESPONSES = {
     "impedance": ("impedance", "bound"),
     "transmitted": ("transmitted_admittance", "transmitted_bound"),
@@ -80,7 +80,7 @@ class Scenario:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rows:
+class ConstraintValues:
     """Limits at one point of the columns: `values` (n,), below 0 where met, and `slopes` (n, m).
 
     A slope is that over the whole range of a column, or of a number of the box.
@@ -96,12 +96,12 @@ class Rows:
 
 
 @dataclass(frozen=True, eq=False)
-class Limits:
+class ConstraintSet:
     """What limits the gains of a scene; after the time `until` of several points only the first is judged."""
 
-    system: CompiledSystem
+    system: Model
     prepared: Prepared
-    demands: Demands
+    demands: TuningSpec
     until: float = math.inf
     known: dict[int, MatrixSource] = field(default_factory=dict)
     samples: dict[Scenario, Floats] = field(default_factory=dict)
@@ -110,7 +110,7 @@ class Limits:
     loop_gains: dict[tuple[tuple[Override, ...], tuple[float, ...]], float] = field(default_factory=dict)
 
     @cached_property
-    def settings(self) -> list[tuple[tuple[Override, ...], CompiledSystem]]:
+    def settings(self) -> list[tuple[tuple[Override, ...], Model]]:
         """Every number of peers with every delay that stands for others, and the scene with these."""
         runs = [range(int(count.low), int(count.high) + 1) for count in self.demands.counts]
         pairs = []
@@ -216,7 +216,7 @@ class Limits:
         return Scenario(setting, tuple(point.tolist())), -float(top.fun) - self.allowed
 
     @property
-    def views(self) -> list[Demands]:
+    def views(self) -> list[TuningSpec]:
         """The demands with what is largest over all frequencies at each of those known: smooth limits all."""
         if all(felt.name != HINF for felt in self.demands.measured):
             return [self.demands]
@@ -241,7 +241,7 @@ class Limits:
         return len(self.frequencies) > before
 
     def asked(
-        self, setting: int, points: Floats, *, bounded: bool = False, view: Demands | None = None
+        self, setting: int, points: Floats, *, bounded: bool = False, view: TuningSpec | None = None
     ) -> Floats:
         """Return how far points (k, m + b) are from the demands other than stability, and the level (k, q).
 
@@ -264,7 +264,7 @@ class Limits:
         values = np.log(np.maximum(felt[:, :count, 0] + off[:, :count], TINY))
         values -= np.log([felt.most for felt in demands.felt])
         if aim.level:
-            weights = [abs(weight) for weight, item in aim.terms if isinstance(item, Felt)]
+            weights = [abs(weight) for weight, item in aim.terms if isinstance(item, TransparencyMetric)]
             sums = _sums(aim, felt[:, count:, 0], points)
             short = (-1 if aim.larger else 1) * (sums - points[:, len(demands.free)])
             beyond = short + off[:, count:] @ weights
@@ -295,7 +295,7 @@ class Limits:
                 scene = apply(self.system, [*counts, *(Override(*pair) for pair in pairs)])
                 try:
                     gain = loop_gain(scene, delay.free, delay.low, delay.high)
-                except UnservedError:
+                except NotSupportedError:
                     gain = math.inf
                 self.loop_gains[counts, point] = math.log(max(gain, TINY))
             values[place] = self.loop_gains[counts, point]
@@ -310,7 +310,7 @@ class Limits:
             sums.append(_sums(self.demands.aim, felt[:, count:, 0], points))
         return np.array(sums)
 
-    def measured(self, setting: int, numbers: Floats, view: Demands) -> Floats:
+    def measured(self, setting: int, numbers: Floats, view: TuningSpec) -> Floats:
         """Return what is felt with gains and box (k, n), what it may be off by, and at how many Hz (k, q, 3).
 
         It is infinite where nothing is felt, or nothing can be said.
@@ -339,13 +339,13 @@ class Limits:
             self.samples[scenario] = self.worst([scenario], chosen)[:, 0]
         return self.samples[scenario]
 
-    def rows(self, scenarios: Sequence[Scenario], chosen: Floats, *, wide: bool = False) -> Rows:
+    def rows(self, scenarios: Sequence[Scenario], chosen: Floats, *, wide: bool = False) -> ConstraintValues:
         """Return all limits with columns (m,), their slopes along the numbers of the box, too, if `wide`."""
         ranges = [*self.demands.columns, *self.demands.box]
         along = np.diag([float(interval.high - interval.low) for interval in ranges])
         along = along if wide else along[: len(chosen)]
         parts: list[tuple[Floats, Floats, Complexes, float, int]] = []
-        aim = [felt for _, felt in self.demands.aim.terms if isinstance(felt, Felt)]
+        aim = [felt for _, felt in self.demands.aim.terms if isinstance(felt, TransparencyMetric)]
         peaks = [felt.name == HINF for felt in self.demands.felt]
         peaks += [any(felt.name == HINF for felt in aim)] * bool(self.demands.aim.terms)
         peaks += [False] * self.demands.changing
@@ -376,7 +376,7 @@ class Limits:
                 asked = self.asked(scenario.setting, moved, view=view)[:, peaks]
                 parts.append((*_differences(asked, inwards), frequency, place))
         counts = [len(values) for values, *_ in parts]
-        return Rows(
+        return ConstraintValues(
             np.concatenate([values for values, *_ in parts]),
             np.concatenate([slopes for _, slopes, *_ in parts]),
             np.concatenate([values for *_, values, _, _ in parts]),
@@ -385,16 +385,19 @@ class Limits:
         )
 
 
-def _sums(aim: Aim, felt: Floats, points: Floats) -> Floats:
+def _sums(aim: Objective, felt: Floats, points: Floats) -> Floats:
     """Return the weighted sum that is an aim (k,), of what is felt of it (k, f) at points (k, m + b)."""
     of_hands = iter(felt.T)
-    terms = [w * (next(of_hands) if isinstance(item, Felt) else points[:, item]) for w, item in aim.terms]
+    terms = [
+        w * (next(of_hands) if isinstance(item, TransparencyMetric) else points[:, item])
+        for w, item in aim.terms
+    ]
     total = np.asarray(np.sum(terms, axis=0))
     return np.where(np.isfinite(total), total, np.nan)
 
 
 def felt_in(
-    system: CompiledSystem, asked: Sequence[Felt], prepared: Prepared
+    system: Model, asked: Sequence[TransparencyMetric], prepared: Prepared
 ) -> list[tuple[float, float, float]]:
     """Return each of what is asked about the hands of a scene, what it may be off by, and at how many Hz.
 
@@ -430,7 +433,7 @@ def felt_in(
         elif felt.name == HINF:
             if COUPLED in felt_response.notes:
                 what = f"{felt.label} is not told of peers that differ, which move apart together"
-                raise ApcError(Mistake("E996", PLACE, what, hint="feel.error_h2"))
+                raise ApcError(Diagnostic("E996", PLACE, what, hint="feel.error_h2"))
             for mode in (mode for mode in felt_response.hinf if mode.of == "error"):
                 peak = mode.sampled_data
                 own = (peak.norm, peak.error, peak.frequency_hz)
@@ -438,7 +441,7 @@ def felt_in(
                     own = (float(mode.gains[hertz.index(felt.frequency_hz)]), peak.error, felt.frequency_hz)
                 value, off, hz = max((value, off, hz), own)
         if value == 0:
-            raise ApcError(Mistake("E996", SUBJECT, f"of {felt.label} nothing is felt in this scene"))
+            raise ApcError(Diagnostic("E996", SUBJECT, f"of {felt.label} nothing is felt in this scene"))
         result.append((value, off, hz))
     return result
 

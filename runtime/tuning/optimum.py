@@ -1,7 +1,7 @@
 """The best gains within limits, of a few scenarios at a time.
 
-Takes: `Limits`, scenarios.
-Gives: `Optimum`, `Search`.
+Takes: `ConstraintSet`, scenarios.
+Gives: `Optimum`, `ScenarioOptimizer`.
 Guarantees: the same question, the same gains: what is drawn is drawn by a fixed rule.
 Does not: prove that nothing is better: so many points were looked at, and none was.
 
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.threads import load_pool
-from apc.tuning.limits import STEP, Limits, Rows, Scenario
+from apc.tuning.limits import STEP, ConstraintSet, ConstraintValues, Scenario
 
 Floats = NDArray[np.float64]
 
@@ -80,7 +80,7 @@ class Optimum:
     value: float
     error: float
     worst: float
-    rows: Rows
+    rows: ConstraintValues
     multipliers: Floats
     looked: int
 
@@ -90,7 +90,7 @@ class TimeUp(Exception):
 
 
 @dataclass(frozen=True, eq=False)
-class Search:
+class ScenarioOptimizer:
     """A search for the best gains in some scenarios.
 
     The gain, or level, in `column` is to be large (`sign` 1) or small (−1); without a column the largest
@@ -98,7 +98,7 @@ class Search:
     Inside, ranges are 0 to 1; t stands for the largest limit, where that is the aim.
     """
 
-    limits: Limits
+    limits: ConstraintSet
     scenarios: Sequence[Scenario]
     column: int | None
     sign: float = 1.0
@@ -225,7 +225,7 @@ class Search:
     def descended(self, start: Floats) -> Optimum:
         """Return where a descent from shares of the ranges ends."""
         optimize = load_pool("scipy.optimize")
-        known: dict[bytes, Rows] = {}
+        known: dict[bytes, ConstraintValues] = {}
         rows_of = self._remembered(known)
         size, spare = len(start), self.column is None
         at_end = (start == self._ends[0]) | (start == self._ends[1])
@@ -275,10 +275,10 @@ class Search:
             best = min(best, *seen, key=self._rank)
         return replace(best, looked=len(known))
 
-    def _remembered(self, known: dict[bytes, Rows]) -> Callable[[Floats], Rows]:
+    def _remembered(self, known: dict[bytes, ConstraintValues]) -> Callable[[Floats], ConstraintValues]:
         """Return what gives the limits at shares (m,), once each; it raises `TimeUp`, but of the first."""
 
-        def rows_of(shares: Floats) -> Rows:
+        def rows_of(shares: Floats) -> ConstraintValues:
             key = np.ascontiguousarray(shares).tobytes()
             if key not in known:
                 if known and self.limits.late:
@@ -288,7 +288,7 @@ class Search:
 
         return rows_of
 
-    def _optimum(self, shares: Floats, rows: Rows) -> Optimum:
+    def _optimum(self, shares: Floats, rows: ConstraintValues) -> Optimum:
         """Return an optimum with what its limits cost: the multipliers that best balance the aim."""
         worst = float(rows.values.max(initial=-np.inf))
         inner = (shares > self._ends[0] + OPEN) & (shares < self._ends[1] - OPEN)

@@ -1,7 +1,7 @@
 """The gains that do best in all that they have to bear, as a person would type them, proved.
 
-Takes: a `CompiledSystem` and `Demands`.
-Gives: `Gain`, `Binding`, `Proved`, `Tuning`, `tune`.
+Takes: a `Model` and `TuningSpec`.
+Gives: `Gain`, `ActiveConstraint`, `Proved`, `Tuning`, `tune`.
 Guarantees: what is said to be proved is proved by the scene's own analysis at the gains as they are printed;
 what is not, is said not to be.
 Does not: prove that no other gains are better, but of at most three that a nominal network limits, by 2 %.
@@ -26,14 +26,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import analyze, near_start
-from apc.analysis.box_proof import UNDECIDED, BoxProof, ChangingDelay
+from apc.analysis.box_proof import UNDECIDED, ChangingDelay, RobustStability
 from apc.answer import proved_at
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic
 from apc.compiler.timings import part
 from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import prepare
-from apc.frame.names import Free, Range, value_now
+from apc.frame.names import ParameterRef, Range, value_now
 from apc.frame.overrides import Override, apply
 from apc.hands.passivity import passive_hands
 from apc.moments.changing_delay import loop_gain
@@ -41,10 +41,10 @@ from apc.network.nominal import left_out
 from apc.result import Result
 from apc.threads import single_threaded
 from apc.tuning.bound import none_better
-from apc.tuning.demands import CHANGING, HINF, PLACE, SUBJECT, Demands, Felt
-from apc.tuning.limits import BEYOND, RESPONSES, Limits, Scenario, felt_in
-from apc.tuning.optimum import BINDS, Optimum, Search
-from apc.unserved import UnservedError
+from apc.tuning.demands import CHANGING, HINF, PLACE, SUBJECT, TransparencyMetric, TuningSpec
+from apc.tuning.limits import BEYOND, RESPONSES, ConstraintSet, Scenario, felt_in
+from apc.tuning.optimum import BINDS, Optimum, ScenarioOptimizer
+from apc.unserved import NotSupportedError
 from apc.vary.crossing import Progress
 from apc.vary.delay_box import changing
 from apc.vary.growth import MEAN_SQUARE, NOMINAL, PASSIVE
@@ -110,7 +110,7 @@ class Gain:
 
 
 @dataclass(frozen=True, slots=True)
-class Binding:
+class ActiveConstraint:
     """What keeps gains from doing better: a mode in a scenario, or an end of a gain's own range.
 
     `where` are the scenario's numbers as (label, value, unit). `shape` and `frequency_hz` are the mode's, ""
@@ -129,7 +129,7 @@ class Proved:
     """What was proved of the gains with some numbers of peers, as (label, number): of the rest, all of it."""
 
     counts: tuple[tuple[str, int], ...]
-    proof: BoxProof
+    proof: RobustStability
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,20 +165,20 @@ class Tuning(Result):
     over: tuple[Range, ...]
     criterion: str
     decay: float
-    felt: tuple[Felt, ...]
+    felt: tuple[TransparencyMetric, ...]
     delay: Range | None
     changing: tuple[tuple[tuple[tuple[str, int], ...], ChangingDelay], ...]
     demanded: bool
     frame_s: float
     allowed: float
     proofs: tuple[Proved, ...]
-    binding: tuple[Binding, ...]
+    binding: tuple[ActiveConstraint, ...]
     looked: int
     bounded: int | None
     notes: tuple[str, ...]
     left_out: tuple[str, ...]
     ranges: tuple[Range, ...] = field(compare=False, repr=False)
-    scenes: tuple[CompiledSystem, ...] = field(compare=False, repr=False)
+    scenes: tuple[Model, ...] = field(compare=False, repr=False)
 
     def plot(self, ax: Any = None) -> Any:
         """Draw two gains over the stable regions of what limits them, and a strike; return the Axes.
@@ -195,8 +195,8 @@ class Tuning(Result):
 
 @part("tune")
 def tune(
-    system: CompiledSystem,
-    demands: Demands,
+    system: Model,
+    demands: TuningSpec,
     *,
     seconds: float = math.inf,
     progress: Progress | None = None,
@@ -226,15 +226,15 @@ def tune(
 class _Work:
     """The work: its scenarios grow."""
 
-    system: CompiledSystem
-    demands: Demands
+    system: Model
+    demands: TuningSpec
     until: float
     progress: Progress
     scenarios: list[Scenario] = field(default_factory=list)
     looked: int = 0
 
     def __post_init__(self) -> None:
-        self.limits = Limits(self.system, prepare(self.system), self.demands, self.until)
+        self.limits = ConstraintSet(self.system, prepare(self.system), self.demands, self.until)
         # What can't be felt anywhere is refused before anything is looked for.
         asked = [felt for felt in self.demands.felt if felt.name in RESPONSES]
         asked += [felt for felt in self.demands.measured if felt.name == HINF]
@@ -249,23 +249,23 @@ class _Work:
         if self.demands.changing:
             try:
                 self.limits.changing(0, np.array([[*self.present, *self.every[0].point]]))
-            except UnservedError as why:
-                raise ApcError(Mistake("E996", SUBJECT, f"{CHANGING} can't be decided: {why}")) from None
+            except NotSupportedError as why:
+                raise ApcError(Diagnostic("E996", SUBJECT, f"{CHANGING} can't be decided: {why}")) from None
         if self.demands.aim.terms:
             self._with_level()
 
     def _with_level(self) -> None:
         """Find where the aim's level is looked for: from the best that is known on."""
-        search = Search(self.limits, self.scenarios, None)
+        search = ScenarioOptimizer(self.limits, self.scenarios, None)
         points = np.vstack([self.present, search.gains(search.even)])
         sums = self.limits.sums(self.scenarios, points)
         known = sums[np.isfinite(sums)]
         if not len(known):
             what = f"nothing is known of {self.demands.aim.label} with any gains that were looked at"
-            raise ApcError(Mistake("E996", PLACE, what, hint="wider ranges, or another aim"))
+            raise ApcError(Diagnostic("E996", PLACE, what, hint="wider ranges, or another aim"))
         best = float(known.max() if self.demands.aim.larger else known.min())
         scale = abs(best) or float(np.abs(known).max()) or 1.0
-        name, unit = Free(self.demands.aim.label), self.demands.aim.unit
+        name, unit = ParameterRef(self.demands.aim.label), self.demands.aim.unit
         level = Range(name, unit, Fraction(best), Fraction(best) + Fraction(scale))
         self.demands = replace(self.demands, aim=replace(self.demands.aim, level=level, scale=scale))
         self.limits = replace(self.limits, demands=self.demands)
@@ -305,7 +305,7 @@ class _Work:
             starts = [self._shares(optimum)]
 
     def _shares(self, optimum: Optimum) -> Floats:
-        return Search(self.limits, self.scenarios, None).shares(optimum)
+        return ScenarioOptimizer(self.limits, self.scenarios, None).shares(optimum)
 
     def _borne(self, column: int | None, starts: list[Floats]) -> Optimum:
         """Return the best of all scenarios, those added that limit it more than those there are."""
@@ -313,7 +313,7 @@ class _Work:
         begun: list[Floats] = []
         for turn in itertools.count():
             self.progress(f"looking for gains in {len(self.scenarios)} of {len(self.every)} scenarios")
-            search = Search(self.limits, self.scenarios, column, sign)
+            search = ScenarioOptimizer(self.limits, self.scenarios, column, sign)
             if not starts:
                 starts = begun = search.start(self.present, self.every)
                 for start in starts:
@@ -468,14 +468,14 @@ class _Work:
                 break
         return proveds, None
 
-    def _stable_if_changing(self, scene: CompiledSystem) -> bool:
+    def _stable_if_changing(self, scene: Model) -> bool:
         """Return whether a scene is proved stable under a delay that changes, where nothing else varies."""
         delay = self.demands.delay
         if delay is None or self.demands.box:
             return False
         try:
             return loop_gain(scene, delay.free, delay.low, delay.high) < 1
-        except UnservedError:
+        except NotSupportedError:
             return False
 
     def _changing(
@@ -511,7 +511,7 @@ class _Work:
         return float(1 - _decimal(least * (1 - BACK[-1]), DIGITS, ROUND_FLOOR))
 
     def _failed(
-        self, numbers: tuple[Override, ...], proof: BoxProof, ranges: Sequence[Range]
+        self, numbers: tuple[Override, ...], proof: RobustStability, ranges: Sequence[Range]
     ) -> Scenario | None:
         """Return the scenario in which gains are proved not to hold; None where it is one already."""
         values = dict(zip([interval.free for interval in ranges], proof.point, strict=False))
@@ -636,12 +636,12 @@ class _Work:
         """Return the scenario of each mode that binds."""
         return [optimum.scenarios[place] for place in optimum.rows.scenario[optimum.multipliers > 0].tolist()]
 
-    def _scene(self, scenario: Scenario) -> CompiledSystem:
+    def _scene(self, scenario: Scenario) -> Model:
         _, scene = self.limits.settings[scenario.setting]
         pairs = zip(self.demands.box, map(Fraction, scenario.point), strict=True)
         return apply(scene, [Override(interval.free, value) for interval, value in pairs])
 
-    def _binding(self, optimum: Optimum, *, met: bool) -> list[Binding]:
+    def _binding(self, optimum: Optimum, *, met: bool) -> list[ActiveConstraint]:
         """Return what binds: each mode with a multiplier, and what less of the ends that meet there buys."""
         bindings = []
         aim = self.demands.aim.column
@@ -676,7 +676,7 @@ class _Work:
             shape, frequency = self._mode(optimum, scenario, complex(rows.eigenvalue[place]))
             if not math.isnan(rows.frequency_hz[place]):
                 frequency = float(rows.frequency_hz[place])
-            bindings.append(Binding(tuple(where), shape, frequency, tuple(buys)))
+            bindings.append(ActiveConstraint(tuple(where), shape, frequency, tuple(buys)))
         return bindings
 
     def _mode(self, optimum: Optimum, scenario: Scenario, eigenvalue: complex) -> tuple[str, float]:
@@ -706,6 +706,6 @@ def _decimal(value: float, digits: int, rounding: str = ROUND_HALF_EVEN) -> Frac
     return Fraction(number.quantize(Decimal((0, (1,), place)), rounding=rounding)) if number else Fraction(0)
 
 
-def _unlooked(name: str, ranges: Sequence[Range]) -> BoxProof:
+def _unlooked(name: str, ranges: Sequence[Range]) -> RobustStability:
     """Return what is proved where the time was up."""
-    return BoxProof(name, tuple(ranges), UNDECIDED, None, 0, 1.0, (), ("the time was up",))
+    return RobustStability(name, tuple(ranges), UNDECIDED, None, 0, 1.0, (), ("the time was up",))

@@ -23,24 +23,24 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem
-from apc.eigen.closing import ClosedSystem, Loop, close, close_loop
+from apc.compiler.compiled import Model
+from apc.eigen.closing import ClosedLoop, ModalSystem, close, close_loop
 from apc.eigen.modes import split
-from apc.eigen.peers import PeerGroup
+from apc.eigen.peers import PeerClass
 from apc.eigen.relative import relative, with_doubt
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.discretize import exponential
-from apc.frame.exchange import Exchange
-from apc.frame.jacobians import SiteJacobians
+from apc.frame.exchange import CommunicationGraph
+from apc.frame.jacobians import SubsystemJacobians
 from apc.frame.lift import FrameMap, compose, lift, with_roundings
 from apc.frame.linearize import linearize, linearize_exact, linearize_rows, of_rows, site_of
-from apc.frame.names import Free, value_now
+from apc.frame.names import ParameterRef, value_now
 from apc.frame.parameters import free_rows
 from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of
 from apc.frame.schedule import Propagate
-from apc.frame.site import LinearSite, every_matrix
+from apc.frame.site import LinearSubsystem, every_matrix
 from apc.vary.wiring import (
-    Wiring,
+    LoopStructure,
     are_rigid,
     closed_loop,
     known_by_constants,
@@ -52,7 +52,7 @@ from apc.vary.wiring import (
 
 Floats = NDArray[np.float64]
 Matrices = NDArray[Any]  # float64 or complex128
-Wired = TypeVar("Wired", ClosedSystem, Loop)
+Wired = TypeVar("Wired", ClosedLoop, ModalSystem)
 T = TypeVar("T")
 
 # The complex step: its square vanishes beside 1, whatever the parameter's size.
@@ -76,11 +76,11 @@ class MatrixSource(Protocol):
     """Matrices of which the largest eigenvalue decides, over values of some parameters."""
 
     @property
-    def system(self) -> CompiledSystem:
+    def system(self) -> Model:
         """The compiled scene."""
 
     @property
-    def free(self) -> tuple[Free, ...]:
+    def free(self) -> tuple[ParameterRef, ...]:
         """The m parameters that vary, in the order of the columns of values."""
 
     def matrices(self, values: Floats) -> tuple[Floats, ...]:
@@ -102,7 +102,7 @@ class Bounded:
     error: Floats  # (k, m, m)
     whole: Floats  # (k, n, n)
     heard: tuple[Floats, ...]  # (n_r, n) or (k, n_r, n), one a site
-    sites: tuple[LinearSite, ...]
+    sites: tuple[LinearSubsystem, ...]
 
     def at(self, places: NDArray[np.intp]) -> Bounded:
         """Return some of the points, places in rising order."""
@@ -131,17 +131,17 @@ class BatchEvaluator:
     free reaches them.
     """
 
-    system: CompiledSystem
-    free: tuple[Free, ...]
-    exchange: Exchange
-    groups: tuple[PeerGroup, ...]
-    wirings: tuple[Wiring, ...]
+    system: Model
+    free: tuple[ParameterRef, ...]
+    exchange: CommunicationGraph
+    groups: tuple[PeerClass, ...]
+    wirings: tuple[LoopStructure, ...]
     durations: Mapping[int, tuple[float, float]]
     tangents: Mapping[str, Any]  # casadi.Function by the kind's name
     fixed: Mapping[tuple[int, int], Mapping[int, Matrices]]  # exponentials that nothing free reaches
 
     @property
-    def closed(self) -> tuple[ClosedSystem, ...]:
+    def closed(self) -> tuple[ClosedLoop, ...]:
         """The closed systems at a point that stands for all."""
         return tuple(wiring.system for wiring in self.wirings)
 
@@ -177,7 +177,7 @@ class BatchEvaluator:
             for values in matrices
         )
 
-    def vectors(self, group: PeerGroup, values: Matrices) -> Matrices:
+    def vectors(self, group: PeerClass, values: Matrices) -> Matrices:
         """Return the parameter vectors (k, n_p) of a group, or (1, n_p) when no value reaches it."""
         if not self.tangents:
             return group.parameters[None]
@@ -185,13 +185,13 @@ class BatchEvaluator:
         listed = {free: values[:, column] for column, free in enumerate(self.free)}
         return free_rows(self.system, self.system.groups[place], peer, listed)
 
-    def first_peer(self, group: PeerGroup) -> tuple[int, int]:
+    def first_peer(self, group: PeerClass) -> tuple[int, int]:
         """Return which group of the scene the first of a group of like peers is of, and its number there."""
         first = group.peers.first
         place = self.exchange.group_of(first)
         return place, first - int(self.exchange.starts[place])
 
-    def closed_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
+    def closed_at(self, value: Sequence[float]) -> tuple[ClosedLoop, ...]:
         """Return the closed systems at one point (m,), as an analysis has them: with error bounds."""
         assert not self.timed, "another time is another schedule"
         return tuple(map(close_loop, lifted_systems(self.with_sites(self.closed, value))))
@@ -205,13 +205,13 @@ class BatchEvaluator:
             if site_key(group) in used
         }
 
-        def at_point(group: PeerGroup) -> PeerGroup:
+        def at_point(group: PeerClass) -> PeerClass:
             vector, exact = moved[site_key(group)]
             return replace(group, parameters=vector, exacting=lambda: exact)
 
         return tuple(replace(system, sites=tuple(map(at_point, system.sites))) for system in systems)
 
-    def _points(self, value: Sequence[float]) -> list[tuple[PeerGroup, Floats]]:
+    def _points(self, value: Sequence[float]) -> list[tuple[PeerClass, Floats]]:
         point = np.array([value], dtype=np.float64)
         return [(group, self.vectors(group, point)[0]) for group in self.groups]
 
@@ -223,7 +223,7 @@ class BatchEvaluator:
                 result[site_key(group)] = self._lift(group, values)
         return result
 
-    def bounded(self, vectors: Callable[[PeerGroup], Floats]) -> tuple[Bounded, ...]:
+    def bounded(self, vectors: Callable[[PeerClass], Floats]) -> tuple[Bounded, ...]:
         """Return each system at k points with bounds on all its errors; no time varies.
 
         Parameters
@@ -232,7 +232,7 @@ class BatchEvaluator:
             Gives the parameters of a group at each point (k, n_p), or (1, n_p) where no value reaches it.
         """
         assert not self.timed, "the errors of a step belong to its time"
-        lifts: dict[tuple[int, int], tuple[LinearSite, FrameMap]] = {}
+        lifts: dict[tuple[int, int], tuple[LinearSubsystem, FrameMap]] = {}
         for group in self.groups:
             if site_key(group) not in lifts:
                 lifts[site_key(group)] = self._lift_bounded(group, vectors(group))
@@ -251,7 +251,7 @@ class BatchEvaluator:
             bounded_systems.append(Bounded(matrix, error, whole, tuple(map(value_of, closed.heard)), sites))
         return tuple(bounded_systems)
 
-    def _lift_bounded(self, group: PeerGroup, vectors: Floats) -> tuple[LinearSite, FrameMap]:
+    def _lift_bounded(self, group: PeerClass, vectors: Floats) -> tuple[LinearSubsystem, FrameMap]:
         rows = linearize_rows(group.jacobians, vectors)
         site, steps, lost = self._placed(group, site_of(group.jacobians, rows))
         bounded = with_roundings(site)
@@ -261,7 +261,7 @@ class BatchEvaluator:
         _lose(frame, lost)
         return site, frame
 
-    def _lift(self, group: PeerGroup, values: Matrices) -> FrameMap:
+    def _lift(self, group: PeerClass, values: Matrices) -> FrameMap:
         if self.tangents:
             rows = self.rows(group.jacobians, self.vectors(group, values))
             linear_site = site_of(group.jacobians, rows)
@@ -276,8 +276,8 @@ class BatchEvaluator:
         return frame
 
     def _placed(
-        self, group: PeerGroup, site: LinearSite
-    ) -> tuple[LinearSite, Mapping[int, Matrices], NDArray[np.bool_]]:
+        self, group: PeerClass, site: LinearSubsystem
+    ) -> tuple[LinearSubsystem, Mapping[int, Matrices], NDArray[np.bool_]]:
         """Return a group's sites, their exponentials if nothing free reaches these, and which have none."""
         beyond = is_beyond(site.a, site.b)
         if site_key(group) in self.fixed:
@@ -285,7 +285,7 @@ class BatchEvaluator:
         site.a[beyond], site.b[beyond] = 0.0, 0.0  # they would spoil the others' exponentials
         return site, {}, beyond
 
-    def steps(self, site: LinearSite, values: Matrices, numbers: Arithmetic) -> dict[int, Matrices]:
+    def steps(self, site: LinearSubsystem, values: Matrices, numbers: Arithmetic) -> dict[int, Matrices]:
         """Return the exponentials of every step, one for all points where A, B and the time stay."""
         a, b = _shared(site.a, site.b)
         steps = {}
@@ -300,7 +300,7 @@ class BatchEvaluator:
                 steps[quanta] = exponential(a, b, seconds, numbers)
         return steps
 
-    def rows(self, built: SiteJacobians, vectors: Matrices) -> Matrices:
+    def rows(self, built: SubsystemJacobians, vectors: Matrices) -> Matrices:
         """Return the coefficients (k, …) of many sites; those of a complex step with their derivative."""
         if not np.iscomplexobj(vectors):
             return linearize_rows(built, vectors)
@@ -309,10 +309,10 @@ class BatchEvaluator:
 
 
 def batch_evaluator(
-    system: CompiledSystem,
-    free: Sequence[Free],
-    groups: Sequence[PeerGroup],
-    exchange: Exchange,
+    system: Model,
+    free: Sequence[ParameterRef],
+    groups: Sequence[PeerClass],
+    exchange: CommunicationGraph,
     *,
     durations: Mapping[int, tuple[float, float]] | None = None,
     follows: bool = True,
@@ -358,7 +358,7 @@ def batch_evaluator(
     return replace(evaluator, wirings=_told_apart(evaluator)) if follows else evaluator
 
 
-def _told_apart(evaluator: BatchEvaluator) -> tuple[Wiring, ...]:
+def _told_apart(evaluator: BatchEvaluator) -> tuple[LoopStructure, ...]:
     """Return the wirings, those marked whose rigid directions are not the same at another point."""
     if not any(wiring.rigid.names for wiring in evaluator.wirings):
         return evaluator.wirings
@@ -402,9 +402,9 @@ def _fixed(evaluator: BatchEvaluator) -> dict[tuple[int, int], Mapping[int, Matr
 
 def lifted_systems(systems: Sequence[Wired]) -> tuple[Wired, ...]:
     """Return systems whose sites are linearized and lifted at the parameters they have, each once."""
-    known: dict[tuple[int, int], tuple[LinearSite, FrameMap]] = {}
+    known: dict[tuple[int, int], tuple[LinearSubsystem, FrameMap]] = {}
 
-    def lifted(group: PeerGroup) -> PeerGroup:
+    def lifted(group: PeerClass) -> PeerClass:
         key, built = site_key(group), group.jacobians
         if key not in known:
             site = linearize(built, group.parameters)
@@ -437,7 +437,7 @@ def _shared(a: Matrices, b: Matrices) -> tuple[Matrices, Matrices]:
     return a, b
 
 
-def _tangent(built: SiteJacobians) -> Any:
+def _tangent(built: SubsystemJacobians) -> Any:
     """Return the coefficients and their derivative along a direction, as a function of (p, dp)."""
     arguments = built.function.sx_in()
     along = casadi.SX.sym("along", arguments[4].numel())

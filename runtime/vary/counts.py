@@ -1,6 +1,6 @@
 """Numbers of peers that are looked at: of a search, and along an axis of a region.
 
-Takes: a `CompiledSystem` and the count of one of its groups, or a number that counts follow from.
+Takes: a `Model` and the count of one of its groups, or a number that counts follow from.
 Gives: `count_range`, `count_pieces`.
 Guarantees: a count is a whole number.
 Does not: judge a scene (see `line`).
@@ -12,12 +12,12 @@ import math
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
 
-from apc.compiler.compiled import CompiledSystem, group_count
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model, group_count
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.peer_counts import least_peers
-from apc.frame.names import Free, Range
+from apc.frame.names import ParameterRef, Range
 from apc.frame.overrides import Override, apply
-from apc.vary.delays import Piece
+from apc.vary.delays import DelaySegment
 from apc.vary.line import SPAN
 
 # Without a limit, so many times the present count on graphs that aren't complete.
@@ -28,7 +28,11 @@ MOST_STRIPS = 200
 
 
 def count_range(
-    system: CompiledSystem, free: Free, limits: Sequence[Fraction | None], present: float, place: Place
+    system: Model,
+    free: ParameterRef,
+    limits: Sequence[Fraction | None],
+    present: float,
+    place: SourceLocation,
 ) -> tuple[int, int]:
     """Return the lowest and the highest count to look at.
 
@@ -66,16 +70,18 @@ def count_range(
     return first, _whole(high, int(min(max(math.ceil(span * present), first + 1), most)), place)
 
 
-def _whole(limit: Fraction | None, otherwise: int, place: Place) -> int:
+def _whole(limit: Fraction | None, otherwise: int, place: SourceLocation) -> int:
     """Return a limit as the whole number it is."""
     if limit is None:
         return otherwise
     if limit.denominator != 1:
-        raise ApcError(Mistake("E842", place, "a number of peers", "a whole number", f"{float(limit):.12g}"))
+        raise ApcError(
+            Diagnostic("E842", place, "a number of peers", "a whole number", f"{float(limit):.12g}")
+        )
     return int(limit)
 
 
-def count_pieces(system: CompiledSystem, axis: Range, place: Place) -> Iterator[Piece]:
+def count_pieces(system: Model, axis: Range, place: SourceLocation) -> Iterator[DelaySegment]:
     """Yield a piece for each count of a range, from halfway to the one before to halfway to the next.
 
     Raises
@@ -85,11 +91,11 @@ def count_pieces(system: CompiledSystem, axis: Range, place: Place) -> Iterator[
     """
     if axis.low.denominator != 1 or axis.high.denominator != 1:
         got = f"{float(axis.low):g} to {float(axis.high):g}"
-        raise ApcError(Mistake("E881", place, f"the range of {axis.free.label}", "whole numbers", got))
+        raise ApcError(Diagnostic("E881", place, f"the range of {axis.free.label}", "whole numbers", got))
     if axis.high - axis.low >= MOST_STRIPS:
         got = f"{int(axis.high - axis.low) + 1:,}"
-        raise ApcError(Mistake("E881", place, axis.free.label, f"at most {MOST_STRIPS} counts", got))
+        raise ApcError(Diagnostic("E881", place, axis.free.label, f"at most {MOST_STRIPS} counts", got))
     half = Fraction(1, 2)
     for count in range(int(axis.low), int(axis.high) + 1):
         inside = apply(system, [Override(axis.free, Fraction(count))])
-        yield Piece(max(axis.low, count - half), min(axis.high, count + half), None, inside)
+        yield DelaySegment(max(axis.low, count - half), min(axis.high, count + half), None, inside)

@@ -1,6 +1,6 @@
 """The values of one parameter at which a scene becomes stable or unstable.
 
-Takes: a `CompiledSystem` and the name of a parameter or delay.
+Takes: a `Model` and the name of a parameter or delay.
 Gives: `Critical`, `critical`.
 Guarantees: every crossing comes with a bound on its error, held by analyses on either side; what was scanned,
 and how finely, is part of the answer.
@@ -19,21 +19,30 @@ import numpy as np
 
 from apc.analysis.analysis import analyze, near_start, prepare_at_start
 from apc.analysis.sides import sides
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.timings import part
 from apc.compiler.words import with_unit
 from apc.frame.devices import replaced_hands
 from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, hangs_on_heard, prepare
-from apc.frame.names import Free, find, parameter_of, unit_of, value_now, values_by_group
+from apc.frame.names import ParameterRef, find, parameter_of, unit_of, value_now, values_by_group
 from apc.hands.passivity import passive_hands
 from apc.network.nominal import left_out, refuse_channel_number
 from apc.option_value import option_value
-from apc.result import Look, Result
+from apc.result import PlotStyle, Result
 from apc.threads import single_threaded
 from apc.vary.counts import count_range
-from apc.vary.crossing import CELL, Crossing, Line, Progress, Search, Verdict, search, stable_in_all
+from apc.vary.crossing import (
+    CELL,
+    Crossing,
+    CrossingReport,
+    ParameterPath,
+    Progress,
+    Verdict,
+    search,
+    stable_in_all,
+)
 from apc.vary.delays import pace
 from apc.vary.evaluator import (
     evaluator_of_many,
@@ -48,18 +57,18 @@ from apc.vary.growth import (
     NOMINAL,
     NOWHERE,
     PASSIVE,
-    PointLine,
+    PointwisePath,
     RadiusEvaluator,
     criterion_of,
     judge_at,
     line_points,
     refuse_time,
 )
-from apc.vary.line import OPEN, SPAN, CountLine, DelayLine, MatrixLine, delay_reach, judged
+from apc.vary.line import OPEN, SPAN, DelayPath, MatrixPath, PeerCountPath, delay_reach, judged
 from apc.vary.periods import PeriodLine
 from apc.vary.timing_values import delay_now, is_scaled, reaches_period, refuse_phase
 
-_PLACE = Place("critical value")
+_PLACE = SourceLocation("critical value")
 
 # Refusals of a frame of too many ticks, states or intervals.
 TOO_LONG = ("E804", "E805", "E933")
@@ -82,11 +91,10 @@ class Critical(Result):
     there is no crossing; `verdict` then says whether all that was scanned is stable. `looked` values were
     looked at, and cells in which another crossing might hide divided down to `cell` of the value. `enters`
     says whether anything that decides depends on the parameter: on a start value of a linear scene nothing
-    does. `left_open` and `alone` are those of `crossing.Search`. `counted` says that it is a number of
-    peers: a crossing's value is then the number on its stable side.
-    `left_out` says what of the scene the answer does not look at. `groups` are the groups' present values
-    (None where their peers differ) of a parameter that is set for all groups though they have not all the
-    same. `system` is the scene.
+    does. `left_open` and `alone` are those of `crossing.CrossingReport`. `counted` says that it is a number
+    of peers: a crossing's value is then the number on its stable side. `left_out` says what of the scene the
+    answer does not look at. `groups` are the groups' present values (None where their peers differ) of a
+    parameter that is set for all groups though they have not all the same. `system` is the scene.
     """
 
     shown_by = "vary_output:critical"
@@ -106,7 +114,7 @@ class Critical(Result):
     looked: int
     enters: bool
     verdict: str
-    system: CompiledSystem = field(compare=False, repr=False)
+    system: Model = field(compare=False, repr=False)
     left_out: tuple[str, ...] = ()
     criterion: str = NOMINAL
     groups: tuple[tuple[str, float | None], ...] = ()
@@ -114,7 +122,7 @@ class Critical(Result):
     left_open: tuple[tuple[float, float], ...] = ()
     alone: tuple[float, ...] = ()
 
-    def plot(self, ax: Any = None, **look: Unpack[Look]) -> Any:
+    def plot(self, ax: Any = None, **look: Unpack[PlotStyle]) -> Any:
         """Draw where the eigenvalues go (root locus), as `look` says; return the matplotlib Axes.
 
         Raises
@@ -124,13 +132,13 @@ class Critical(Result):
         """
         if self.criterion == PASSIVE:
             what = "what every passive hand can draw has no eigenvalues: there is no root locus of it"
-            raise ApcError(Mistake("E930", Place(self.topology), what))
+            raise ApcError(Diagnostic("E930", SourceLocation(self.topology), what))
         return self._drawn(ax, look=look)
 
 
 @part("critical")
 def critical(
-    system: CompiledSystem,
+    system: Model,
     name: str,
     *,
     lower: str | None = None,
@@ -177,7 +185,7 @@ def critical(
         _check_limits(system, free, limits, timed=timed)
         prepared = prepare(system)
 
-        def stable_of(changed: CompiledSystem) -> bool | None:
+        def stable_of(changed: Model) -> bool | None:
             if by_growth:
                 return judge_at(changed, prepared, [], _PLACE, criterion=chosen_criterion).stable
             return analyze(changed, prepared=prepared).stable
@@ -220,14 +228,14 @@ def critical(
 
 
 def _searched(
-    system: CompiledSystem,
-    free: Free,
+    system: Model,
+    free: ParameterRef,
     prepared: Prepared,
     criterion: str,
     limits: Sequence[Fraction | None],
-    stable_of: Callable[[CompiledSystem], bool | None],
+    stable_of: Callable[[Model], bool | None],
     progress: Progress | None,
-) -> Search:
+) -> CrossingReport:
     """Return the search along a number, by the evaluator that covers it.
 
     Parameters
@@ -252,14 +260,14 @@ def _searched(
 
     if counted:
         result = search(
-            CountLine(system, free, stable_of, *count_range(system, free, limits, present, _PLACE)),
+            PeerCountPath(system, free, stable_of, *count_range(system, free, limits, present, _PLACE)),
             progress=progress,
         )
     elif timed and reaches_period(system, free):
         if criterion == MEAN_SQUARE and not is_scaled(system, free):
             refuse_time(system, free, _PLACE, criterion)
 
-        def decide(changed: CompiledSystem) -> Verdict:
+        def decide(changed: Model) -> Verdict:
             if criterion not in BY_GROWTH:
                 return judged(changed, prepared)
             try:
@@ -287,7 +295,7 @@ def _searched(
         tell = pace(system, free, begin, end, place=_PLACE, progress=progress)
         result = stable_in_all(
             [
-                search(DelayLine(side.system, free, start, begin, end, tell))
+                search(DelayPath(side.system, free, start, begin, end, tell))
                 for side, start in zip(sides(system, prepared), starts, strict=True)
                 if start is not None
             ]
@@ -307,7 +315,7 @@ def _searched(
 
 
 def _everywhere(
-    search: Search,
+    search: CrossingReport,
     present: float,
     stable_now: Callable[[], bool | None],
     criterion: str,
@@ -329,7 +337,7 @@ def _everywhere(
     return f"{words} whatever its value: nothing that decides stability depends on it"
 
 
-def _line(system: CompiledSystem, free: Free, ends: Ends, prepared: Prepared) -> Line:
+def _line(system: Model, free: ParameterRef, ends: Ends, prepared: Prepared) -> ParameterPath:
     """Return a scene along a parameter that reaches no time: by its matrices, or value by value."""
     if not parameters_suffice(system, prepared):
         return _singly(system, free, ends, prepared, NOMINAL)
@@ -342,25 +350,27 @@ def _line(system: CompiledSystem, free: Free, ends: Ends, prepared: Prepared) ->
             raise
         return _singly(system, free, ends, prepared, NOMINAL)
     low = parameter.minimum if low is None else low
-    line = MatrixLine(family, prepared, np.array([parameter.value]), 0, low, high)
+    line = MatrixPath(family, prepared, np.array([parameter.value]), 0, low, high)
     if high is None and parameter.maximum is not None:
         return replace(line, top=min(SPAN * line.scale, parameter.maximum))
     return line
 
 
-def _singly(system: CompiledSystem, free: Free, ends: Ends, prepared: Prepared, criterion: str) -> PointLine:
+def _singly(
+    system: Model, free: ParameterRef, ends: Ends, prepared: Prepared, criterion: str
+) -> PointwisePath:
     """Return a scene along a number, judged value by value."""
     points, least = line_points(system, free, *ends, value_now(system, free) or 1.0)
-    return PointLine(RadiusEvaluator(system, (free,), prepared, _PLACE, criterion), points, least)
+    return PointwisePath(RadiusEvaluator(system, (free,), prepared, _PLACE, criterion), points, least)
 
 
-def _limit(option: str, text: str | None, free: Free, unit: str) -> Fraction | None:
+def _limit(option: str, text: str | None, free: ParameterRef, unit: str) -> Fraction | None:
     """Read a limit, None if there is none."""
     return None if text is None else option_value(option, text, what=free.name, unit=unit)
 
 
 def _check_limits(
-    system: CompiledSystem, free: Free, limits: Sequence[Fraction | None], *, timed: bool
+    system: Model, free: ParameterRef, limits: Sequence[Fraction | None], *, timed: bool
 ) -> None:
     """Refuse limits that leave nothing to look at."""
     low, high = limits
@@ -370,20 +380,20 @@ def _check_limits(
     for value in (low, high):
         if value is not None and timed and not value and reaches_period(system, free):
             what = f"a limit of {free.name}"
-            raise ApcError(Mistake("E843", _PLACE, what, "more than 0 s", "0 s"))
+            raise ApcError(Diagnostic("E843", _PLACE, what, "more than 0 s", "0 s"))
         if value is not None and (
             (least is not None and value < least) or (most is not None and value > most)
         ):
             expected = f"at least {least:g}" if least is not None and value < least else f"at most {most:g}"
             what, got = f"a limit of {free.name}", with_unit(f"{float(value):g}", unit)
-            raise ApcError(Mistake("E843", _PLACE, what, with_unit(expected, unit), got))
+            raise ApcError(Diagnostic("E843", _PLACE, what, with_unit(expected, unit), got))
     bottom = low if low is not None else (least or 0.0)
     if high is not None and not high > bottom:
         what, got = f"the range of {free.name}", with_unit(f"{float(bottom):g} to {float(high):g}", unit)
-        raise ApcError(Mistake("E842", _PLACE, what, "an upper limit above the lower", got))
+        raise ApcError(Diagnostic("E842", _PLACE, what, "an upper limit above the lower", got))
 
 
-def _chosen(search: Search, present: float, stable_now: Callable[[], bool | None]) -> Crossing | None:
+def _chosen(search: CrossingReport, present: float, stable_now: Callable[[], bool | None]) -> Crossing | None:
     """Return the crossing that matters, see `Critical`; on a jump, the scene itself tells its side."""
     if not search.edges:
         return None

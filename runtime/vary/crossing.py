@@ -1,7 +1,8 @@
 """Where the verdict of a scene changes as one of its numbers varies, held between two verdicts.
 
-Takes: a `Line`, a scene along one of its numbers.
-Gives: `Verdict`, `Crossing`, `Stretch`, `Line`, `OneStretch`, `Search`; `search`; `shortest_decimal`.
+Takes: a `ParameterPath`, a scene along one of its numbers.
+Gives: `Verdict`, `Crossing`, `SmoothSegment`, `ParameterPath`, `SingleSegment`, `CrossingReport`; `search`;
+`shortest_decimal`.
 Guarantees: on either side of a crossing, by its error, the scene's own analysis gives another verdict; where
 it gives none, the crossing is called an estimate. A jump is at an exact value.
 Does not: prove that there are no others between two values that were looked at.
@@ -130,7 +131,7 @@ class Crossing:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Stretch:
+class SmoothSegment:
     """Values from `low` to `high` along which the eigenvalues are continuous, to the ends from within.
 
     `points` (k,) are those to begin with, cells are measured against `least` where the value is smaller.
@@ -147,30 +148,30 @@ class Stretch:
     slow: bool = False
 
 
-class Line(Protocol):
+class ParameterPath(Protocol):
     """A scene along one of its numbers, named by `label`."""
 
     @property
     def label(self) -> str:
         """The number that varies."""
 
-    def stretches(self) -> Iterator[Stretch]:
+    def stretches(self) -> Iterator[SmoothSegment]:
         """Yield the stretches in order."""
 
-    def change(self, before: Stretch, after: Stretch, *, stable_below: bool) -> Crossing:
+    def change(self, before: SmoothSegment, after: SmoothSegment, *, stable_below: bool) -> Crossing:
         """Return the crossing between two stretches, the first stable or the second."""
 
 
-class OneStretch:
+class SingleSegment:
     """A line of one stretch."""
 
-    def change(self, before: Stretch, after: Stretch, *, stable_below: bool) -> Crossing:
+    def change(self, before: SmoothSegment, after: SmoothSegment, *, stable_below: bool) -> Crossing:
         """There is one stretch."""
         raise AssertionError("a line of one stretch has no jump")
 
 
 @dataclass(frozen=True, slots=True)
-class Search:
+class CrossingReport:
     """All crossings of one parameter in an interval, with what lies between them.
 
     `edges` are the crossings in order, and `stable` says of each stretch between them, one more than there
@@ -224,7 +225,7 @@ class _Samples:
         return _Samples(points[order], values[order], slopes[order])
 
 
-def stable_in_all(searches: Sequence[Search]) -> Search:
+def stable_in_all(searches: Sequence[CrossingReport]) -> CrossingReport:
     """Return the search for the values at which all of several models are stable.
 
     Parameters
@@ -250,7 +251,7 @@ def stable_in_all(searches: Sequence[Search]) -> Search:
         if together is not stable[-1]:
             edges.append(edge)
             stable.append(together)
-    return Search(
+    return CrossingReport(
         edges=tuple(edges),
         stable=tuple(stable),
         scanned=(max(one.scanned[0] for one in searches), min(one.scanned[1] for one in searches)),
@@ -264,7 +265,7 @@ def stable_in_all(searches: Sequence[Search]) -> Search:
     )
 
 
-def search(line: Line, *, first: bool = False, progress: Progress | None = None) -> Search:
+def search(line: ParameterPath, *, first: bool = False, progress: Progress | None = None) -> CrossingReport:
     """Find the crossings of a line.
 
     Parameters
@@ -283,7 +284,7 @@ def search(line: Line, *, first: bool = False, progress: Progress | None = None)
     ends: list[float] = []
     alone: list[float] = []
     looked, whole, enters, sided, why = 0, True, False, True, ""
-    before: Stretch | None = None
+    before: SmoothSegment | None = None
     for number, stretch in enumerate(line.stretches()):
         samples, cleared, why = _scanned(stretch, first=first)
         looked, whole = looked + len(samples.points), whole and cleared
@@ -329,7 +330,7 @@ def search(line: Line, *, first: bool = False, progress: Progress | None = None)
         if why or (first and any(edge.stable_side == "below" for edge in edges)):
             break
     scanned = (ends[0], ends[-1]) if ends else (math.nan, math.nan)
-    return Search(
+    return CrossingReport(
         edges=tuple(edges),
         stable=tuple(stable),
         scanned=scanned,
@@ -343,7 +344,7 @@ def search(line: Line, *, first: bool = False, progress: Progress | None = None)
     )
 
 
-def _scanned(stretch: Stretch, *, first: bool) -> tuple[_Samples, bool, str]:
+def _scanned(stretch: SmoothSegment, *, first: bool) -> tuple[_Samples, bool, str]:
     """Return the samples of a stretch that have a side, those cells divided in which a crossing might hide.
 
     Also, whether every cell was cleared, and why the stretch was left before its end.
@@ -373,7 +374,7 @@ def _scanned(stretch: Stretch, *, first: bool) -> tuple[_Samples, bool, str]:
     return samples, False, why
 
 
-def _begun(stretch: Stretch, *, first: bool) -> tuple[_Samples, str]:
+def _begun(stretch: SmoothSegment, *, first: bool) -> tuple[_Samples, str]:
     """Return the samples at the points to begin with, as far as is wanted, and why no further."""
     if not (first and stretch.slow):
         return _sampled(stretch, stretch.points), ""
@@ -389,7 +390,7 @@ def _begun(stretch: Stretch, *, first: bool) -> tuple[_Samples, str]:
     return samples, ""
 
 
-def _sampled(stretch: Stretch, points: Floats) -> _Samples:
+def _sampled(stretch: SmoothSegment, points: Floats) -> _Samples:
     """Return the samples at points that have eigenvalues."""
     values, slopes = stretch.look(points)
     known = np.isfinite(values).all(axis=1)
@@ -452,7 +453,7 @@ def _cubic(t: Floats, start: Complexes, end: Complexes, slope: Complexes, end_sl
     return np.asarray(straight + t * (1 - t) ** 2 * slope + t**2 * (t - 1) * end_slope)
 
 
-def _with_ends_beside(stretch: Stretch, samples: _Samples) -> tuple[_Samples, list[float]]:
+def _with_ends_beside(stretch: SmoothSegment, samples: _Samples) -> tuple[_Samples, list[float]]:
     """Return the samples with an end replaced by a point just inside, where the verdict changes next to it.
 
     Also, the ends at which the verdict differs from that just inside.
@@ -474,7 +475,7 @@ def _with_ends_beside(stretch: Stretch, samples: _Samples) -> tuple[_Samples, li
 
 
 def _crossing(
-    stretch: Stretch,
+    stretch: SmoothSegment,
     ends: Sequence[float],
     limits: tuple[float, float],
     growth: Sequence[float],
@@ -516,7 +517,7 @@ def _crossing(
     return Crossing(value, min(width, high - low), side, grows.frequency_hz, "crossing", ESTIMATE)
 
 
-def _bisected(stretch: Stretch, ends: Sequence[float], *, rising: bool, half: float) -> Crossing | None:
+def _bisected(stretch: SmoothSegment, ends: Sequence[float], *, rising: bool, half: float) -> Crossing | None:
     """Hold a crossing by bisection with verdicts, None where both ends have one verdict or are undecided."""
     left, right = ends
     below, above = (stretch.judge(Fraction(end)) for end in ends)
@@ -538,7 +539,7 @@ def _bisected(stretch: Stretch, ends: Sequence[float], *, rising: bool, half: fl
 
 
 def _narrowed(
-    stretch: Stretch, left: float, right: float, verdicts: tuple[Verdict, Verdict], *, rising: bool
+    stretch: SmoothSegment, left: float, right: float, verdicts: tuple[Verdict, Verdict], *, rising: bool
 ) -> tuple[float, float, tuple[Verdict, Verdict]]:
     """Return a bracket narrowed from both ends to what verdicts decide, with the verdicts at its ends.
 
@@ -573,7 +574,7 @@ def _narrowed(
 
 
 def _held(
-    stretch: Stretch, left: float, right: float, verdicts: tuple[Verdict, Verdict], side: str
+    stretch: SmoothSegment, left: float, right: float, verdicts: tuple[Verdict, Verdict], side: str
 ) -> Crossing:
     """Return the crossing between two values of these verdicts, the stable one on a side."""
     dies, grows = verdicts if side == "below" else verdicts[::-1]
@@ -597,7 +598,7 @@ def shortest_decimal(low: float, high: float) -> Fraction:
     return Fraction(number, 10**digits)
 
 
-def _root(stretch: Stretch, ends: Sequence[float], growth: Sequence[float], off: float) -> float:
+def _root(stretch: SmoothSegment, ends: Sequence[float], growth: Sequence[float], off: float) -> float:
     """Return where floats see the largest magnitude pass 1 between ends on two sides, off by so much of it.
 
     By Newton's method and, where that leaves the ends or there are no slopes, Brent's.

@@ -1,6 +1,6 @@
 """Proof that a scene is stable at every delay of a link in a range, whatever constant it is.
 
-Takes: a `CompiledSystem`, ranges of which one is a link's delay, and what proves the others at one delay.
+Takes: a `Model`, ranges of which one is a link's delay, and what proves the others at one delay.
 Gives: `is_delay`, `prove_over_delay`, `standing_delays`.
 Guarantees: a packet is read at ticks, so that between two delays at which it is read a tick later nothing
 changes: each such piece is judged at one delay within, and each delay between two pieces by itself.
@@ -13,18 +13,18 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from fractions import Fraction
 
-from apc.analysis.box_proof import UNDECIDED, BoxProof, ChangingDelay
+from apc.analysis.box_proof import UNDECIDED, ChangingDelay, RobustStability
 from apc.analysis.sides import sides
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.frame.instance import prepare
-from apc.frame.names import Free, Range
+from apc.frame.names import ParameterRef, Range
 from apc.moments.changing_delay import loop_gain, unstable_delays
-from apc.unserved import UnservedError
+from apc.unserved import NotSupportedError
 from apc.vary.delays import delay_pieces
 from apc.vary.timing_values import system_with_delay
 
-PLACE = Place("box")
+PLACE = SourceLocation("box")
 
 CONSTANT = "at every constant delay: one that changes from packet to packet is not among these"
 
@@ -32,18 +32,18 @@ CONSTANT = "at every constant delay: one that changes from packet to packet is n
 PARTS = tuple(Fraction(part, 8) for part in range(8, 0, -1))
 
 
-def is_delay(system: CompiledSystem, free: Free) -> bool:
+def is_delay(system: Model, free: ParameterRef) -> bool:
     """Say whether a timing is the delay of a link, or of some pairs of its peers."""
     return any(free.name in (link.delay, *(pair.delay for pair in link.delays)) for link in system.links)
 
 
 def prove_over_delay(
-    system: CompiledSystem,
+    system: Model,
     ranges: Sequence[Range],
-    prove: Callable[[CompiledSystem, list[Range]], BoxProof],
+    prove: Callable[[Model, list[Range]], RobustStability],
     *,
     nominal: bool,
-) -> BoxProof:
+) -> RobustStability:
     """Prove a scene stable in a box of which one range is a link's delay.
 
     Parameters
@@ -66,7 +66,9 @@ def prove_over_delay(
     delays = [interval for interval in ranges if is_delay(system, interval.free)]
     if len(delays) > 1:
         names = " and ".join(dict.fromkeys(delay.free.label for delay in delays))
-        raise ApcError(Mistake("E831", PLACE, f"one range of one delay is taken in a box, not more: {names}"))
+        raise ApcError(
+            Diagnostic("E831", PLACE, f"one range of one delay is taken in a box, not more: {names}")
+        )
     (delay,) = delays
     rest = [interval for interval in ranges if interval is not delay]
     place, width = list(ranges).index(delay), delay.high - delay.low
@@ -92,13 +94,13 @@ def prove_over_delay(
     return replace(whole, verdict=UNDECIDED if left else verdict, open_share=float(left), point=open_point)
 
 
-def changing(system: CompiledSystem, delay: Range) -> ChangingDelay:
+def changing(system: Model, delay: Range) -> ChangingDelay:
     """Return what is proved of a delay that changes from packet to packet within a range."""
     low, width = delay.low, delay.high - delay.low
     try:
         ends = (low + part * width for part in PARTS)
         proved = next((end for end in ends if loop_gain(system, delay.free, low, end) < 1), None)
-    except UnservedError as why:
+    except NotSupportedError as why:
         return ChangingDelay(None, None, f"left open, as {why}")
     several = len(sides(system, prepare(system))) > 1
     beyond = None
@@ -107,13 +109,13 @@ def changing(system: CompiledSystem, delay: Range) -> ChangingDelay:
     return ChangingDelay(None if proved is None else float(proved), beyond)
 
 
-def standing_delays(system: CompiledSystem, delay: Range) -> Iterator[tuple[Fraction, Fraction]]:
+def standing_delays(system: Model, delay: Range) -> Iterator[tuple[Fraction, Fraction]]:
     """Yield the delays that stand for all of a range, each with how much of the range it stands for."""
     pieces = delay_pieces(system, delay.free, delay.low, prepare(system), place=PLACE, high=delay.high)
     for piece in pieces:
         if piece.evaluator is not None:
             what = f"forces wait for {delay.free.label}, too: what happens when changes with it by degrees"
-            raise ApcError(Mistake("E831", PLACE, what, hint=f"apc critical {delay.free.label}"))
+            raise ApcError(Diagnostic("E831", PLACE, what, hint=f"apc critical {delay.free.label}"))
         high = min(piece.high, delay.high)
         yield piece.low, Fraction(0)
         yield (piece.low + high) / 2, high - piece.low

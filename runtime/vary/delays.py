@@ -1,7 +1,7 @@
 """A system's frame matrices as a delay varies: piece by piece, as far as the order of events stays the same.
 
-Takes: a `CompiledSystem` and a parameter or timing that reaches its delays.
-Gives: `Piece`, `delay_pieces`, `pace`, `borders`; `reaches_parameters`.
+Takes: a `Model` and a parameter or timing that reaches its delays.
+Gives: `DelaySegment`, `delay_pieces`, `pace`, `borders`; `reaches_parameters`.
 Guarantees: pieces join on without a gap; events coincide at the values between them and nowhere else.
 Does not: vary periods or phases: another period is another frame.
 
@@ -22,17 +22,17 @@ from functools import lru_cache, partial
 import numpy as np
 
 from apc.analysis.analysis import lifted_groups
-from apc.compiler.compiled import CompiledSystem, Kind
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model, PeerType
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.multiples import common_divisor
 from apc.compiler.words import no_more, time_left
 from apc.eigen.peers import states_of
 from apc.frame.instance import Prepared, prepared_at
-from apc.frame.names import Free
+from apc.frame.names import ParameterRef
 from apc.frame.parameters import resolve
-from apc.frame.schedule import Act, Propagate, Schedule
+from apc.frame.schedule import HoldUpdate, Propagate, Schedule
 from apc.vary.batch import BatchEvaluator, batch_evaluator
-from apc.vary.evaluator import Asked
+from apc.vary.evaluator import EvaluatorKey
 from apc.vary.timing_values import STEP, delay_now, system_with_delay, timing_slopes
 
 # Pieces of one search: each is some schedules and matrices, a hundredth of a second and more.
@@ -49,7 +49,7 @@ KEPT, KEPT_PIECES, FEW_STATES = 16, 16, 120
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
+class DelaySegment:
     """Delays between `low` and `high` seconds; the ends are limits from within.
 
     Where nothing depends on the delay within the piece it has no `evaluator`: `inside`, the scene at one of
@@ -59,18 +59,18 @@ class Piece:
     low: Fraction
     high: Fraction
     evaluator: BatchEvaluator | None
-    inside: CompiledSystem
+    inside: Model
 
 
 def delay_pieces(
-    system: CompiledSystem,
-    free: Free,
+    system: Model,
+    free: ParameterRef,
     low: Fraction,
     prepared: Prepared,
     *,
-    place: Place,
+    place: SourceLocation,
     high: Fraction,
-) -> Iterator[Piece]:
+) -> Iterator[DelaySegment]:
     """Yield the pieces from a value on upwards.
 
     Parameters
@@ -95,7 +95,7 @@ def delay_pieces(
     """
     following = borders(system, free, place=place)
     _count(free, low, high, following, place)
-    piece = _pieces(Asked.of(system, [free], prepared))
+    piece = _pieces(EvaluatorKey.of(system, [free], prepared))
     while low < high:
         end = following(low)
         yield piece(low, end)
@@ -103,7 +103,7 @@ def delay_pieces(
 
 
 @lru_cache(maxsize=KEPT)
-def _pieces(of: Asked) -> Callable[[Fraction, Fraction], Piece]:
+def _pieces(of: EvaluatorKey) -> Callable[[Fraction, Fraction], DelaySegment]:
     """Return what builds the piece between two values, and of few states keeps it for the next question."""
     (free,) = of.free
     slopes, follows = timing_slopes(of.system, free), reaches_parameters(of.system, free)
@@ -114,12 +114,12 @@ def _pieces(of: Asked) -> Callable[[Fraction, Fraction], Piece]:
 
 
 def pace(
-    system: CompiledSystem,
-    free: Free,
+    system: Model,
+    free: ParameterRef,
     low: Fraction,
     high: Fraction,
     *,
-    place: Place,
+    place: SourceLocation,
     progress: Callable[[str], None] | None,
 ) -> Callable[[Fraction], None]:
     """Return what tells, as each piece begins and is given its end, how far a search over a delay is.
@@ -145,7 +145,11 @@ def pace(
 
 
 def _count(
-    free: Free, low: Fraction, high: Fraction, following: Callable[[Fraction], Fraction], place: Place
+    free: ParameterRef,
+    low: Fraction,
+    high: Fraction,
+    following: Callable[[Fraction], Fraction],
+    place: SourceLocation,
 ) -> int:
     """Return how many pieces a range has; refuse one of which nobody will see the end."""
     at = low
@@ -157,11 +161,11 @@ def _count(
         f"from {float(low):.6g} to {float(high):.6g} (SI) events coincide at more than {MOST_PIECES:,} "
         f"values of {free.label}, the most that are searched"
     )
-    raise ApcError(Mistake("E846", place, what, hint=f"a range up to {no_more(at)} s"))
+    raise ApcError(Diagnostic("E846", place, what, hint=f"a range up to {no_more(at)} s"))
 
 
 @lru_cache(maxsize=KEPT)
-def borders(system: CompiledSystem, free: Free, *, place: Place) -> Callable[[Fraction], Fraction]:
+def borders(system: Model, free: ParameterRef, *, place: SourceLocation) -> Callable[[Fraction], Fraction]:
     """Return what gives the next value at which events coincide that don't at the values before it.
 
     What is held acts a delay after each tick of its clock: it may coincide with a tick of any clock, or with
@@ -184,7 +188,7 @@ def borders(system: CompiledSystem, free: Free, *, place: Place) -> Callable[[Fr
     for name, slope in slopes.items():
         if at[2][name] != at[0][name] + 2 * slope * STEP:
             what = f"{name} is not linear in {free.name}: its critical value can't be searched"
-            raise ApcError(Mistake("E844", place, what))
+            raise ApcError(Diagnostic("E844", place, what))
     clocks = {clock.name: clock for clock in system.clocks}
     holds = dict.fromkeys((hold.clock, hold.delay) for kind in system.kinds for hold in kind.holds)
     packets = dict.fromkeys(
@@ -221,7 +225,7 @@ def borders(system: CompiledSystem, free: Free, *, place: Place) -> Callable[[Fr
     return following
 
 
-def reaches_parameters(system: CompiledSystem, free: Free) -> bool:
+def reaches_parameters(system: Model, free: ParameterRef) -> bool:
     """Say whether what reaches the delays is, or changes, a parameter of the equations as well."""
     here, there = (
         resolve(system_with_delay(system, free, value)).parameters for value in (Fraction(1), Fraction(2))
@@ -229,21 +233,21 @@ def reaches_parameters(system: CompiledSystem, free: Free) -> bool:
     return not all(np.array_equal(*pair) for pair in zip(here, there, strict=True))
 
 
-def _rhythm(free: Free, place: Place) -> ApcError:
+def _rhythm(free: ParameterRef, place: SourceLocation) -> ApcError:
     what = f"{free.name} sets the rhythm of a clock, and with it the frame: it can't be varied continuously"
-    return ApcError(Mistake("E844", place, what, hint="apc analyze with --set, one value at a time"))
+    return ApcError(Diagnostic("E844", place, what, hint="apc analyze with --set, one value at a time"))
 
 
 def _piece(
-    system: CompiledSystem,
-    free: Free,
+    system: Model,
+    free: ParameterRef,
     low: Fraction,
     high: Fraction,
     *,
     prepared: Prepared,
     slopes: Mapping[str, Fraction],
     follows: bool,
-) -> Piece:
+) -> DelaySegment:
     """Build the evaluator of one piece from its schedules at a value inside."""
     value = low + INSIDE * (high - low)
     inside = system_with_delay(system, free, value)
@@ -253,19 +257,19 @@ def _piece(
         for quanta, slope in _steps(schedule, system.kinds[group.kind], slopes).items():
             durations[quanta] = (float(quanta * schedule.quantum - slope * value), float(slope))
     if not follows and not any(slope for _, slope in durations.values()):
-        return Piece(low, high, None, inside)
+        return DelaySegment(low, high, None, inside)
     groups, exchange = lifted_groups(inside, prepared=shared)
     evaluator = batch_evaluator(inside, (free,), groups, exchange, durations=durations, follows=follows)
-    return Piece(low, high, evaluator, inside)
+    return DelaySegment(low, high, evaluator, inside)
 
 
-def _steps(schedule: Schedule, kind: Kind, slopes: Mapping[str, Fraction]) -> Mapping[int, Fraction]:
+def _steps(schedule: Schedule, kind: PeerType, slopes: Mapping[str, Fraction]) -> Mapping[int, Fraction]:
     """Return how fast each step grows, by its quanta: only what is held moves, all else is at its ticks."""
     result: dict[int, Fraction] = {}
     step, start, moving = 0, Fraction(0), set[Fraction]()
     for event in (*schedule.events, Propagate(0)):
         if not isinstance(event, Propagate):
-            moving.add(slopes[kind.holds[event.hold].delay] if isinstance(event, Act) else Fraction(0))
+            moving.add(slopes[kind.holds[event.hold].delay] if isinstance(event, HoldUpdate) else Fraction(0))
             continue
         (end,) = moving or {Fraction(0)}
         if step:

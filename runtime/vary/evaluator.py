@@ -1,8 +1,9 @@
 """The evaluator of a system's matrices over some of its parameters, whatever kind of scene it is.
 
-Takes: a `CompiledSystem` and the parameters that vary.
-Gives: `evaluator`, `evaluator_of_many`, `PiecewiseEvaluator`; `parameters_suffice`, `Asked`; `many_packets`;
-`closed_at`, `leading_in_floats`; `free_parameters`, `reaches_time`, `reaches_count`, `overrides_at`.
+Takes: a `Model` and the parameters that vary.
+Gives: `evaluator`, `evaluator_of_many`, `PiecewiseEvaluator`; `parameters_suffice`, `EvaluatorKey`;
+`many_packets`; `closed_at`, `leading_in_floats`; `free_parameters`, `reaches_time`, `reaches_count`,
+`overrides_at`.
 Guarantees: peers that are alike at some values only are kept apart.
 Does not: vary times (see `delays`).
 """
@@ -20,14 +21,14 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import lifted_groups
 from apc.analysis.sides import sides
-from apc.compiler.compiled import CompiledSystem, Group, Parameter, group_count
-from apc.compiler.errors import ApcError, Mistake, Place
-from apc.eigen.closing import ClosedSystem
+from apc.compiler.compiled import Group, Model, Parameter, group_count
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
+from apc.eigen.closing import ClosedLoop
 from apc.eigen.modes import split
-from apc.eigen.peers import PeerGroup, states_of
-from apc.frame.exchange import Exchange
+from apc.eigen.peers import PeerClass, states_of
+from apc.frame.exchange import CommunicationGraph
 from apc.frame.instance import Prepared
-from apc.frame.names import Free, is_named, parameter_of, times_of
+from apc.frame.names import ParameterRef, is_named, parameter_of, times_of
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import free_rows, scope_of
 from apc.frame.radius import UNIT
@@ -64,8 +65,8 @@ KEPT = 8
 class JoinedEvaluator:
     """A `MatrixSource` of several models over the same parameters: the matrices of all, one after another."""
 
-    system: CompiledSystem
-    free: tuple[Free, ...]
+    system: Model
+    free: tuple[ParameterRef, ...]
     sources: tuple[BatchEvaluator, ...]
 
     def matrices(self, values: Floats) -> tuple[Floats, ...]:
@@ -80,7 +81,7 @@ class JoinedEvaluator:
         """Return bounds (k, n, n) on the errors of the matrices at values (k, m), entry by entry."""
         return tuple(error for source in self.sources for error in source.errors(values))
 
-    def closed_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
+    def closed_at(self, value: Sequence[float]) -> tuple[ClosedLoop, ...]:
         """Return the closed systems at one point (m,), as an analysis has them."""
         return tuple(closed for source in self.sources for closed in source.closed_at(value))
 
@@ -94,8 +95,8 @@ class PiecewiseEvaluator:
     up with zeros.
     """
 
-    system: CompiledSystem
-    free: tuple[Free, ...]
+    system: Model
+    free: tuple[ParameterRef, ...]
     prepared: Prepared  # from `analysis.prepare_at_start`
     size: int
     alike: list[BatchEvaluator] = field(default_factory=list)
@@ -130,7 +131,9 @@ class PiecewiseEvaluator:
     def _around(self, value: Floats) -> BatchEvaluator:
         """Return what serves the points at which the same motions are free as at one (m,)."""
         at = apply(self.system, overrides_at(self.system, self.free, value.tolist()))
-        result = batch_evaluator(at, self.free, *Asked.of(at, self.free, self.prepared).lifted_anywhere())
+        result = batch_evaluator(
+            at, self.free, *EvaluatorKey.of(at, self.free, self.prepared).lifted_anywhere()
+        )
         return replace(result, wirings=tuple(map(wire, result.closed)))  # none that serve other points, too
 
     def _filled(self, blocks: Sequence[Floats]) -> Floats:
@@ -151,7 +154,7 @@ def _is_apart(matrices: Floats) -> NDArray[np.bool_]:
     return np.asarray(sure & (np.abs(values - 1).min(axis=1, initial=np.inf) >= DRIFT))
 
 
-def evaluator(system: CompiledSystem, free: Sequence[Free], *, prepared: Prepared) -> BatchEvaluator:
+def evaluator(system: Model, free: Sequence[ParameterRef], *, prepared: Prepared) -> BatchEvaluator:
     """Prepare a system for many values of some of its parameters, which say how all peers move.
 
     Parameters
@@ -168,43 +171,43 @@ def evaluator(system: CompiledSystem, free: Sequence[Free], *, prepared: Prepare
     ApcError
         As `analysis.lifted_groups`.
     """
-    return _evaluator(Asked.of(system, free, prepared))
+    return _evaluator(EvaluatorKey.of(system, free, prepared))
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class EvaluatorKey:
     """All that an evaluator follows from; `known` are the identities of the Jacobians in `prepared`."""
 
-    system: CompiledSystem
-    free: tuple[Free, ...]
+    system: Model
+    free: tuple[ParameterRef, ...]
     known: tuple[int, ...]
     order: tuple[str, ...]
     prepared: Prepared = field(compare=False)
 
     @classmethod
-    def of(cls, system: CompiledSystem, free: Sequence[Free], prepared: Prepared) -> Asked:
+    def of(cls, system: Model, free: Sequence[ParameterRef], prepared: Prepared) -> EvaluatorKey:
         """Return what is asked of a scene, from `instance.prepare`, over parameters that vary."""
         return cls(system, tuple(free), tuple(map(id, prepared.jacobians)), prepared.order, prepared)
 
-    def lifted_anywhere(self) -> tuple[tuple[PeerGroup, ...], Exchange]:
+    def lifted_anywhere(self) -> tuple[tuple[PeerClass, ...], CommunicationGraph]:
         """Return the peers in groups, alike where they are so at every value, and what they exchange."""
         return lifted_groups(generic(self.system, self.free), prepared=self.prepared)
 
 
 @lru_cache(maxsize=KEPT)
-def _evaluator(of: Asked) -> BatchEvaluator:
+def _evaluator(of: EvaluatorKey) -> BatchEvaluator:
     """Prepare a system, see `evaluator`."""
     return batch_evaluator(of.system, of.free, *of.lifted_anywhere())
 
 
-def parameters_suffice(system: CompiledSystem, prepared: Prepared) -> bool:
+def parameters_suffice(system: Model, prepared: Prepared) -> bool:
     """Say whether numbers alone say how all peers move, wherever they are."""
     return all(prepared.jacobians[group.kind].parameters_suffice for group in system.groups)
 
 
 def closed_at(
-    system: CompiledSystem, free: Sequence[Free], prepared: Prepared, value: Sequence[float]
-) -> tuple[ClosedSystem, ...]:
+    system: Model, free: Sequence[ParameterRef], prepared: Prepared, value: Sequence[float]
+) -> tuple[ClosedLoop, ...]:
     """Return the closed systems at one point (m,), as an analysis has them."""
     changed = apply(system, overrides_at(system, free, value))
     return tuple(
@@ -214,13 +217,13 @@ def closed_at(
     )
 
 
-def _relative(system: CompiledSystem, prepared: Prepared) -> list[Floats]:
+def _relative(system: Model, prepared: Prepared) -> list[Floats]:
     """Return the matrices of a scene's closed systems, relative to what is rigid; NaN where there is none."""
     systems = split(*lifted_groups(system, prepared=prepared))
     return [reduced(wire(closed), closed.matrix[None], 1)[0] for closed in systems]
 
 
-def leading_in_floats(system: CompiledSystem, prepared: Prepared) -> complex:
+def leading_in_floats(system: Model, prepared: Prepared) -> complex:
     """Return the largest eigenvalue of a scene in floats, what is rigid left out, NaN if there is none."""
     matrices = [
         matrix for side in sides(system, prepared) for matrix in _relative(side.system, side.prepared)
@@ -231,7 +234,7 @@ def leading_in_floats(system: CompiledSystem, prepared: Prepared) -> complex:
     return complex(values[np.argmax(np.abs(values))])
 
 
-def many_packets(system: CompiledSystem, prepared: Prepared) -> bool:
+def many_packets(system: Model, prepared: Prepared) -> bool:
     """Say whether packets on their way are most of a scene's states: an analysis leaves them out."""
     packets = max(sum(schedule.depths) for schedule in prepared.schedules)
     used = zip(prepared.schedules, system.groups, strict=True)
@@ -239,7 +242,7 @@ def many_packets(system: CompiledSystem, prepared: Prepared) -> bool:
 
 
 def evaluator_of_many(
-    system: CompiledSystem, free: Sequence[Free], place: Place, *, prepared: Prepared
+    system: Model, free: Sequence[ParameterRef], place: SourceLocation, *, prepared: Prepared
 ) -> BatchEvaluator:
     """Return `evaluator`, for work that takes a hundred points and more.
 
@@ -271,11 +274,11 @@ def evaluator_of_many(
             f"a range of values is looked at in hundreds of matrices, here of {states:,} states; "
             f"{MOST_STATES:,} are the most"
         )
-        raise ApcError(Mistake("E804", place, what, hint=hint))
+        raise ApcError(Diagnostic("E804", place, what, hint=hint))
     return result
 
 
-def generic(system: CompiledSystem, free: Sequence[Free]) -> CompiledSystem:
+def generic(system: Model, free: Sequence[ParameterRef]) -> Model:
     """Return the system with meaningless values for what is free: peers alike there are so everywhere."""
     overrides = []
     for place, item in enumerate(free):
@@ -297,7 +300,7 @@ def _unbounded(parameter: Parameter) -> Parameter:
     return replace(parameter, minimum=None, open_minimum=False, maximum=None)
 
 
-def free_parameters(system: CompiledSystem) -> list[Free]:
+def free_parameters(system: Model) -> list[ParameterRef]:
     """Return the parameters that follow from no other, set no time and count nobody, each as it can be set.
 
     A parameter is everybody's where no group has a value of its own; else it is that of each group it
@@ -318,29 +321,29 @@ def free_parameters(system: CompiledSystem) -> list[Free]:
         }
         own = any(value.name == parameter.name for group in system.groups for value in group.values)
         if not own and not any(several.values()):
-            frees.append(Free(parameter.name))
+            frees.append(ParameterRef(parameter.name))
             continue
         frees += [
-            Free(parameter.name, group.name)
+            ParameterRef(parameter.name, group.name)
             for group in system.groups
             if not several[group.name] and _reaches(system, group, parameter.name)
         ]
     return frees
 
 
-def _reaches(system: CompiledSystem, group: Group, name: str) -> bool:
+def _reaches(system: Model, group: Group, name: str) -> bool:
     """Say whether a parameter's value in a group enters the group's equations."""
-    values = {Free(name, group.name): np.array([float(GENERIC), float(2 * GENERIC)])}
+    values = {ParameterRef(name, group.name): np.array([float(GENERIC), float(2 * GENERIC)])}
     with np.errstate(all="ignore"):
         return len(free_rows(system, group, 0, values)) > 1
 
 
-def overrides_at(system: CompiledSystem, free: Sequence[Free], value: Sequence[float]) -> list[Override]:
+def overrides_at(system: Model, free: Sequence[ParameterRef], value: Sequence[float]) -> list[Override]:
     """Return overrides to a point (m,): counts are rounded, periods become ones of short frames."""
     return [Override(item, _exact(system, item, number)) for item, number in zip(free, value, strict=True)]
 
 
-def _exact(system: CompiledSystem, free: Free, number: float) -> Fraction:
+def _exact(system: Model, free: ParameterRef, number: float) -> Fraction:
     if reaches_count(system, free):
         return Fraction(round(number))
     if reaches_time(system, free):
@@ -348,12 +351,12 @@ def _exact(system: CompiledSystem, free: Free, number: float) -> Fraction:
     return Fraction(number)
 
 
-def reaches_count(system: CompiledSystem, free: Free) -> bool:
+def reaches_count(system: Model, free: ParameterRef) -> bool:
     """Say whether the number of peers of some group is, or depends on, this parameter."""
     return free.name in scope_of(system).needed([group_count(group.name) for group in system.groups])
 
 
-def reaches_time(system: CompiledSystem, free: Free) -> bool:
+def reaches_time(system: Model, free: ParameterRef) -> bool:
     """Say whether a period, phase or delay is, or depends on, this parameter."""
     if times_of(system, free.name):
         return True

@@ -1,7 +1,7 @@
 """The values of one parameter at which one number passes 1: a spectral radius, or a growth of its own.
 
-Takes: a `CompiledSystem` and the name of a parameter, or of what its links lose.
-Gives: `MEAN_SQUARE`, `NOMINAL`, `PASSIVE`, `BY_GROWTH`, `criterion_of`, `refuse_time`; `PointLine`,
+Takes: a `Model` and the name of a parameter, or of what its links lose.
+Gives: `MEAN_SQUARE`, `NOMINAL`, `PASSIVE`, `BY_GROWTH`, `criterion_of`, `refuse_time`; `PointwisePath`,
 `line_points`, `BOUNDED`; `judge_at`, `allowed`; `RadiusEvaluator`.
 Guarantees: a verdict is by bounds on the growth of second moments, or on what hands can draw, which counts
 as a growth (see `passivity.passive_growth`); nominally, by the analysis itself.
@@ -21,14 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import analyze
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.frame.ages import aged
 from apc.frame.instance import Prepared
-from apc.frame.names import Free, parameter_of, unit_of
+from apc.frame.names import ParameterRef, parameter_of, unit_of
 from apc.frame.overrides import Override, apply
 from apc.network.nominal import channel_numbers, unreliable
-from apc.vary.crossing import OneStretch, Stretch, Verdict
+from apc.vary.crossing import SingleSegment, SmoothSegment, Verdict
 from apc.vary.evaluator import leading_in_floats, overrides_at, reaches_time
 from apc.vary.line import OPEN, SPAN, one_by_one, spread, verdict_of
 
@@ -54,7 +54,9 @@ TAGGED = "an estimate, not proved: of second moments that are themselves estimat
 SHARES = 33
 
 
-def criterion_of(system: CompiledSystem, asked: str | None, place: Place, varied: Sequence[Free] = ()) -> str:
+def criterion_of(
+    system: Model, asked: str | None, place: SourceLocation, varied: Sequence[ParameterRef] = ()
+) -> str:
     """Return the criterion of a verdict: as asked, or mean square where a link is, or may become, unreliable.
 
     Parameters
@@ -75,12 +77,14 @@ def criterion_of(system: CompiledSystem, asked: str | None, place: Place, varied
     """
     if asked not in (None, MEAN_SQUARE, NOMINAL, PASSIVE):
         what = f"{str(asked)[:40]} is no criterion ({MEAN_SQUARE}, {NOMINAL}, {PASSIVE})"
-        raise ApcError(Mistake("E898", place, what, hint=f"--in {MEAN_SQUARE}"))
+        raise ApcError(Diagnostic("E898", place, what, hint=f"--in {MEAN_SQUARE}"))
     by_chance = unreliable(system) or any(free.name in channel_numbers(system) for free in varied)
     return asked or (MEAN_SQUARE if by_chance else NOMINAL)
 
 
-def refuse_time(system: CompiledSystem, free: Free, place: Place, criterion: str = MEAN_SQUARE) -> None:
+def refuse_time(
+    system: Model, free: ParameterRef, place: SourceLocation, criterion: str = MEAN_SQUARE
+) -> None:
     """Refuse to vary a period, phase or delay by a criterion of one number; how much delays vary may.
 
     Parameters
@@ -102,11 +106,11 @@ def refuse_time(system: CompiledSystem, free: Free, place: Place, criterion: str
         what = f"{free.label} can't be varied {BY_GROWTH[criterion]}: it changes the order of events"
         if criterion == PASSIVE:
             hint = f'apc analyze --hands passive --set {free.label}="…", one value after the other'
-            raise ApcError(Mistake("E930", place, what, hint=hint))
-        raise ApcError(Mistake("E898", place, what, hint=f"--in {NOMINAL}"))
+            raise ApcError(Diagnostic("E930", place, what, hint=hint))
+        raise ApcError(Diagnostic("E898", place, what, hint=f"--in {NOMINAL}"))
     if criterion == PASSIVE and free.name in channel_numbers(system):
         what = f"{free.label} can't be varied with passive hands: every packet takes its nominal delay there"
-        raise ApcError(Mistake("E930", place, what, hint=f"--in {MEAN_SQUARE}, with free hands"))
+        raise ApcError(Diagnostic("E930", place, what, hint=f"--in {MEAN_SQUARE}, with free hands"))
 
 
 # Where there is no number: a frame that grows beyond floats, and beyond what a parameter may be.
@@ -114,10 +118,10 @@ NOWHERE = ("E806", "E624")
 
 
 def judge_at(
-    system: CompiledSystem,
+    system: Model,
     prepared: Prepared,
     overrides: Sequence[Override],
-    place: Place,
+    place: SourceLocation,
     *,
     bounded: bool = True,
     criterion: str = MEAN_SQUARE,
@@ -163,7 +167,7 @@ def judge_at(
         hint = f"--in {NOMINAL}"
         if any(override.free.name in channel_numbers(system) for override in overrides):
             hint = "apc simulate" if aged(system) else "a narrower range between --lower and --upper"
-        raise ApcError(Mistake("E898", place, what, hint=hint))
+        raise ApcError(Diagnostic("E898", place, what, hint=hint))
     proof = TAGGED if not result.exact else BOUNDED[criterion] if result.proved else ITERATED
     error = max(result.high - result.radius, result.radius - result.low)
     return Verdict(result.stable, result.radius, error, (), proof)
@@ -177,10 +181,10 @@ class RadiusEvaluator:
     over a small part of the directions, right to about 1e-9 of them.
     """
 
-    system: CompiledSystem
-    free: tuple[Free, ...]
+    system: Model
+    free: tuple[ParameterRef, ...]
     prepared: Prepared
-    place: Place
+    place: SourceLocation
     criterion: str = MEAN_SQUARE
 
     def verdict(self, value: Sequence[float], *, bounded: bool = False) -> Verdict:
@@ -251,7 +255,7 @@ class RadiusEvaluator:
         return (np.array(errors)[:, None, None],)
 
 
-def allowed(system: CompiledSystem, free: Free) -> tuple[float, float]:
+def allowed(system: Model, free: ParameterRef) -> tuple[float, float]:
     """Return between which values a parameter may be."""
     if any(timing.name == free.name for timing in system.timings):
         return 0.0, math.inf
@@ -263,7 +267,7 @@ def allowed(system: CompiledSystem, free: Free) -> tuple[float, float]:
 
 
 @dataclass(frozen=True, eq=False)
-class PointLine(OneStretch):
+class PointwisePath(SingleSegment):
     """The one parameter of a `RadiusEvaluator`, at `points` (k,) to begin with: each value by itself, once.
 
     Cells are measured against `least` where the value is smaller.
@@ -292,15 +296,15 @@ class PointLine(OneStretch):
             return self._sampled(value)
         return self.source.verdict([float(value)], bounded=True)
 
-    def stretches(self) -> Iterator[Stretch]:
+    def stretches(self) -> Iterator[SmoothSegment]:
         """Yield the one stretch."""
         low, high = Fraction(self.points[0]), Fraction(self.points[-1])
         look = partial(one_by_one, self._sampled)
-        yield Stretch(low, high, self.points, self.least, look, self.judge, slow=True)
+        yield SmoothSegment(low, high, self.points, self.least, look, self.judge, slow=True)
 
 
 def line_points(
-    system: CompiledSystem, free: Free, low: float | None, high: float | None, scale: float
+    system: Model, free: ParameterRef, low: float | None, high: float | None, scale: float
 ) -> tuple[Floats, float]:
     """Return the values of a parameter to look at first, and what cells are measured against beside 0.
 

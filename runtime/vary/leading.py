@@ -1,7 +1,7 @@
 """The largest eigenvalue of a whole scene at many points, with its bound, and how its mode moves.
 
 Takes: a `BatchEvaluator`, and what its systems are at some points (`BatchEvaluator.bounded`).
-Gives: `Part`, `parts_of`; `Leading`, `leading`.
+Gives: `DrivingPart`, `parts_of`; `Leading`, `leading`.
 Guarantees: what is said to be certain is proved, as in `eigen.enclosure`: which eigenvalue is the largest of
 all systems, how far it may be off, on which side of 1 it is, and that no other one is 1.
 Does not: say anything of the points where that is not clear.
@@ -22,7 +22,7 @@ from apc.eigen.spectrum import LEAST_SHARE, STRAIGHT
 from apc.frame.course import turns
 from apc.frame.radius import UNIT
 from apc.vary.batch import BatchEvaluator, Bounded
-from apc.vary.wiring import Wiring
+from apc.vary.wiring import LoopStructure
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -38,7 +38,7 @@ APART = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Part:
+class DrivingPart:
     """States of a system that drive each other: its eigenvalues are those of its parts.
 
     `states` are their places among the relative coordinates.
@@ -62,19 +62,19 @@ class Leading:
     certain: Truths
 
 
-def parts_of(evaluator: BatchEvaluator) -> tuple[tuple[Part, ...], tuple[Truths, ...]]:
+def parts_of(evaluator: BatchEvaluator) -> tuple[tuple[DrivingPart, ...], tuple[Truths, ...]]:
     """Return the parts of all systems, and which entries (n, n) of each one's matrix may be other than 0."""
     patterns, parts = [], []
     for place, wiring in enumerate(evaluator.wirings):
         matrix, error = relative_bounded(wiring.system.matrix, wiring.system.error, wiring.relative)
         size = np.abs(matrix) + error
         patterns.append(size != 0)
-        parts += [Part(place, states) for states in driving_parts(size != 0)]
+        parts += [DrivingPart(place, states) for states in driving_parts(size != 0)]
     return tuple(parts), tuple(patterns)
 
 
 def leading(
-    evaluator: BatchEvaluator, parts: Sequence[Part], systems: Sequence[Bounded], count: int
+    evaluator: BatchEvaluator, parts: Sequence[DrivingPart], systems: Sequence[Bounded], count: int
 ) -> Leading:
     """Find the largest eigenvalue of the whole.
 
@@ -92,7 +92,7 @@ def leading(
 
 
 def _leading(
-    evaluator: BatchEvaluator, parts: Sequence[Part], systems: Sequence[Bounded], count: int
+    evaluator: BatchEvaluator, parts: Sequence[DrivingPart], systems: Sequence[Bounded], count: int
 ) -> Leading:
     enclosed = []
     for part in parts:
@@ -146,7 +146,12 @@ def _block(matrix: Floats, states: Places) -> Floats:
 
 
 def _angles(
-    wiring: Wiring, bounded: Bounded, part: Part, values: Complexes, right: Complexes, left: Complexes
+    wiring: LoopStructure,
+    bounded: Bounded,
+    part: DrivingPart,
+    values: Complexes,
+    right: Complexes,
+    left: Complexes,
 ) -> Floats:
     """Return by how much modes turn in a frame (k,), see `spectrum.angles_in_frame`; NaN if it isn't clear.
 

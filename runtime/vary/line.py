@@ -1,7 +1,7 @@
 """A scene along one of its numbers: its eigenvalues at many values, and its analysis at any.
 
-Takes: a `CompiledSystem`, what was prepared of it, and the number that varies.
-Gives: `MatrixLine`, `JudgedLine`, `DelayLine`, `CountLine`; `spread`, `SPAN`; `one_by_one`, `judged`,
+Takes: a `Model`, what was prepared of it, and the number that varies.
+Gives: `MatrixPath`, `JudgedLine`, `DelayPath`, `PeerCountPath`; `spread`, `SPAN`; `one_by_one`, `judged`,
 `verdict_of`, `OPEN`.
 Guarantees: `judge` is the scene's own analysis; `look` its matrices in floats.
 Does not: search (see `crossing`).
@@ -19,24 +19,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import Analysis, analyze, lifted_groups
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, SourceLocation
 from apc.eigen.eigenpairs import eigenvalues
 from apc.eigen.modes import split
 from apc.eigen.rigid import rigid_modes_of
 from apc.eigen.spectrum import DRIFTS
 from apc.frame.instance import Prepared
-from apc.frame.names import Free
+from apc.frame.names import ParameterRef
 from apc.frame.overrides import Override, apply
 from apc.vary.batch import BatchEvaluator
-from apc.vary.crossing import ESTIMATE, UNSURE, Crossing, OneStretch, Stretch, Verdict
-from apc.vary.delays import INSIDE, Piece, borders, delay_pieces
+from apc.vary.crossing import ESTIMATE, UNSURE, Crossing, SingleSegment, SmoothSegment, Verdict
+from apc.vary.delays import INSIDE, DelaySegment, borders, delay_pieces
 from apc.vary.timing_values import delay_now, system_with_delay
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
-PLACE = Place("critical value")
+PLACE = SourceLocation("critical value")
 
 # Without limits given, values from SPAN times smaller to SPAN times larger than the scale are looked at: the
 # present value or, where that is 0, the change that would move an eigenvalue by 1 if it went on as it starts.
@@ -66,7 +66,7 @@ EVERY, FURTHER = 32, 1.25
 OPEN = Verdict(None, math.nan, math.inf, (), "")
 
 
-def judged(system: CompiledSystem, prepared: Prepared) -> Verdict:
+def judged(system: Model, prepared: Prepared) -> Verdict:
     """Return the verdict of a topology, open if there is no analysis.
 
     A drift occurs on both sides of a crossing, so that it does not decide.
@@ -107,7 +107,7 @@ def spread(bottom: float, top: float, scale: float) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
-class MatrixLine(OneStretch):
+class MatrixPath(SingleSegment):
     """One of an evaluator's free parameters varies, the others stay at `base` (m,): a line of one stretch.
 
     `prepared` is that of the evaluator's topology. `bottom` and `top` are the ends, None for those of `SPAN`.
@@ -149,14 +149,14 @@ class MatrixLine(OneStretch):
         fastest = float(np.nanmax(np.abs(self.look(np.zeros(1))[1]), initial=0.0))
         return 1 / fastest if fastest > 0 else 1.0
 
-    def stretches(self) -> Iterator[Stretch]:
+    def stretches(self) -> Iterator[SmoothSegment]:
         """Yield the one stretch."""
         bottom = self.bottom
         if bottom is None:
             bottom = -SPAN * self.scale if self.base[self.column] < 0 else 0.0
         top = self.top if self.top is not None else max(SPAN * self.scale, bottom + self.scale)
         points = spread(bottom, top, self.scale)
-        yield Stretch(Fraction(bottom), Fraction(top), points, self.scale / SPAN, self.look, self.judge)
+        yield SmoothSegment(Fraction(bottom), Fraction(top), points, self.scale / SPAN, self.look, self.judge)
 
 
 def matrix_look(family: BatchEvaluator, points: Floats, column: int) -> tuple[Complexes, Complexes]:
@@ -195,8 +195,8 @@ def one_by_one(judge: Callable[[Fraction], Verdict], values: Floats) -> tuple[Co
 class JudgedLine:
     """A line of which each value is analysed by itself, once."""
 
-    system: CompiledSystem
-    free: Free
+    system: Model
+    free: ParameterRef
     known: dict[Fraction, Verdict] = field(default_factory=dict, kw_only=True)
 
     @property
@@ -215,7 +215,7 @@ class JudgedLine:
 
 
 @dataclass(frozen=True, eq=False)
-class DelayLine(JudgedLine):
+class DelayPath(JudgedLine):
     """A delay from `low` to `high`: between two coincidences of events what decides is continuous.
 
     What happens exactly at `low` is a stretch of its own: events may coincide there. `rigid` are the numbers
@@ -239,7 +239,7 @@ class DelayLine(JudgedLine):
         """Return the verdict at a delay that moves events."""
         return judged(system_with_delay(self.system, self.free, value), self.prepared)
 
-    def stretches(self) -> Iterator[Stretch]:
+    def stretches(self) -> Iterator[SmoothSegment]:
         """Yield the value at which the line begins, then the stretches from one coincidence to the next."""
         yield self._constant(self.low, self.low, self.low)
         for piece in delay_pieces(
@@ -257,8 +257,8 @@ class DelayLine(JudgedLine):
             self.progress(min(high, self.high))
 
     def _constant(
-        self, low: Fraction, high: Fraction, inside: Fraction, there: CompiledSystem | None = None
-    ) -> Stretch:
+        self, low: Fraction, high: Fraction, inside: Fraction, there: Model | None = None
+    ) -> SmoothSegment:
         """Return a stretch within which nothing depends on the delay: the scene at a value stands for all."""
         there = there or system_with_delay(self.system, self.free, inside)
         point, high = np.array([float(low)]), min(high, self.high)
@@ -272,9 +272,9 @@ class DelayLine(JudgedLine):
                 return one_by_one(judge, point)
             return np.array([[radius]], np.complex128), np.full((1, 1), np.nan, np.complex128)
 
-        return Stretch(low, high, point, float(high - low), look, judge)
+        return SmoothSegment(low, high, point, float(high - low), look, judge)
 
-    def _radius(self, there: CompiledSystem) -> float:
+    def _radius(self, there: Model) -> float:
         """Return the spectral radius of the scene at a delay in floats, 1 where there is no matrix.
 
         As many eigenvalues as are rigid, those nearest to 1, are left out.
@@ -292,7 +292,7 @@ class DelayLine(JudgedLine):
             largest = max(largest, float(np.abs(values[moving]).max(initial=0.0)))
         return largest
 
-    def _moving(self, piece: Piece, family: BatchEvaluator) -> Stretch:
+    def _moving(self, piece: DelaySegment, family: BatchEvaluator) -> SmoothSegment:
         """Return a stretch in which events move with the delay."""
         high = min(piece.high, self.high)
         points = np.linspace(float(piece.low), float(high), PIECE_SAMPLES)
@@ -300,9 +300,9 @@ class DelayLine(JudgedLine):
         def look(values: Floats) -> tuple[Complexes, Complexes]:
             return matrix_look(family, values[:, None], 0)
 
-        return Stretch(piece.low, high, points, float(high - piece.low), look, self._judge_within)
+        return SmoothSegment(piece.low, high, points, float(high - piece.low), look, self._judge_within)
 
-    def change(self, before: Stretch, after: Stretch, *, stable_below: bool) -> Crossing:
+    def change(self, before: SmoothSegment, after: SmoothSegment, *, stable_below: bool) -> Crossing:
         """Return a jump, exact where analyses just inside both stretches hold it there.
 
         Where stretches between the two were left open, it lies anywhere in these.
@@ -320,7 +320,7 @@ class DelayLine(JudgedLine):
 
 
 def delay_reach(
-    system: CompiledSystem, free: Free, low: Fraction, *, pieces: int, further: float
+    system: Model, free: ParameterRef, low: Fraction, *, pieces: int, further: float
 ) -> tuple[Fraction, int]:
     """Return how far a delay is looked at where nobody says, and over how many pieces that is.
 
@@ -342,29 +342,29 @@ def delay_reach(
 
 
 @dataclass(frozen=True, eq=False)
-class CountLine(JudgedLine):
+class PeerCountPath(JudgedLine):
     """A number of peers from `first` to `last`: a stretch each, the larger ones looked at less densely."""
 
-    verdict_of: Callable[[CompiledSystem], bool | None]
+    verdict_of: Callable[[Model], bool | None]
     first: int
     last: int
 
     def _verdict(self, value: Fraction) -> Verdict:
         return sided(self.verdict_of(apply(self.system, [Override(self.free, value)])))
 
-    def stretches(self) -> Iterator[Stretch]:
+    def stretches(self) -> Iterator[SmoothSegment]:
         """Yield the counts that are looked at to begin with, in order."""
         look = partial(one_by_one, self.judge)
         count = self.first
         while True:
             at = Fraction(count)
-            yield Stretch(at, at, np.array([float(count)]), 0.0, look, self.judge, slow=True)
+            yield SmoothSegment(at, at, np.array([float(count)]), 0.0, look, self.judge, slow=True)
             if count >= self.last:
                 return
             step = math.floor(count * FURTHER) if count >= self.first + EVERY else 0
             count = max(count + 1, min(self.last, step))
 
-    def change(self, before: Stretch, after: Stretch, *, stable_below: bool) -> Crossing:
+    def change(self, before: SmoothSegment, after: SmoothSegment, *, stable_below: bool) -> Crossing:
         """Return the two neighbouring counts between which the verdict changes, by halving."""
         below, above = int(before.high), int(after.low)
         while above - below > 1:

@@ -1,6 +1,6 @@
 """Where the eigenvalues of a scene go as one of its numbers grows: the root locus, in the plane of z.
 
-Takes: a `CompiledSystem` and a `Critical` of it. Gives: `Locus`, `root_locus`; `eigenvalues_at`.
+Takes: a `Model` and a `Critical` of it. Gives: `Locus`, `root_locus`; `eigenvalues_at`.
 Guarantees: every point is an eigenvalue of the frame with that value, what is rigid at every value left out,
 every packet on time; a value that the scene can't have is left out.
 Does not: prove anything; the crossings are those of `critical`.
@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import analyze, prepare_at_start
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, SourceLocation
 from apc.compiler.timings import part
 from apc.frame.instance import Prepared, prepare
-from apc.frame.names import Free, find
+from apc.frame.names import ParameterRef, find
 from apc.frame.overrides import Override, apply
 from apc.threads import single_threaded
 from apc.vary.evaluator import evaluator_of_many, reaches_count, reaches_time
@@ -49,7 +49,7 @@ class Locus:
 
 
 @part("locus")
-def root_locus(system: CompiledSystem, critical: Critical) -> Locus:
+def root_locus(system: Model, critical: Critical) -> Locus:
     """Follow the eigenvalues of a scene over the values at which its stability was looked at.
 
     Parameters
@@ -80,7 +80,7 @@ def root_locus(system: CompiledSystem, critical: Critical) -> Locus:
 
 
 def eigenvalues_at(
-    system: CompiledSystem, free: Free, values: Sequence[Fraction | float], *, prepared: Prepared
+    system: Model, free: ParameterRef, values: Sequence[Fraction | float], *, prepared: Prepared
 ) -> tuple[list[int], tuple[NDArray[np.complex128], ...]]:
     """Return which values of a parameter have eigenvalues, by their places, and the eigenvalues of each.
 
@@ -100,14 +100,14 @@ def eigenvalues_at(
     if start is None or reaches_count(system, free) or reaches_time(system, free):
         return _one_by_one(system, free, values, prepared)
     with single_threaded(), np.errstate(all="ignore"):
-        family = evaluator_of_many(system, [free], Place(free.label), prepared=start)
+        family = evaluator_of_many(system, [free], SourceLocation(free.label), prepared=start)
         every, _ = matrix_look(family, np.array(values, np.float64)[:, None], 0)
     places = np.flatnonzero(np.isfinite(every).all(axis=1)).tolist()
     return places, tuple(every[places])
 
 
 def _one_by_one(
-    system: CompiledSystem, free: Free, values: Sequence[Fraction | float], prepared: Prepared
+    system: Model, free: ParameterRef, values: Sequence[Fraction | float], prepared: Prepared
 ) -> tuple[list[int], tuple[NDArray[np.complex128], ...]]:
     """Return the same by an analysis each."""
     places, eigenvalues = [], []

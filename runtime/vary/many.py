@@ -1,7 +1,8 @@
 """Many analyses at once: the verdict, the spectral radius with its bound, and how the leading mode moves.
 
-Takes: a `CompiledSystem`, and values of some of its parameters and times.
-Gives: `Varied`, `Rows`; `ManyAnalyses`, `many_analyses`, `by_matrices`; `Analyses`, `analyze_many`.
+Takes: a `Model`, and values of some of its parameters and times.
+Gives: `SweptParameter`, `BatchResult`; `ManyAnalyses`, `many_analyses`, `by_matrices`; `Analyses`,
+`analyze_many`.
 Guarantees: what `analysis.analyze` gives at each point, to the bounds: what the matrices of many points
 leave open, or say of it less than an analysis would, has an analysis of its own.
 Does not: give all modes, or share out work among processes (see `sweeps`).
@@ -24,9 +25,9 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Analysis, analyze, near_start
 from apc.analysis.plan import make_plan
-from apc.compiler.compiled import CompiledSystem, Parameter
-from apc.compiler.errors import ApcError, Mistake, Place
-from apc.eigen.peers import PeerGroup
+from apc.compiler.compiled import Model, Parameter
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
+from apc.eigen.peers import PeerClass
 from apc.eigen.rigid import what_stands
 from apc.eigen.spectrum import (
     STABLE,
@@ -39,15 +40,15 @@ from apc.eigen.spectrum import (
 from apc.frame.ages import linear_sites
 from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, instance, prepare
-from apc.frame.names import Free, find, notes_for_all_groups, unit_of
+from apc.frame.names import ParameterRef, find, notes_for_all_groups, unit_of
 from apc.frame.overrides import Override, apply
-from apc.frame.parameters import Numbers, resolve, scope_of
+from apc.frame.parameters import ResolvedNumbers, resolve, scope_of
 from apc.network.nominal import left_out, refuse_channel_number
 from apc.result import Result
 from apc.threads import single_threaded
 from apc.vary.batch import BatchEvaluator, batch_evaluator
-from apc.vary.evaluator import Asked, generic, reaches_count, reaches_time
-from apc.vary.leading import Part, leading, parts_of
+from apc.vary.evaluator import EvaluatorKey, generic, reaches_count, reaches_time
+from apc.vary.leading import DrivingPart, leading, parts_of
 
 if TYPE_CHECKING:
     import pandas
@@ -56,7 +57,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Truths = NDArray[np.bool_]
 
-PLACE = Place("analyze_many")
+PLACE = SourceLocation("analyze_many")
 
 # What stands in the verdict's place of a point whose numbers can't be computed with.
 FAULT = "error: "
@@ -84,10 +85,10 @@ MOST_LOOPS = 128
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Varied:
+class SweptParameter:
     """A parameter or time that varies, and its values in SI: as floats (v,), and exactly by their places."""
 
-    free: Free
+    free: ParameterRef
     numbers: Floats
     exact: Callable[[int], Fraction]
 
@@ -97,7 +98,7 @@ class Varied:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rows:
+class BatchResult:
     """What analyses give at k points; of a point at fault the verdict is `error: ` and the message's code.
 
     Numbers are NaN where there is none; `rigid_modes` is −1 at a point at fault.
@@ -112,7 +113,7 @@ class Rows:
     message: NDArray[Any]  # str
 
     @classmethod
-    def nothing(cls, count: int) -> Rows:
+    def nothing(cls, count: int) -> BatchResult:
         """Return so many rows that say nothing yet."""
         radius, error, frequency, damping = np.full((4, count), np.nan)
         verdict, message = np.full((2, count), "", dtype=object)
@@ -134,7 +135,7 @@ class _Reaching:
 class _Family:
     """What all points of the same times share; `rigid` and `drifts` are those of the whole."""
 
-    system: CompiledSystem
+    system: Model
     evaluator: BatchEvaluator
     columns: tuple[int, ...]  # which of the varied each free parameter is
     reaching: tuple[_Reaching, ...]
@@ -142,23 +143,23 @@ class _Family:
     drifts: int
     bounds: tuple[tuple[int, Parameter], ...]  # the parameters that a varied one sets, by its column
     patterns: tuple[Truths, ...]  # which entries of each system's matrix may be other than 0
-    parts: tuple[Part, ...]
-    resolved: dict[tuple[Override, ...], Numbers | None] = field(default_factory=dict)
+    parts: tuple[DrivingPart, ...]
+    resolved: dict[tuple[Override, ...], ResolvedNumbers | None] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ManyAnalyses:
     """The analyses of one scene at values of what varies; made ready once, asked any number of times."""
 
-    system: CompiledSystem
-    varied: tuple[Varied, ...]
+    system: Model
+    varied: tuple[SweptParameter, ...]
     prepared: Prepared
     times: tuple[int, ...]
     families: dict[tuple[int, ...], _Family | None] = field(default_factory=dict)
 
-    def at(self, places: Integers) -> Rows:
+    def at(self, places: Integers) -> BatchResult:
         """Return what the analyses of points give, whose values are at these places (k, m) of the varied."""
-        rows = Rows.nothing(len(places))
+        rows = BatchResult.nothing(len(places))
         still_open = np.ones(len(places), dtype=np.bool_)
         if len(places):
             timings, which = np.unique(places[:, list(self.times)], axis=0, return_inverse=True)
@@ -181,11 +182,11 @@ class ManyAnalyses:
             given = tuple(
                 self.varied[column].override(place) for column, place in zip(self.times, timing, strict=True)
             )
-            asked = Asked.of(self.system, [varied.free for varied in self.varied], self.prepared)
+            asked = EvaluatorKey.of(self.system, [varied.free for varied in self.varied], self.prepared)
             self.families[timing] = _family(asked, self.times, given)
         return self.families[timing]
 
-    def _alone(self, places: Integers, row: int, rows: Rows) -> None:
+    def _alone(self, places: Integers, row: int, rows: BatchResult) -> None:
         """Analyse one point by itself."""
         try:
             overrides = [
@@ -210,7 +211,7 @@ class Analyses(Result):
     """The answers of many analyses, arrays of the shape of the values.
 
     `parameters` names what varied, with its unit, and `values` holds its values in SI. The columns are
-    those of `Rows`; `left_out` says what of the scene the answers do not look at.
+    those of `BatchResult`; `left_out` says what of the scene the answers do not look at.
     """
 
     shown_by = "vary_output:analyses"
@@ -238,7 +239,7 @@ class Analyses(Result):
         return table
 
 
-def analyze_many(system: CompiledSystem, values: Mapping[str, Any]) -> Analyses:
+def analyze_many(system: Model, values: Mapping[str, Any]) -> Analyses:
     """Analyse a scene at many values of some parameters and times.
 
     Parameters
@@ -256,12 +257,12 @@ def analyze_many(system: CompiledSystem, values: Mapping[str, Any]) -> Analyses:
     """
     if not values:
         what = "nothing varies"
-        raise ApcError(Mistake("E883", PLACE, what, hint='{"contact.stiffness": [500.0, 1000.0]}'))
+        raise ApcError(Diagnostic("E883", PLACE, what, hint='{"contact.stiffness": [500.0, 1000.0]}'))
     frees, listed = [], []
     for name, given in values.items():
         free = find(system, name.strip(), PLACE, counts=True)
         if free in frees:
-            raise ApcError(Mistake("E883", PLACE, f"{free.label} is given twice"))
+            raise ApcError(Diagnostic("E883", PLACE, f"{free.label} is given twice"))
         refuse_channel_number(system, free, PLACE)
         frees.append(free)
         listed.append(_numbers_of(system, free, given))
@@ -270,11 +271,11 @@ def analyze_many(system: CompiledSystem, values: Mapping[str, Any]) -> Analyses:
     except ValueError:
         shapes = " and ".join(str(values.shape) for values in listed)
         what = f"values of the shapes {shapes} can't be broadcast against one another"
-        raise ApcError(Mistake("E881", PLACE, what)) from None
+        raise ApcError(Diagnostic("E881", PLACE, what)) from None
     varied, places = [], []
     for free, array in zip(frees, arrays, strict=True):
         numbers, which = np.unique(array.ravel(), return_inverse=True)
-        varied.append(Varied(free, numbers, partial(_shortest, numbers)))
+        varied.append(SweptParameter(free, numbers, partial(_shortest, numbers)))
         places.append(which)
     rows = many_analyses(system, varied).at(np.stack(places, axis=1))
     shape = arrays[0].shape
@@ -291,7 +292,7 @@ def analyze_many(system: CompiledSystem, values: Mapping[str, Any]) -> Analyses:
     )
 
 
-def _numbers_of(system: CompiledSystem, free: Free, given: Any) -> Floats:
+def _numbers_of(system: Model, free: ParameterRef, given: Any) -> Floats:
     """Read the values of a parameter: numbers in SI, or quantities."""
     unit, what = unit_of(system, free.name), f"the values of {free.label}"
     array = np.asarray(given)
@@ -303,7 +304,7 @@ def _numbers_of(system: CompiledSystem, free: Free, given: Any) -> Floats:
         array = np.array([float(number) for number in read]).reshape(array.shape)
     if array.dtype.kind not in "fiu" or not array.size or not np.isfinite(array).all():
         expected = f"finite numbers, in {unit}" if unit != "1" else "finite numbers"
-        raise ApcError(Mistake("E881", PLACE, what, expected, str(given)[:40]))
+        raise ApcError(Diagnostic("E881", PLACE, what, expected, str(given)[:40]))
     return array.astype(np.float64)
 
 
@@ -312,13 +313,13 @@ def _shortest(numbers: Floats, place: int) -> Fraction:
     return Fraction(repr(float(numbers[place])))
 
 
-def by_matrices(system: CompiledSystem) -> bool:
+def by_matrices(system: Model) -> bool:
     """Say whether matrices of many points can be had at once: all follows from the parameters alone."""
     sites = linear_sites(system)
     return all(sites[group.kind].parameters_suffice for group in system.groups)
 
 
-def many_analyses(system: CompiledSystem, varied: Sequence[Varied]) -> ManyAnalyses:
+def many_analyses(system: Model, varied: Sequence[SweptParameter]) -> ManyAnalyses:
     """Make ready the analyses of a scene at many values.
 
     Parameters
@@ -337,7 +338,7 @@ def many_analyses(system: CompiledSystem, varied: Sequence[Varied]) -> ManyAnaly
 
 
 @lru_cache(maxsize=KEPT_ON)
-def _family(of: Asked, times: tuple[int, ...], given: tuple[Override, ...]) -> _Family | None:
+def _family(of: EvaluatorKey, times: tuple[int, ...], given: tuple[Override, ...]) -> _Family | None:
     """Prepare the matrices for some times; None where an analysis of the scene is no matter of these."""
     system, prepared = of.system, of.prepared
     columns = tuple(column for column in range(len(of.free)) if column not in times)
@@ -379,7 +380,7 @@ def _family(of: Asked, times: tuple[int, ...], given: tuple[Override, ...]) -> _
     )
 
 
-def _reaching(system: CompiledSystem, columns: Sequence[int], free: Sequence[Free]) -> tuple[_Reaching, ...]:
+def _reaching(system: Model, columns: Sequence[int], free: Sequence[ParameterRef]) -> tuple[_Reaching, ...]:
     """Return the varied numbers from which any others follow, those together of which the same does."""
     scopes = [scope_of(system), *(scope_of(system, group.values) for group in system.groups)]
     reachings: list[_Reaching] = []
@@ -400,7 +401,7 @@ def _reaching(system: CompiledSystem, columns: Sequence[int], free: Sequence[Fre
 
 
 def _filled(
-    family: _Family, varied: Sequence[Varied], places: Integers, numbers: Integers, rows: Rows
+    family: _Family, varied: Sequence[SweptParameter], places: Integers, numbers: Integers, rows: BatchResult
 ) -> Truths:
     """Fill in what the matrices of some points decide, and say of each whether they do."""
     done = np.zeros(len(numbers), dtype=np.bool_)
@@ -415,10 +416,10 @@ def _filled(
 
 def _decided(
     family: _Family,
-    varied: Sequence[Varied],
+    varied: Sequence[SweptParameter],
     places: Integers,
     rows: Integers,
-    result: Rows,
+    result: BatchResult,
 ) -> Truths:
     """Do so for few points at a time."""
     allowed, vectors = _vectors(family, varied, places)
@@ -459,8 +460,8 @@ def _loose(error: Floats) -> Truths:
 
 
 def _vectors(
-    family: _Family, varied: Sequence[Varied], places: Integers
-) -> tuple[Truths, Callable[[PeerGroup], Floats]]:
+    family: _Family, varied: Sequence[SweptParameter], places: Integers
+) -> tuple[Truths, Callable[[PeerClass], Floats]]:
     """Return which points may be, and what gives each group's parameters there (k, n_p), or (1, n_p).
 
     A number that follows from others is worked out as for an analysis, in rationals, once for all points that
@@ -481,7 +482,7 @@ def _vectors(
         key=lambda column: varied[column].free.group or "",
     )
 
-    def vectors(group: PeerGroup) -> Floats:
+    def vectors(group: PeerClass) -> Floats:
         place, peer = family.evaluator.first_peer(group)
         names, own = group.jacobians.kind.parameters, family.system.groups[place].name
         vectors = group.parameters[None]
@@ -509,8 +510,8 @@ def _vectors(
 
 
 def _resolved(
-    family: _Family, varied: Sequence[Varied], reaching: _Reaching, places: Sequence[int]
-) -> Numbers | None:
+    family: _Family, varied: Sequence[SweptParameter], reaching: _Reaching, places: Sequence[int]
+) -> ResolvedNumbers | None:
     """Return the scene's numbers with what others follow from at these places; None if these may not be."""
     given = tuple(
         varied[column].override(place) for column, place in zip(reaching.columns, places, strict=True)

@@ -1,6 +1,6 @@
 """How much each coupler's stiffness and damping, and each delay, may grow before the boundary.
 
-Takes: a `CompiledSystem`.
+Takes: a `Model`.
 Gives: `Margin`, `Margins`, `margins`, `network_margins`; `not_looked`; `coupler_parameters`; `STIFFNESSES`.
 Guarantees: a margin is the next crossing above the present value, with its error; none is said together with
 how far was looked.
@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import analyze, lifted_groups, prepare_at_start
 from apc.analysis.sides import sides
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, SourceLocation
 from apc.compiler.timings import part
 from apc.compiler.words import counted
 from apc.eigen.modes import arrange
@@ -30,28 +30,28 @@ from apc.eigen.peers import states_of
 from apc.eigen.spectrum import DRIFTS, finite
 from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, prepare
-from apc.frame.names import Free, named_times, parameter_of, times_of, unit_of, value_now
+from apc.frame.names import ParameterRef, named_times, parameter_of, times_of, unit_of, value_now
 from apc.network.nominal import channel_numbers
 from apc.result import Result
 from apc.threads import single_threaded
-from apc.vary.crossing import ESTIMATE, Search, search
+from apc.vary.crossing import ESTIMATE, CrossingReport, search
 from apc.vary.evaluator import evaluator, free_parameters, many_packets, parameters_suffice
 from apc.vary.growth import (
     BOUNDED,
     MEAN_SQUARE,
     NOMINAL,
-    PointLine,
+    PointwisePath,
     RadiusEvaluator,
     allowed,
     line_points,
 )
-from apc.vary.line import DelayLine, MatrixLine, delay_reach
+from apc.vary.line import DelayPath, MatrixPath, delay_reach
 from apc.vary.sensitivity import not_varied, of_channels
 from apc.vary.timing_values import delay_now
 
 Floats = NDArray[np.float64]
 
-PLACE = Place("margins")
+PLACE = SourceLocation("margins")
 
 # Units of a stiffness and of a damping, along an axis or about one, as components write them.
 STIFFNESSES = ("N/m", "kg/s^2")
@@ -115,7 +115,7 @@ class Margins(Result):
 
 
 @part("margins")
-def margins(system: CompiledSystem, *, prepared: Prepared | None = None, quick: bool = False) -> Margins:
+def margins(system: Model, *, prepared: Prepared | None = None, quick: bool = False) -> Margins:
     """Find how much each stiffness, damping and delay may grow, all else as it is.
 
     Parameters
@@ -155,7 +155,7 @@ def margins(system: CompiledSystem, *, prepared: Prepared | None = None, quick: 
         return Margins(result, _notes(result, start))
 
 
-def _loops(system: CompiledSystem, prepared: Prepared, *, most: float) -> list[int]:
+def _loops(system: Model, prepared: Prepared, *, most: float) -> list[int]:
     """Return how many states each loop has, none where what they would take is beyond the most."""
     schedules = prepared.schedules
     events = OF_EVENT * max(len(schedule.events) for schedule in schedules)
@@ -176,7 +176,7 @@ def _notes(rows: Sequence[Margin], start: Prepared | None) -> str:
     return "; ".join(notes)
 
 
-def coupler_parameters(system: CompiledSystem) -> list[Free]:
+def coupler_parameters(system: Model) -> list[ParameterRef]:
     """Return the stiffnesses and dampings of parts without motion of their own, and the named ones."""
     moving = {state.name.rpartition(".")[0] for kind in system.kinds for state in kind.states}
     return [
@@ -186,7 +186,7 @@ def coupler_parameters(system: CompiledSystem) -> list[Free]:
     ]
 
 
-def _delays(system: CompiledSystem) -> list[Free]:
+def _delays(system: Model) -> list[ParameterRef]:
     """Return the timings that a hold or link waits for, or the named time they all follow from.
 
     A link's own delay is not among them where every two groups have one of theirs.
@@ -203,12 +203,12 @@ def _delays(system: CompiledSystem) -> list[Free]:
             waited.append(link.delay)
         waited += [pair.delay for pair in link.delays]
     free = {timing.name for timing in named_times(system) if timing.formula is None}
-    return [Free(name) for name in dict.fromkeys(waited) if name in free]
+    return [ParameterRef(name) for name in dict.fromkeys(waited) if name in free]
 
 
 def _lines(
-    system: CompiledSystem, free: Sequence[Free], prepared: Prepared, *, singly: bool
-) -> Iterator[MatrixLine | PointLine | None]:
+    system: Model, free: Sequence[ParameterRef], prepared: Prepared, *, singly: bool
+) -> Iterator[MatrixPath | PointwisePath | None]:
     """Yield the line of each parameter from its present value on, None where it can't grow.
 
     What a stiffness of 0 leaves free is no relative motion of the scene as it is, but one of every scene in
@@ -223,20 +223,20 @@ def _lines(
             source = RadiusEvaluator(system, (item,), prepared, PLACE, NOMINAL)
             scale = abs(present) or 1.0
             points, least = line_points(system, item, present, min(GROWTH * scale, most), scale)
-            yield PointLine(source, points, least) if points[-1] > present else None
+            yield PointwisePath(source, points, least) if points[-1] > present else None
             continue
         if present:
             assert together is not None, "it is among those that are not 0"
-            whole = MatrixLine(together, prepared, base[base != 0], frees.index(item), present)
+            whole = MatrixPath(together, prepared, base[base != 0], frees.index(item), present)
         else:
-            whole = MatrixLine(
+            whole = MatrixPath(
                 evaluator(system, [item], prepared=prepared), prepared, np.zeros(1), 0, present
             )
         top = min(GROWTH * whole.scale, most)
         yield replace(whole, top=top) if top > present else None
 
 
-def _delay_margin(system: CompiledSystem, free: Free, prepared: Prepared, largest: int) -> Margin | None:
+def _delay_margin(system: Model, free: ParameterRef, prepared: Prepared, largest: int) -> Margin | None:
     """Return the margin of a delay, in a scene whose largest loop has so many states."""
     if len(times_of(system, free.name)) > 1:
         return not_looked(system, free, "groups set their own")
@@ -248,19 +248,19 @@ def _delay_margin(system: CompiledSystem, free: Free, prepared: Prepared, larges
     if largest > MOST_DELAYED and not late:
         return not_looked(system, free, f"{largest:,} states in each order of events")
     try:
-        return _margin(system, free, search(DelayLine(system, free, prepared, now, end), first=True))
+        return _margin(system, free, search(DelayPath(system, free, prepared, now, end), first=True))
     except ApcError as error:
         return not_looked(system, free, error.mistakes[0].what)
 
 
-def not_looked(system: CompiledSystem, free: Free, why: str) -> Margin:
+def not_looked(system: Model, free: ParameterRef, why: str) -> Margin:
     """Return the row of a parameter of which nothing was looked for, and why."""
     present = value_now(system, free)
     unit = unit_of(system, free.name)
     return Margin(free.label, unit, present, None, None, None, None, "", present, why)
 
 
-def _margin(system: CompiledSystem, free: Free, search: Search) -> Margin | None:
+def _margin(system: Model, free: ParameterRef, search: CrossingReport) -> Margin | None:
     """Return how far a parameter may grow by a search, None where nothing depends on it."""
     if not search.enters:
         return None
@@ -283,9 +283,7 @@ def _margin(system: CompiledSystem, free: Free, search: Search) -> Margin | None
     )
 
 
-def network_margins(
-    system: CompiledSystem, prepared: Prepared, nominal: Margins, *, quick: bool = False
-) -> Margins:
+def network_margins(system: Model, prepared: Prepared, nominal: Margins, *, quick: bool = False) -> Margins:
     """Find how much each stiffness, damping, probability and jitter may grow, stable in mean square.
 
     On either side of a margin, by its error, bounds on the growth of second moments decide, or the note says
@@ -333,7 +331,7 @@ def network_margins(
                 rows.append(not_looked(system, item, "from 0 nothing says how far"))
                 continue
             source = RadiusEvaluator(system, (item,), prepared, PLACE)
-            result = search(PointLine(source, points, least), first=True)
+            result = search(PointwisePath(source, points, least), first=True)
             looked += result.looked
             rows.append(_margin(system, item, result))
             if rows[-1] and result.why:
@@ -350,12 +348,12 @@ def network_margins(
     return Margins(tuple(filter(None, rows)), "; ".join(notes))
 
 
-def _grown(system: CompiledSystem, free: Free, scale: float) -> tuple[Floats, float]:
+def _grown(system: Model, free: ParameterRef, scale: float) -> tuple[Floats, float]:
     """Return the values over which a number is looked at in mean square, and the least size of a cell."""
     present, most = value_now(system, free), allowed(system, free)[1]
     if free.name in channel_numbers(system):
         delays = [
-            value_now(system, Free(link.delay))
+            value_now(system, ParameterRef(link.delay))
             for link in system.links
             if link.channel is not None and link.channel.jitter == free.name
         ]

@@ -1,6 +1,6 @@
 """A clock period as the number that varies: which values are analysed, and where the verdict changes.
 
-Takes: a `CompiledSystem` and a timing, or a parameter, that a clock's period depends on.
+Takes: a `Model` and a timing, or a parameter, that a clock's period depends on.
 Gives: `period_pieces`, `PeriodLine`.
 Guarantees: every verdict is an analysis at an exact rational period.
 Does not: give a verdict for periods whose frame with the other clocks is longer than
@@ -26,11 +26,11 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import SourceLocation
 from apc.frame.names import Range
-from apc.vary.crossing import ESTIMATE, PERIOD, Crossing, Stretch, Verdict
-from apc.vary.delays import Piece
+from apc.vary.crossing import ESTIMATE, PERIOD, Crossing, SmoothSegment, Verdict
+from apc.vary.delays import DelaySegment
 from apc.vary.line import JudgedLine, one_by_one, spread
 from apc.vary.timing_values import (
     common_period,
@@ -52,7 +52,7 @@ PERIOD_SPAN = 32
 STRIPS = 32
 
 
-def period_pieces(system: CompiledSystem, axis: Range, place: Place) -> Iterator[Piece]:
+def period_pieces(system: Model, axis: Range, place: SourceLocation) -> Iterator[DelaySegment]:
     """Yield a piece for each of some periods of a range, with ends halfway to its neighbours.
 
     Raises
@@ -64,7 +64,7 @@ def period_pieces(system: CompiledSystem, axis: Range, place: Place) -> Iterator
     values = periods_near(system, axis.free, [axis.low + step * k for k in range(STRIPS + 1)], place)
     middles = [(before + after) / 2 for before, after in itertools.pairwise(values)]
     for value, low, high in zip(values, [axis.low, *middles], [*middles, axis.high], strict=True):
-        yield Piece(low, high, None, system_with_delay(system, axis.free, value))
+        yield DelaySegment(low, high, None, system_with_delay(system, axis.free, value))
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,15 +74,15 @@ class PeriodLine(JudgedLine):
     `decide` gives the verdict of a topology.
     """
 
-    decide: Callable[[CompiledSystem], Verdict]
+    decide: Callable[[Model], Verdict]
     low: Fraction | None
     high: Fraction | None
-    place: Place
+    place: SourceLocation
 
     def _verdict(self, value: Fraction) -> Verdict:
         return self.decide(system_with_delay(self.system, self.free, value))
 
-    def stretches(self) -> Iterator[Stretch]:
+    def stretches(self) -> Iterator[SmoothSegment]:
         """Yield one stretch where all clocks scale with the number, else one for each period."""
         now = delay_now(self.system, self.free)
         low = self.low or min(now, self.high or now) / PERIOD_SPAN
@@ -90,16 +90,18 @@ class PeriodLine(JudgedLine):
         points = spread(float(low), float(high), float(now))
         look = partial(one_by_one, self.judge)
         if is_scaled(self.system, self.free):
-            yield Stretch(low, high, points, float(low), look, self.judge, slow=True)
+            yield SmoothSegment(low, high, points, float(low), look, self.judge, slow=True)
             return
         targets = sorted({low, *map(Fraction, points[1:-1].tolist()), high})
         for at in periods_near(self.system, self.free, targets, self.place):
-            yield Stretch(at, at, np.array([float(at)]), 0.0, partial(self._look, at), self.judge, slow=True)
+            yield SmoothSegment(
+                at, at, np.array([float(at)]), 0.0, partial(self._look, at), self.judge, slow=True
+            )
 
     def _look(self, value: Fraction, _: Floats) -> tuple[Complexes, Complexes]:
         return one_by_one(lambda _: self.judge(value), np.array([float(value)]))
 
-    def change(self, before: Stretch, after: Stretch, *, stable_below: bool) -> Crossing:
+    def change(self, before: SmoothSegment, after: SmoothSegment, *, stable_below: bool) -> Crossing:
         """Return the change between two periods, as near as the frames allow."""
         low, high = before.low, after.low
         unit = common_period(self.system, self.free)

@@ -1,6 +1,6 @@
 """What moves the spectral radius most: its derivative with respect to every parameter.
 
-Takes: a `CompiledSystem`.
+Takes: a `Model`.
 Gives: `Sensitivity`, `Sensitivities`, `sensitivities`, `network_sensitivities`; `varied`, `not_varied`,
 `of_channels`.
 Guarantees: the derivative is that of the motion that decides, whatever is rigid left out, to rounding, which
@@ -24,17 +24,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import analyze, lifted_groups, prepare_at_start
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, SourceLocation
 from apc.compiler.timings import part
 from apc.compiler.words import counted
 from apc.eigen.eigenpairs import driving_parts, eigenpairs
 from apc.eigen.modes import split
 from apc.eigen.spectrum import solve_spectrum
-from apc.frame.display_units import Unit
+from apc.frame.display_units import DisplayUnit
 from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, prepare
-from apc.frame.names import Free, named_times, parameter_of, unit_of, value_now
+from apc.frame.names import ParameterRef, named_times, parameter_of, unit_of, value_now
 from apc.network.nominal import channel_numbers
 from apc.result import Result
 from apc.threads import single_threaded
@@ -42,7 +42,7 @@ from apc.vary.evaluator import evaluator, free_parameters
 from apc.vary.growth import MEAN_SQUARE, NOMINAL, RadiusEvaluator
 
 if TYPE_CHECKING:
-    from apc.moments.network_verdict import Growth
+    from apc.moments.network_verdict import StabilityMeasure
 
 Floats = NDArray[np.float64]
 Places = NDArray[np.intp]
@@ -69,7 +69,7 @@ MOST_VARIED = 60
 # What grows in mean square is called so.
 MOMENTS = "second moments"
 
-PLACE = Place("sensitivities")
+PLACE = SourceLocation("sensitivities")
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +106,7 @@ class Sensitivities(Result):
 
 
 @part("sensitivities")
-def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -> Sensitivities:
+def sensitivities(system: Model, *, prepared: Prepared | None = None) -> Sensitivities:
     """Differentiate the spectral radius with respect to every parameter, as each can be set.
 
     Parameters
@@ -135,10 +135,10 @@ def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -
         most = solve_spectrum(systems, in_balls=False).spectral_radius + SHARED
 
         @cache
-        def clusters_of(*together: Free) -> list[_Cluster] | None:
+        def clusters_of(*together: ParameterRef) -> list[_Cluster] | None:
             return _clusters(system, together, start)
 
-        def frees(*together: Free) -> bool:
+        def frees(*together: ParameterRef) -> bool:
             """Say whether something that is rigid in the scene as it is moves where these vary."""
             return any(np.abs(cluster.values).max() > most for cluster in clusters_of(*together) or ())
 
@@ -196,7 +196,7 @@ def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -
     return Sensitivities(radius, active, tuple(rows), "; ".join(notes))
 
 
-def varied(system: CompiledSystem) -> list[Free]:
+def varied(system: Model) -> list[ParameterRef]:
     """Return the free parameters that are no start values, and no numbers of unreliable links."""
     starts = {state.start for kind in system.kinds for state in kind.states}
     starts |= {start for kind in system.kinds for clock in kind.clocks for start in clock.starts}
@@ -204,7 +204,7 @@ def varied(system: CompiledSystem) -> list[Free]:
     return [free for free in free_parameters(system) if free.name not in kept_out]
 
 
-def _singly(system: CompiledSystem, prepared: Prepared, free: Sequence[Free]) -> Sensitivities:
+def _singly(system: Model, prepared: Prepared, free: Sequence[ParameterRef]) -> Sensitivities:
     """Return the derivatives of a scene's spectral radius by differences of analyses."""
     now = analyze(system, prepared=prepared)
     if not now.modes:
@@ -218,7 +218,7 @@ def _singly(system: CompiledSystem, prepared: Prepared, free: Sequence[Free]) ->
     return _by_differences(system, prepared, free, NOMINAL, now.spectral_radius, active)
 
 
-def network_sensitivities(system: CompiledSystem, prepared: Prepared) -> Sensitivities:
+def network_sensitivities(system: Model, prepared: Prepared) -> Sensitivities:
     """Differentiate what second moments grow by with respect to every parameter, and what links lose by.
 
     Parameters
@@ -243,9 +243,9 @@ def network_sensitivities(system: CompiledSystem, prepared: Prepared) -> Sensiti
 
 
 def _by_differences(
-    system: CompiledSystem,
+    system: Model,
     prepared: Prepared,
-    free: Sequence[Free],
+    free: Sequence[ParameterRef],
     criterion: str,
     radius: float,
     active: tuple[tuple[complex, str], ...],
@@ -272,7 +272,7 @@ def _by_differences(
     return Sensitivities(radius, active, tuple(rows), note)
 
 
-def not_varied(count: int, growth: Growth) -> str:
+def not_varied(count: int, growth: StabilityMeasure) -> str:
     """Return why a scene is not looked at over its network at many values of so many numbers, "" if it is."""
     if count > MOST_VARIED:
         return f"over this network, {count} numbers take too long to vary (apc critical varies one)"
@@ -285,10 +285,10 @@ def not_varied(count: int, growth: Growth) -> str:
     return ""
 
 
-def of_channels(system: CompiledSystem) -> list[Free]:
+def of_channels(system: Model) -> list[ParameterRef]:
     """Return what links lose and delay packets by, where it follows from nothing else."""
     numbers = channel_numbers(system)
-    times = [Free(timing.name) for timing in named_times(system) if timing.formula is None]
+    times = [ParameterRef(timing.name) for timing in named_times(system) if timing.formula is None]
     return [free for free in (*free_parameters(system), *times) if free.name in numbers]
 
 
@@ -307,9 +307,7 @@ class _Cluster:
     condition: float
 
 
-def _rows(
-    system: CompiledSystem, free: Free, cluster: _Cluster, column: int, first: int
-) -> list[Sensitivity]:
+def _rows(system: Model, free: ParameterRef, cluster: _Cluster, column: int, first: int) -> list[Sensitivity]:
     """Return how the magnitudes of a cluster follow one parameter, the fastest first."""
     parameter = parameter_of(system, free)
     moves = np.linalg.eigvals(cluster.rates[column])
@@ -317,7 +315,7 @@ def _rows(
     return [
         Sensitivity(
             parameter=free.label,
-            unit=Unit.of(parameter),
+            unit=DisplayUnit.of(parameter),
             value=parameter.value,
             derivative=rate,
             relative=rate * parameter.value,
@@ -335,7 +333,7 @@ def _defective(cluster: _Cluster) -> str:
     return f"{what} {'share' if many else 'shares'} one motion: there the radius has no derivative"
 
 
-def _clusters(system: CompiledSystem, free: Sequence[Free], prepared: Prepared) -> list[_Cluster] | None:
+def _clusters(system: Model, free: Sequence[ParameterRef], prepared: Prepared) -> list[_Cluster] | None:
     """Return the eigenvalues that share the spectral radius, of each pair one, the largest first.
 
     None where there is no matrix, or no derivative of it.

@@ -1,6 +1,6 @@
 """The values of a time, and the clock periods that make short frames with the other clocks.
 
-Takes: a `CompiledSystem` and a timing, or a parameter that a timing depends on.
+Takes: a `Model` and a timing, or a parameter that a timing depends on.
 Gives: `system_with_delay`, `delay_now`, `timing_slopes`; `reaches_period`, `refuse_phase`, `is_scaled`;
 `nearest_period`, `periods_near`, `period_between`, `common_period`; `MOST_FRAME_TICKS`.
 Guarantees: exact rationals of a second.
@@ -14,11 +14,11 @@ from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from functools import lru_cache
 
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.multiples import common_divisor, common_multiple
 from apc.compiler.words import with_unit
-from apc.frame.names import Free
+from apc.frame.names import ParameterRef
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import resolve, scope_of
 
@@ -34,12 +34,12 @@ SHARES = (Fraction(1, 32), Fraction(1, 4), Fraction(1))
 DIGITS, KEPT = 9, 256
 
 
-def system_with_delay(system: CompiledSystem, free: Free, value: Fraction) -> CompiledSystem:
+def system_with_delay(system: Model, free: ParameterRef, value: Fraction) -> Model:
     """Return the system with another value of what reaches its delays."""
     return apply(system, [Override(free, value)])
 
 
-def delay_now(system: CompiledSystem, free: Free) -> Fraction:
+def delay_now(system: Model, free: ParameterRef) -> Fraction:
     """Return the present value of a timing, or of a parameter that reaches one, exactly."""
     for timing in system.timings:
         if timing.name == free.name:
@@ -48,34 +48,34 @@ def delay_now(system: CompiledSystem, free: Free) -> Fraction:
 
 
 @lru_cache(maxsize=KEPT)
-def timing_slopes(system: CompiledSystem, free: Free) -> Mapping[str, Fraction]:
+def timing_slopes(system: Model, free: ParameterRef) -> Mapping[str, Fraction]:
     """Return how fast each timing follows a parameter or timing, by its name."""
     now = delay_now(system, free)
     here, there = (resolve(system_with_delay(system, free, value)).timings for value in (now, now + STEP))
     return {name: (there[name] - here[name]) / STEP for name in here}
 
 
-def _clock_times(system: CompiledSystem, *, phases: bool) -> set[str]:
+def _clock_times(system: Model, *, phases: bool) -> set[str]:
     return {clock.phase if phases else clock.period for clock in system.clocks}
 
 
-def reaches_period(system: CompiledSystem, free: Free) -> bool:
+def reaches_period(system: Model, free: ParameterRef) -> bool:
     """Return whether the period of some clock is, or depends on, this parameter."""
     return _reaches(system, free, _clock_times(system, phases=False))
 
 
-def _reaches(system: CompiledSystem, free: Free, times: set[str]) -> bool:
+def _reaches(system: Model, free: ParameterRef, times: set[str]) -> bool:
     return free.name in times or free.name in scope_of(system).needed(sorted(times))
 
 
-def refuse_phase(system: CompiledSystem, free: Free, place: Place, *, code: str = "E844") -> None:
+def refuse_phase(system: Model, free: ParameterRef, place: SourceLocation, *, code: str = "E844") -> None:
     """Raise ApcError E844, or another code, for what the phase of a clock depends on, and no period."""
     if _reaches(system, free, _clock_times(system, phases=True)) and not reaches_period(system, free):
         what = f"{free.name} sets the phase of a clock: it can't be varied continuously"
-        raise ApcError(Mistake(code, place, what, hint="apc analyze with --set, one value at a time"))
+        raise ApcError(Diagnostic(code, place, what, hint="apc analyze with --set, one value at a time"))
 
 
-def is_scaled(system: CompiledSystem, free: Free, *, delays: bool = False) -> bool:
+def is_scaled(system: Model, free: ParameterRef, *, delays: bool = False) -> bool:
     """Return whether all periods and phases are proportional to a number; `delays`: all times are."""
     now, timings = delay_now(system, free), resolve(system).timings
     names = _clock_times(system, phases=False) | _clock_times(system, phases=True)
@@ -87,7 +87,7 @@ def is_scaled(system: CompiledSystem, free: Free, *, delays: bool = False) -> bo
     )
 
 
-def _ticks(system: CompiledSystem, free: Free, value: Fraction) -> float:
+def _ticks(system: Model, free: ParameterRef, value: Fraction) -> float:
     """Return how many ticks all clocks have in a frame at a value, infinite where there is no frame."""
     try:
         timings = resolve(system_with_delay(system, free, value)).timings
@@ -112,7 +112,7 @@ def _simplest(low: Fraction, high: Fraction) -> Fraction:
     return whole + 1 / _simplest(1 / (high - whole), 1 / (low - whole))
 
 
-def common_period(system: CompiledSystem, free: Free) -> Fraction:
+def common_period(system: Model, free: ParameterRef) -> Fraction:
     """Return the common divisor of the periods that stay, in seconds: periods are fractions of it."""
     slopes, timings = timing_slopes(system, free), resolve(system).timings
     fixed = [timings[name] for name in _clock_times(system, phases=False) if not slopes[name]]
@@ -120,7 +120,7 @@ def common_period(system: CompiledSystem, free: Free) -> Fraction:
 
 
 def period_between(
-    system: CompiledSystem, free: Free, unit: Fraction, low: Fraction, high: Fraction
+    system: Model, free: ParameterRef, unit: Fraction, low: Fraction, high: Fraction
 ) -> Fraction | None:
     """Return the simplest value strictly between two whose frame is short enough, None if there is none.
 
@@ -138,7 +138,7 @@ def period_between(
 
 
 def long_period_between(
-    system: CompiledSystem, free: Free, unit: Fraction, low: Fraction, high: Fraction
+    system: Model, free: ParameterRef, unit: Fraction, low: Fraction, high: Fraction
 ) -> Fraction | None:
     """Return a value strictly between two whose frame is about as long as allowed, None if there is none.
 
@@ -164,7 +164,7 @@ def long_period_between(
 
 
 @lru_cache(maxsize=KEPT)
-def nearest_period(system: CompiledSystem, free: Free, value: Fraction) -> Fraction:
+def nearest_period(system: Model, free: ParameterRef, value: Fraction) -> Fraction:
     """Return a period near a value, by powers of ten, whose frame is short; any other time as it is."""
     if value <= 0 or not reaches_period(system, free) or is_scaled(system, free):
         return value
@@ -180,7 +180,7 @@ def nearest_period(system: CompiledSystem, free: Free, value: Fraction) -> Fract
 
 
 def periods_near(
-    system: CompiledSystem, free: Free, targets: Sequence[Fraction], place: Place
+    system: Model, free: ParameterRef, targets: Sequence[Fraction], place: SourceLocation
 ) -> list[Fraction]:
     """Return the simplest period near each of some values, and one of a long frame on either side of it.
 
@@ -220,5 +220,5 @@ def periods_near(
             "with the other clocks"
         )
         hint = f"a range about a multiple of {with_unit(f'{float(unit):g}', 's')}"
-        raise ApcError(Mistake("E844", place, what, hint=hint))
+        raise ApcError(Diagnostic("E844", place, what, hint=hint))
     return sorted(found)

@@ -1,7 +1,7 @@
 """Closing the loop of one system for many points at once, and taking its rigid motions out.
 
-Takes: a `ClosedSystem` that stands for all points, and the one-frame maps of its sites at each.
-Gives: `Wiring`, `wire`, `known_by_constants`, `closed_loop`, `reduced`, `relative_at`,
+Takes: a `ClosedLoop` that stands for all points, and the one-frame maps of its sites at each.
+Gives: `LoopStructure`, `wire`, `known_by_constants`, `closed_loop`, `reduced`, `relative_at`,
 `are_rigid`, `site_key`.
 Guarantees: the matrices are those of `closing.close_loop` in relative coordinates, to rounding; where the
 directions are not those of a rigid motion they are NaN.
@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.closing import ClosedSystem, Feedback, close, feedback_of
-from apc.eigen.peers import PeerGroup
+from apc.eigen.closing import ClosedLoop, InterconnectionMatrices, close, feedback_of
+from apc.eigen.peers import PeerClass
 from apc.eigen.relative import Relative, relative, relative_coordinates, relative_places
 from apc.eigen.rigid import RigidModes, find_rigid_modes, rigid_modes_of
 from apc.frame.lift import FrameMap
@@ -37,25 +37,25 @@ NEAR_ONE = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
-class Wiring:
+class LoopStructure:
     """How a closed system's sites hear each other, and which of its coordinates are left.
 
     `rigid` are the rigid motions, `relative` the coordinates that are left.
     """
 
-    system: ClosedSystem
-    feedback: tuple[Feedback, ...]  # one a site, with its radii
+    system: ClosedLoop
+    feedback: tuple[InterconnectionMatrices, ...]  # one a site, with its radii
     rigid: RigidModes
     relative: Relative
     moving: bool  # the directions follow the free parameters, and W with them
 
 
-def site_key(group: PeerGroup) -> tuple[int, int]:
+def site_key(group: PeerClass) -> tuple[int, int]:
     """Return what sites of the same one-frame map have in common: whose site and whose schedule it is."""
     return id(group.site), id(group.schedule)
 
 
-def wire(system: ClosedSystem) -> Wiring:
+def wire(system: ClosedLoop) -> LoopStructure:
     """Take down who hears whom in a closed system, and its rigid motions."""
     feedback = tuple(feedback_of(system, system.layout))
     rigid = rigid_modes_of(system)
@@ -67,11 +67,13 @@ def wire(system: ClosedSystem) -> Wiring:
     return wiring
 
 
-def _without(system: ClosedSystem, feedback: tuple[Feedback, ...], rigid: RigidModes) -> Wiring:
-    return Wiring(system, feedback, rigid, relative_coordinates(rigid.basis), moving=False)
+def _without(
+    system: ClosedLoop, feedback: tuple[InterconnectionMatrices, ...], rigid: RigidModes
+) -> LoopStructure:
+    return LoopStructure(system, feedback, rigid, relative_coordinates(rigid.basis), moving=False)
 
 
-def known_by_constants(wiring: Wiring, there: RigidModes) -> Wiring:
+def known_by_constants(wiring: LoopStructure, there: RigidModes) -> LoopStructure:
     """Return the wiring of directions that follow the parameters, given up for them where they don't.
 
     A held force follows its stiffness, and tells nothing of the motion where that is next to nothing; how far
@@ -97,13 +99,13 @@ def known_by_constants(wiring: Wiring, there: RigidModes) -> Wiring:
     return replace(wiring, relative=relative_coordinates(basis, relative_places(constant)), moving=True)
 
 
-def closed_loop(wiring: Wiring, lifted: Mapping[tuple[int, int], FrameMap]) -> Matrices:
+def closed_loop(wiring: LoopStructure, lifted: Mapping[tuple[int, int], FrameMap]) -> Matrices:
     """Close the loop of one system at all points: its matrices (k, n, n), see `closing.close`."""
     maps = [lifted[site_key(group)] for group in wiring.system.sites]
     return close(maps, [feedback.plain for feedback in wiring.feedback], wiring.system.layout).matrix
 
 
-def reduced(wiring: Wiring, matrix: Matrices, count: int) -> Matrices:
+def reduced(wiring: LoopStructure, matrix: Matrices, count: int) -> Matrices:
     """Take the rigid motions out; NaN where the directions are not rigid."""
     at, sound = relative_at(wiring, matrix)
     within = relative(matrix, at)
@@ -112,7 +114,7 @@ def reduced(wiring: Wiring, matrix: Matrices, count: int) -> Matrices:
     return np.broadcast_to(values, (count, *values.shape[1:])).copy() if len(values) < count else values
 
 
-def relative_at(wiring: Wiring, matrix: Matrices) -> tuple[Relative, NDArray[np.bool_]]:
+def relative_at(wiring: LoopStructure, matrix: Matrices) -> tuple[Relative, NDArray[np.bool_]]:
     """Return the relative coordinates at each point, and whether they are relative to rigid motions.
 
     Directions that follow the parameters, as where two forces hold each other, solve M V = V with V_p = 1:
@@ -137,7 +139,7 @@ def relative_at(wiring: Wiring, matrix: Matrices) -> tuple[Relative, NDArray[np.
     return Relative(held, rest, weights, nothing), np.asarray(still.all(axis=(1, 2)))
 
 
-def are_rigid(wiring: Wiring, matrix: Floats) -> NDArray[np.bool_]:
+def are_rigid(wiring: LoopStructure, matrix: Floats) -> NDArray[np.bool_]:
     """Say of each matrix (k, n, n) whether the rigid motions V move by themselves, M V = V C, C_ii = 1."""
     basis = wiring.rigid.basis
     held = wiring.relative.held

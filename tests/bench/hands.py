@@ -35,7 +35,7 @@ Curves = Mapping[
 ]  # by the scheme and what is said of it, a value for each of PEERS
 
 
-def scene(text: str, peers: int, stiffness: float) -> apc.CompiledSystem:
+def scene(text: str, peers: int, stiffness: float) -> apc.Model:
     """Return the paper's scene of so many users."""
     pairs = ("count: 3", f"count: {peers}"), ("stiffness: 500", f"stiffness: {stiffness}")
     return compiled(replaced(text, *pairs))

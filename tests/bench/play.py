@@ -12,12 +12,12 @@ from fractions import Fraction
 from time import process_time
 
 import apc
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.frame.exchange import build_exchange
 from apc.frame.parameters import resolve
 from apc.loop.beside import compare_run
-from apc.loop.peer import Loop
-from apc.loop.run import Run
+from apc.loop.peer import PeerLoop
+from apc.loop.run import RealtimeRun
 from apc.loop.start import Play, play_all
 from apc.present.loop_output import ticks_text
 from apc.simulation.rows_in_time import pushes
@@ -35,13 +35,13 @@ MOST_APART = 1e-9  # of forces in N, and of the rest in its own unit
 TICK = 1e-3  # seconds of a haptic loop's period
 
 
-def work_of_a_tick(system: CompiledSystem) -> tuple[float, int]:
+def work_of_a_tick(system: Model) -> tuple[float, int]:
     """Return the processor time of one instant of the first peer, in s, and how many states it has."""
     exchange = build_exchange(system, resolve(system).timings)
     names = [exchange.peer_name(one) for one in range(exchange.peers)]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listening:
         addresses = {name: ("127.0.0.1", at + 1) for at, name in enumerate(names[1:])}
-        loop = Loop(system, names[0], listening, addresses, digest=bytes(8), duration=Fraction(1))
+        loop = PeerLoop(system, names[0], listening, addresses, digest=bytes(8), duration=Fraction(1))
         given = pushes(loop.simulation, 0)
         loop.player.warm_up()
         taken = []
@@ -61,7 +61,7 @@ def main() -> None:
         seconds, system = 3 if given.quick else given.seconds, compiled(MOVED)
         how = Play(duration=Fraction(seconds), secret=bytes(16), emulate=True, seed=None, patience=60.0)
         peers = [part.run for part in play_all(system, how) if part.run is not None]
-        run = Run("", system, tuple(sorted(peers, key=lambda one: one.number)))
+        run = RealtimeRun("", system, tuple(sorted(peers, key=lambda one: one.number)))
         beside = compare_run(run)
         print(f"three peers, {seconds} s, lan: 8 ms, jitter 4 ms, loss 5 %, in the sender; sealed packets")
         print("\n".join(ticks_text(beside.ticks)))

@@ -77,7 +77,7 @@ def sides_by_hand(text: str, x: float) -> set[tuple[float, float]]:
     return found
 
 
-def model(python: str, text: str, x: float, folder: Path) -> apc.CompiledSystem:
+def model(python: str, text: str, x: float, folder: Path) -> apc.Model:
     """Return the compiled topology."""
     z, w = "sample(flange.x)/L", "sample(der(flange.x))*T/L"
     force = text.replace("z", f"({z})").replace("w", f"({w})")

@@ -23,7 +23,7 @@ import flint
 from apc.analysis.analysis import Analysis, analyze
 from apc.answer import sensitivities_of
 from apc.benchmark.timing import timed
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.compiler.components.component_library import Library
 from apc.compiler.errors import ApcError
 from apc.eigen.balls import precision
@@ -75,7 +75,7 @@ class Tally:
     wrong: list[str] = field(default_factory=list)
 
 
-def truth(system: CompiledSystem) -> tuple[flint.arb, int]:
+def truth(system: Model) -> tuple[flint.arb, int]:
     """Return the radius without eigenvalues that are 1, and how many these are (a drift counts twice)."""
     classes = classes_of(system)
     found = truth_of([(count, eigenvalues(one)) for _, count, one in frame_matrices(system, classes)])
@@ -106,7 +106,7 @@ def check(found: Analysis, radius: flint.arb, rigid: int) -> str:
     return "" if as_many or not found.stable else f"{found.rigid_modes} rigid, truth {rigid}"
 
 
-def _looked_into(system: CompiledSystem, found: Analysis) -> list[str]:
+def _looked_into(system: Model, found: Analysis) -> list[str]:
     """Return what is wrong with what an analysis tells beside its verdict."""
     if found.stable is None and found.spectral_radius == 1:
         return []  # a motion that grows with t² leaves an eigenvalue 1, which the reference takes for a translation
@@ -142,7 +142,7 @@ def run(points: int, *, seed: int = 0, methods: Sequence[str] = ("auto",), draws
     return tally
 
 
-def _analysed(system: CompiledSystem, method: str, due: str, look: bool, tally: Tally) -> list[str]:
+def _analysed(system: Model, method: str, due: str, look: bool, tally: Tally) -> list[str]:
     """Analyse a scene, take it down in the tally, and return what is wrong; `due` is the error it must give."""
     try:
         taken, found = timed(partial(analyze, system, method=method))

@@ -20,7 +20,7 @@ import flint
 import numpy as np
 
 from apc.analysis.analysis import Analysis, analyze
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.eigen.balls import precision
 from apc.frame.instance import prepare
 from apc.frame.names import find, parameter_of
@@ -57,7 +57,7 @@ def scene(generator: random.Random) -> str:
     return next(text for text in texts if not any(name in text for name in own))
 
 
-def check_sensitivities(system: CompiledSystem, found: Analysis | Sensitivities) -> str:
+def check_sensitivities(system: Model, found: Analysis | Sensitivities) -> str:
     """Return what is wrong with the derivatives of a scene's spectral radius, "" if nothing is.
 
     Of an analysis the radius is compared with theirs.
@@ -89,7 +89,7 @@ def check_sensitivities(system: CompiledSystem, found: Analysis | Sensitivities)
     return ""
 
 
-def _matrices(system: CompiledSystem) -> list[Any]:
+def _matrices(system: Model) -> list[Any]:
     """Return the frame matrices of all closed systems."""
     frame = prepare(system).schedules[0].frame_s
     return [_whole_map(one, frame) for one in _happenings(system)]
@@ -150,7 +150,7 @@ def _scaled(matrix: Any) -> Any:
     return matrix * (flint.acb(1) / flint.acb(size))
 
 
-def _slopes(system: CompiledSystem, here: Sequence[Any], name: str) -> list[Any]:
+def _slopes(system: Model, here: Sequence[Any], name: str) -> list[Any]:
     """Return the derivatives of all frame matrices by a parameter, set as `--set` does."""
     free = find(system, name)
     value = parameter_of(system, free).value
@@ -199,7 +199,7 @@ def check_frequencies(found: Analysis) -> str:
     return ""
 
 
-def _happenings(system: CompiledSystem) -> Iterator[Happening]:
+def _happenings(system: Model) -> Iterator[Happening]:
     """Yield the common motion, and each class's differences, as peers to follow."""
     classes = classes_of(system)
     sites = build_peers(system, classes.peers, classes.groups, linear=True)

@@ -17,8 +17,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
-from apc.compiler.compiled import CompiledSystem
-from apc.frame.names import Free
+from apc.compiler.compiled import Model
+from apc.frame.names import ParameterRef
 from apc.frame.overrides import Override
 from tests.fuzz.grammar import grown, rules_of
 
@@ -300,12 +300,12 @@ def _rows(generator: random.Random) -> str:
     return f"arcs: [{', '.join(arcs)}]"
 
 
-def numbers(generator: random.Random, shape: Shape, system: CompiledSystem) -> list[Override]:
+def numbers(generator: random.Random, shape: Shape, system: Model) -> list[Override]:
     """Return numbers at random: a decade is as likely as the next."""
     known = {parameter.name for parameter in system.parameters}
     values = []
     for name, (low, high, zero) in shape.ranges.items():
         value = 0.0 if generator.random() < zero else 10 ** generator.uniform(low, high)
         if name in known:
-            values.append(Override(Free(name), Fraction(value)))
+            values.append(Override(ParameterRef(name), Fraction(value)))
     return values

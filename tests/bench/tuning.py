@@ -20,7 +20,7 @@ FREE = {K: (10.0, 5000.0), B: (0.0, 50.0)}
 SCENES = {"average": AVERAGE, "mesh": MESH}
 
 
-def radii(model: apc.CompiledSystem, spread: float, counts: range, masses: int) -> Callable[..., np.ndarray]:
+def radii(model: apc.Model, spread: float, counts: range, masses: int) -> Callable[..., np.ndarray]:
     """Return what gives the spectral radii (counts, masses) with gains (2,)."""
     mass = {MASS: 0.1 * np.linspace(1 - spread, 1 + spread, masses)}
 

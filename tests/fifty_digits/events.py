@@ -1,6 +1,6 @@
 """Peers followed event by event, over exact numbers and balls.
 
-Takes: a `CompiledSystem`.
+Takes: a `Model`.
 Gives: `Peer`, `build_peers`; `Happening`, `Play`; `refusal`, `ticks_between`.
 Guarantees: shares with the analysis and the simulation what says what the scene is, and nothing that says
 what it does: no Jacobian of theirs, no schedule, no lifted map, no mode. Shared are the compiled functions;
@@ -28,7 +28,7 @@ import casadi
 import flint
 import numpy as np
 
-from apc.compiler.compiled import CompiledSystem, Kind
+from apc.compiler.compiled import Model, PeerType
 from apc.compiler.interpolation import jacobian
 from apc.eigen.balls import rational_ball
 from apc.frame.exact import evaluate_exact, is_rational
@@ -46,7 +46,7 @@ class Peer:
     n_u + 1), exact. `back` counts the ticks kept of each clock, `sent_back` the packets of each link.
     """
 
-    kind: Kind
+    kind: PeerType
     group: int
     ticks: tuple[Callable[..., list[Number]], ...]
     sends: tuple[Callable[..., list[Number]], ...]
@@ -82,7 +82,7 @@ class Play:
     packets: list[list[list[tuple[Fraction, list[Number]]]]]
 
 
-def refusal(system: CompiledSystem, *, in_time: bool) -> str:
+def refusal(system: Model, *, in_time: bool) -> str:
     """Say why there is no reference, "" if there is one.
 
     Parameters
@@ -201,7 +201,7 @@ def _slopes(
     return lambda time, *parts: [sum((parts[i][j] * k for i, j, k in row), 0) for row in rows]
 
 
-def _rate(kind: Kind, parameters: Sequence[Fraction], *, linear: bool) -> Any:
+def _rate(kind: PeerType, parameters: Sequence[Fraction], *, linear: bool) -> Any:
     """Return [A B c; 0 0 0] of the continuous equations, exact; c is left out when `linear`."""
     n_x, n_u = len(kind.states), len(kind.holds)
     symbols = kind.derivative.sx_in()
@@ -225,9 +225,7 @@ def _rationals(rows: Sequence[Sequence[Fraction]]) -> Any:
     return flint.fmpq_mat(len(rows), len(rows), entries)
 
 
-def build_peers(
-    system: CompiledSystem, peers: Sequence[int], groups: Sequence[int], *, linear: bool
-) -> list[Peer]:
+def build_peers(system: Model, peers: Sequence[int], groups: Sequence[int], *, linear: bool) -> list[Peer]:
     """Build some peers, at the present precision.
 
     Parameters
@@ -296,7 +294,7 @@ def build_peers(
     return found
 
 
-def _delays(system: CompiledSystem, name: str) -> list[str]:
+def _delays(system: Model, name: str) -> list[str]:
     """Return the timings of all delays of a link."""
     link = next(one for one in system.links if one.name == name)
     return [link.delay, *(pair.delay for pair in link.delays)]
@@ -305,7 +303,7 @@ def _delays(system: CompiledSystem, name: str) -> list[str]:
 class Happening:
     """Some peers and who hears whom among them; what happens when."""
 
-    def __init__(self, system: CompiledSystem, sites: Sequence[Peer], whom: Whom) -> None:
+    def __init__(self, system: Model, sites: Sequence[Peer], whom: Whom) -> None:
         self.sites, self.whom = sites, whom
         self.seconds = resolve(system).timings
         clocks = {clock.name: clock for clock in system.clocks}

@@ -1,6 +1,6 @@
 """What a scene does to fifty digits, whatever method is measured against it.
 
-Takes: a `CompiledSystem`.
+Takes: a `Model`.
 Gives: `Classes`, `classes_of`; `frame_matrices`, `eigenvalues`, `Truth`, `spectral_truth`; `exact_course`.
 Guarantees: digits that are not certain are not given.
 Does not: serve every scene (see `bench.events.refusal`).
@@ -16,7 +16,7 @@ from typing import Any
 import flint
 import numpy as np
 
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.compiler.weights import exact_weight
 from apc.eigen.balls import precision, rational_ball
 from apc.frame.exchange import arcs
@@ -54,7 +54,7 @@ class Classes:
     weights: Mapping[str, tuple[tuple[Fraction, ...], ...]]
 
 
-def classes_of(system: CompiledSystem) -> Classes:
+def classes_of(system: Model) -> Classes:
     """Find the peers that can change places: equal ones on complete graphs and stars, else none."""
     rows = resolve(system).rows
     shapes = {link.graph.shape for link in system.links}
@@ -91,7 +91,7 @@ def classes_of(system: CompiledSystem) -> Classes:
     )
 
 
-def frame_matrices(system: CompiledSystem, classes: Classes) -> list[tuple[str, int, Any]]:
+def frame_matrices(system: Model, classes: Classes) -> list[tuple[str, int, Any]]:
     """Return the one-frame maps of the common motion and of each class's differences.
 
     Each is (name, how often the whole holds it, `flint.arb_mat`), at the present precision. Where a class of
@@ -228,7 +228,7 @@ class Truth:
             return str(self.radius.str(DIGITS, radius=False))
 
 
-def spectral_truth(system: CompiledSystem) -> Truth | str:
+def spectral_truth(system: Model) -> Truth | str:
     """Return the truth about one frame of a scene, or why there is none.
 
     Two precisions have to agree on the digits.
@@ -272,7 +272,7 @@ def _agree(one: Any, other: Any) -> bool:
     return bool(apart <= size * flint.arb(10) ** (-DIGITS)) or bool(size < flint.arb(10) ** (-DIGITS))
 
 
-def exact_course(system: CompiledSystem, duration: Fraction) -> tuple[tuple[str, ...], Any] | str:
+def exact_course(system: Model, duration: Fraction) -> tuple[tuple[str, ...], Any] | str:
     """Return the continuous states of all peers at every tick of the fastest clock, or why they can't be had.
 
     Parameters
@@ -300,7 +300,7 @@ def exact_course(system: CompiledSystem, duration: Fraction) -> tuple[tuple[str,
     return f"not certain to {DIGITS} digits at {PRECISIONS[-1]} bits"
 
 
-def _course(system: CompiledSystem, duration: Fraction) -> tuple[tuple[str, ...], list[list[Any]]]:
+def _course(system: Model, duration: Fraction) -> tuple[tuple[str, ...], list[list[Any]]]:
     """Play a scene from time 0 and keep the states at the ticks."""
     whole = _everybody(system)
     sites = build_peers(system, whole.peers, whole.groups, linear=False)
@@ -343,7 +343,7 @@ def _remembered(clock: Any, start: Sequence[Fraction]) -> list[Number]:
     return values
 
 
-def _everybody(system: CompiledSystem) -> Classes:
+def _everybody(system: Model) -> Classes:
     """Return every peer as a class of its own."""
     groups = tuple(place for place, group in enumerate(system.groups) for _ in range(group.count))
     n = len(groups)

@@ -35,7 +35,7 @@ from apc.compiler.pipeline import compile_topology
 from apc.compiler.store import model_of
 from apc.inputs import load_fresh
 from apc.loop.beside import compare_run
-from apc.loop.peer import Loop
+from apc.loop.peer import PeerLoop
 from apc.loop.run import run_of, write_run
 from apc.loop.run_folder import read_run
 from apc.processes import digest_of
@@ -245,7 +245,7 @@ def recorded() -> dict[str, bytes]:
         for one in sockets.values():
             one.bind(("127.0.0.1", 0))
         loops = [
-            Loop(system, peer, sockets[peer], others, digest=digest_of(system), duration=Fraction(1, 20))
+            PeerLoop(system, peer, sockets[peer], others, digest=digest_of(system), duration=Fraction(1, 20))
             for peer in names
             for others in [{one: to.getsockname() for one, to in sockets.items() if one != peer}]
         ]

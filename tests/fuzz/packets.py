@@ -13,9 +13,9 @@ from collections.abc import Callable
 
 import pytest
 
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.loop.packets import ANSWER, DATA, HELLO, Address, Hello, Post
-from apc.loop.peer import Loop
+from apc.loop.peer import PeerLoop
 from tests.fuzz.inputs import mutated
 from tests.surfaces.wire import OWN, SOON, Other, Wire, loop_at, send_packets
 
@@ -25,7 +25,7 @@ EXTREME = (0, 1, -1, 2**31, 2**61 - 1, 1 - 2**61, 2**63 - 1, -(2**63))
 Forgery = tuple[bytes, Address]
 
 
-def run_packets(system: CompiledSystem, count: int, seed: int) -> tuple[list[str], Counter[str]]:
+def run_packets(system: Model, count: int, seed: int) -> tuple[list[str], Counter[str]]:
     """Give a peer so many forged datagrams, in meeting the others and in playing with them.
 
     Returns
@@ -56,7 +56,7 @@ def run_packets(system: CompiledSystem, count: int, seed: int) -> tuple[list[str
 class _Scene:
     """A peer that plays with two others: `given` are the datagrams that it took from them."""
 
-    def __init__(self, wire: Wire, loop: Loop, others: list[Other]) -> None:
+    def __init__(self, wire: Wire, loop: PeerLoop, others: list[Other]) -> None:
         self.wire, self.loop, self.others = wire, loop, others
         self.given: list[Forgery] = []
 
@@ -67,7 +67,7 @@ class _Scene:
         return kept, dict(loop.post.nonces), dict(loop.post.keys), dict(loop.offsets), loop.began, loop.begins
 
 
-def _met(patch: pytest.MonkeyPatch, system: CompiledSystem) -> _Scene:
+def _met(patch: pytest.MonkeyPatch, system: Model) -> _Scene:
     wire = Wire(patch)
     loop = loop_at(wire, system, DIGEST, SECRET)
     others = [Other(wire, number, DIGEST, SECRET) for number in (1, 2)]

@@ -30,7 +30,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 import apc
-from apc.compiler.errors import ApcError, Mistake
+from apc.compiler.errors import ApcError, Diagnostic
 from apc.compiler.pipeline import run_stages
 from tests.fuzz.inputs import MODELS, PLAYED, SENTINEL, TOPOLOGY, Input, make_input
 from tests.fuzz.models import FORGERIES, Forgery
@@ -329,7 +329,7 @@ def _shape(sentence: str) -> str:
     return " ".join(re.sub(r"[^a-z ,']+", "_", sentence).split()[:5])
 
 
-def _fault_in(mistake: Mistake, texts: dict[str, list[bytes]]) -> str:
+def _fault_in(mistake: Diagnostic, texts: dict[str, list[bytes]]) -> str:
     sentence, place = mistake.sentence, mistake.place
     if not re.fullmatch(r"E\d{3}", mistake.code):
         return "no code"

@@ -15,10 +15,10 @@ import pytest
 
 import apc
 from apc.exports.c_text import driver, header, source
-from apc.exports.peer_step import Peer, peer_of
+from apc.exports.peer_step import ExportedPeer, peer_of
 from apc.network.channel import PacketSource, channel_law
 from apc.simulation.settings import DEFAULT, parse_method
-from apc.simulation.simulation import Plan, plan_of
+from apc.simulation.simulation import SimulationPlan, plan_of
 from tests.lossy import effective
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
@@ -33,7 +33,7 @@ def compiler() -> str:
     return found or pytest.skip("there is no C compiler")
 
 
-def build(peer: Peer, folder: Path, options: Sequence[str] = SANITIZED) -> Path:
+def build(peer: ExportedPeer, folder: Path, options: Sequence[str] = SANITIZED) -> Path:
     """Return the driver of a peer, compiled."""
     texts = {
         f"{peer.identifier}.h": header(peer),
@@ -53,14 +53,14 @@ def build(peer: Peer, folder: Path, options: Sequence[str] = SANITIZED) -> Path:
 class Running:
     """A peer's process; what it said last, by name."""
 
-    peer: Peer
+    peer: ExportedPeer
     process: subprocess.Popen[str]
     names: tuple[str, ...]
     at: int = 0
     turns: itertools.cycle[int] | None = None
 
     @classmethod
-    def started(cls, peer: Peer, folder: Path) -> Running:
+    def started(cls, peer: ExportedPeer, folder: Path) -> Running:
         names = ["time", *(one.name for one in peer.forces.values())]
         for line in peer.lines:
             if line.sending >= 0:
@@ -92,7 +92,7 @@ class Running:
 
 
 def differences(
-    system: apc.CompiledSystem, folder: Path, *, duration: str, method: str = "", device: str | None = None
+    system: apc.Model, folder: Path, *, duration: str, method: str = "", device: str | None = None
 ) -> dict[str, tuple[float, float]]:
     """Play a scene, and its peers in C with the devices' motion and the packets' arrivals of that run.
 
@@ -135,7 +135,7 @@ def differences(
 class _Network:
     """All packets that were sent, and which of them each peer hears."""
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: SimulationPlan) -> None:
         self.plan, self.sent = plan, dict[tuple[str, int, int], Mapping[str, float]]()
         self.quantum = plan.schedules[0].quantum
         timings = plan.numbers.timings
@@ -155,14 +155,14 @@ class _Network:
                 taken = PacketSource(law, name, [way], seed=plan.system.experiment.seed).take(MOST_PACKETS)
                 self.late[(name, *way)] = taken[0].tolist()
 
-    def send(self, peer: Peer, at: int, said: Mapping[str, float]) -> None:
+    def send(self, peer: ExportedPeer, at: int, said: Mapping[str, float]) -> None:
         for line in peer.lines:
             if line.sending >= 0 and said[f"{line.link} sent"]:
                 period, phase = self.grid[line.link]
                 packet = {one: said[f"{line.link} {one}"] for one in line.channels}
                 self.sent[line.link, peer.number, (at - phase) // period] = packet
 
-    def heard(self, peer: Peer, at: int) -> list[float]:
+    def heard(self, peer: ExportedPeer, at: int) -> list[float]:
         """Return the numbers that are heard at an instant, in the driver's order."""
         found: list[float] = []
         exchange, timings = self.plan.exchange, self.plan.numbers.timings

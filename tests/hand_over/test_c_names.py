@@ -16,7 +16,7 @@ from apc.exports.c_text import driver, header, source
 from apc.exports.code import scene_unit
 from apc.exports.fmu import OPTIONS
 from apc.exports.identifiers import identifier, prefixed
-from apc.exports.peer_step import Peer, peer_of
+from apc.exports.peer_step import ExportedPeer, peer_of
 from apc.simulation.settings import DEFAULT
 from apc.simulation.simulation import plan_of
 from tests.hand_over.in_c import compiler
@@ -75,13 +75,13 @@ def topology(links: list[str], groups: list[str], clocks: tuple[str, str], masse
 
 
 @functools.cache
-def hostile() -> apc.CompiledSystem:
+def hostile() -> apc.Model:
     """Return a model that has all the names."""
     links = [name for name in NAMES if name not in TAKEN]
     return compiled(topology(links, TAKEN[4:], (TAKEN[0], TAKEN[1]), (TAKEN[2], TAKEN[3])))
 
 
-def compile_all(peer: Peer, folder: Path) -> None:
+def compile_all(peer: ExportedPeer, folder: Path) -> None:
     """Compile a peer as C99 and gnu17, and link it with a program of C++17 that calls all its functions."""
     name = peer.identifier
     texts = {
@@ -122,7 +122,7 @@ def test_links_of_any_name_compile_as_c_and_cpp(tmp_path: Path) -> None:
     compile_all(peer_of(plan_of(hostile(), DEFAULT), 0, DEFAULT, device=None), tmp_path)
 
 
-def compile_fmu(system: apc.CompiledSystem, folder: Path, peer: str = "") -> None:
+def compile_fmu(system: apc.Model, folder: Path, peer: str = "") -> None:
     unit = scene_unit(system, peer=peer)
     for file, text in unit.texts.items():
         (folder / file).write_text(text, encoding="ascii")

@@ -18,7 +18,7 @@ import apc
 from apc.__main__ import run
 from apc.compiler.errors import ApcError
 from apc.exports.code import scene_unit
-from apc.exports.fmu import Unit, write_fmu
+from apc.exports.fmu import FmuContent, write_fmu
 from tests.hand_over.in_c import STRICT, compiler
 from tests.hand_over.test_c import BENT, INSIDE, LOSSY, LOSSY_HOLD, MIXED, MOVED, PAIRS, PAPER
 from tests.topologies import AVERAGE, compiled, replaced
@@ -54,13 +54,13 @@ def fmpy() -> Any:
     return pytest.importorskip("fmpy.validation", reason="FMPy is not installed")
 
 
-def written(text: str, folder: Path, *, peer: str = "", method: str = "") -> tuple[Path, Unit]:
+def written(text: str, folder: Path, *, peer: str = "", method: str = "") -> tuple[Path, FmuContent]:
     unit = scene_unit(compiled(text), peer=peer, method=method)
     write_fmu(path := folder / f"{unit.scene.name}.fmu", unit)
     return path, unit
 
 
-def gap(system: apc.CompiledSystem, path: Path, unit: Unit, method: str = "", seconds: float = 0.5) -> float:
+def gap(system: apc.Model, path: Path, unit: FmuContent, method: str = "", seconds: float = 0.5) -> float:
     """Return how far what FMPy plays is from what `simulate` plays, of the largest value."""
     import fmpy as player
 

@@ -60,7 +60,7 @@ links: {lan: {clock: network, delay: 8 ms}}
 """
 
 
-def worst(system: apc.CompiledSystem, seconds: float, method: str | None = None) -> float:
+def worst(system: apc.Model, seconds: float, method: str | None = None) -> float:
     """Play a scene by Rumoca and by apc; return how far states are apart, of the largest of each kind."""
     rumoca = import_module("rumoca")
     made = modelica(system)

@@ -48,12 +48,12 @@ TEXTS = {"average": AVERAGE, "mesh": MESH, "late": LATE}
 EVERY = (*TEXTS, *NAMES)
 
 
-def made(name: str) -> apc.CompiledSystem:
+def made(name: str) -> apc.Model:
     return compiled(TEXTS[name]) if name in TEXTS else shipped(name)
 
 
 @functools.cache
-def shipped(name: str) -> apc.CompiledSystem:
+def shipped(name: str) -> apc.Model:
     return apc.compile(SCENES / f"{name}.yaml")
 
 
@@ -62,7 +62,7 @@ def magnitudes(matrix: Floats) -> Floats:
     return np.sort(np.abs(np.linalg.eigvals(matrix)))[::-1]
 
 
-def cuts(system: apc.CompiledSystem) -> list[str]:
+def cuts(system: apc.Model) -> list[str]:
     """Return all that a scene can be cut at."""
     forces = {hold.name.rpartition(".")[0] for kind in system.kinds for hold in kind.holds}
     return [*(link.name for link in system.links), *sorted(forces)]

@@ -7,7 +7,7 @@ import math
 import pytest
 
 import apc
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from tests.topologies import AVERAGE, SCENES, compiled, replaced
 
@@ -17,7 +17,7 @@ TEXT = {
 }
 
 
-def experiment(name: str, *pairs: tuple[str, str]) -> CompiledSystem:
+def experiment(name: str, *pairs: tuple[str, str]) -> Model:
     return compiled(replaced(TEXT[name], *pairs))
 
 

@@ -14,24 +14,24 @@ import pytest
 
 import apc
 from apc.__main__ import run
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.eigen.dissipation import least_real, peak_gain
 from apc.frame.devices import with_hands
-from apc.hands.passivity import STABLE, UNSTABLE, PassiveHands, passive_hands
+from apc.hands.passivity import STABLE, UNSTABLE, AbsoluteStability, passive_hands
 from tests.topologies import AVERAGE, MESH, ROOT, SCENES, compiled, replaced, wall
 from tests.truths import LIBRARY
 
 PULL = "coordination.stiffness"
 
 
-def users(count: int, stiffness: float, text: str = AVERAGE, *changes: tuple[str, str]) -> CompiledSystem:
+def users(count: int, stiffness: float, text: str = AVERAGE, *changes: tuple[str, str]) -> Model:
     """Return the paper's scene of so many users."""
     own = ("count: 3", f"count: {count}"), ("stiffness: 500", f"stiffness: {stiffness}")
     return compiled(replaced(text, *own, *changes))
 
 
-def sampled_wall(ticks: float, stiffness: float = 800) -> CompiledSystem:
+def sampled_wall(ticks: float, stiffness: float = 800) -> Model:
     """Return a device on a fixed spring whose force is so many ticks of 1 ms late."""
     return compiled(
         "topology: wall\nclocks: {tick: 1 ms}\npeers: {user: {count: 1}}\n"
@@ -60,7 +60,7 @@ def half_a_tick_later(ticks: int) -> float:
         *((wall(1.0, 0.8, 0.0, 500.0, virtual), 0.25 + virtual) for virtual in (0.0, 0.1, 0.3, 0.7)),
     ],
 )
-def test_a_wall_needs_the_damping_of_its_closed_form(system: CompiledSystem, needed: float) -> None:
+def test_a_wall_needs_the_damping_of_its_closed_form(system: Model, needed: float) -> None:
     (mode,) = apc.passive_hands(system).modes
     assert mode.needed == pytest.approx(needed, rel=1e-9)
     assert mode.passive is (needed < mode.damping)
@@ -94,7 +94,7 @@ def test_damping_that_an_independent_program_found(
     assert found.stable is False and found.proof
 
 
-def random_users(luck: np.random.Generator) -> CompiledSystem:
+def random_users(luck: np.random.Generator) -> Model:
     """Return a few users with random numbers, delays and groups."""
 
     def of(low: float, high: float) -> str:
@@ -123,14 +123,14 @@ def random_users(luck: np.random.Generator) -> CompiledSystem:
     )
 
 
-def shaken(system: CompiledSystem, hands: np.ndarray) -> bool:
+def shaken(system: Model, hands: np.ndarray) -> bool:
     """Say whether a scene is unstable with any of these (mass, damping, stiffness) at every device."""
     names = ("hand.mass", "hand.damping", "hand.stiffness")
     many = apc.analyze_many(apc.with_hands(system, "held"), dict(zip(names, hands.T, strict=True)))
     return bool((many.stable == 0).any())
 
 
-def tuned(found: PassiveHands) -> np.ndarray:
+def tuned(found: AbsoluteStability) -> np.ndarray:
     """Return heavy masses on springs which sway by themselves at the frequencies told."""
     hertz = [one.frequency_hz for one in found.modes if one.passive is False and one.frequency_hz]
     each = itertools.product((1000.0, 300.0, 10.0, 1.0, 0.1), (0.7, 0.99, 1.0, 1.01), hertz)
@@ -160,26 +160,26 @@ def test_no_passive_hand_shakes_what_is_called_passive_and_a_tuned_one_what_is_n
     assert struck >= 0.7 * tried  # some need more than a mass and a spring
 
 
-def by_critical(system: CompiledSystem, limit: float) -> None:
+def by_critical(system: Model, limit: float) -> None:
     (crossing,) = apc.critical(system, PULL, criterion="passive").crossings
     assert crossing.value == pytest.approx(limit, rel=5e-7)
     assert crossing.error < 3e-9 * limit
     assert crossing.proof == "what hands can draw bounded on either side"
 
 
-def by_certificate(system: CompiledSystem, limit: float) -> None:
+def by_certificate(system: Model, limit: float) -> None:
     for value, stable in ((limit - 1e-3, True), (limit + 1e-3, False)):
         at = apc.set_parameters(system, {PULL: f"{value!r} N/m"})
         found = passive_hands(at, certify=True)
         assert (found.stable, found.proof) == (stable, "proved by floats whose every rounding is bounded")
 
 
-def by_sweep(system: CompiledSystem, limit: float) -> None:
+def by_sweep(system: Model, limit: float) -> None:
     found = apc.sweep(system, {PULL: f"{limit - 1e-3},{limit + 1e-3} N/m"}, criterion="passive", jobs=1)
     assert found.column("verdict").tolist() == [STABLE, UNSTABLE]
 
 
-def by_region(system: CompiledSystem, limit: float) -> None:
+def by_region(system: Model, limit: float) -> None:
     """Also from where nothing holds the copies, and there is no map."""
     x, y = "contact.stiffness=0 N/m:1200 N/m", f"{PULL}=0 N/m:600 N/m"
     found = apc.region(system, x=x, y=y, criterion="passive")
@@ -190,7 +190,7 @@ def by_region(system: CompiledSystem, limit: float) -> None:
 @pytest.mark.few(2)
 @pytest.mark.parametrize("way", [by_critical, by_certificate, by_sweep, by_region])
 def test_every_way_to_ask_finds_what_an_independent_program_found(
-    way: Callable[[CompiledSystem, float], None],
+    way: Callable[[Model, float], None],
 ) -> None:
     """Three users bear 458.24216 N/m with any passive hand."""
     way(users(3, 200), 458.24216)
@@ -449,7 +449,7 @@ couplers:
 """
 
 
-def textbook(damping: str, start: str = "1 mm") -> CompiledSystem:
+def textbook(damping: str, start: str = "1 mm") -> Model:
     """Return a sampled wall before a device of 2 N·s/m, which is passive below K = 2 (b − |B|)/T."""
     return compiled(WALL.replace("DAMPING", damping).replace("START", start))
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import apc
-from apc.frame.names import Free, Range
+from apc.frame.names import ParameterRef, Range
 from apc.hands.wall_conditions import CONDITIONS
 from apc.regions.overlay import overlay_points, parse_overlay, symbol_values
 from tests.topologies import AVERAGE, compiled, told, wall
@@ -54,7 +54,7 @@ GIL = "gil:K=it.stiffness,B=it.damping,b=device.damping,T=tick.period,t_d=it.del
 
 def curve(words: str, *axes: tuple[str, float, float]) -> np.ndarray:
     """Return the curve of a condition over two numbers of the wall."""
-    ranges = [Range(Free(name), "", Fraction(low), Fraction(high)) for name, low, high in axes]
+    ranges = [Range(ParameterRef(name), "", Fraction(low), Fraction(high)) for name, low, high in axes]
     return overlay_points(MODEL, parse_overlay(MODEL, words), *ranges)
 
 

@@ -11,7 +11,7 @@ from scipy.linalg import expm
 
 import apc
 from apc.analysis.switching import OPEN, STABLE
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from tests.topologies import SCENES, compiled, replaced, wall
 
 Floats = NDArray[np.float64]
@@ -39,7 +39,7 @@ hands:
 ARM = HELD[HELD.index("hands:") :]
 
 
-def scene(count: int, tie: float, contact: float, damping: float = 0.0) -> CompiledSystem:
+def scene(count: int, tie: float, contact: float, damping: float = 0.0) -> Model:
     """Return users who hold their devices and may touch copies of 0.2 kg."""
     return compiled(
         replaced(

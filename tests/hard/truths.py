@@ -11,7 +11,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.compiler.pipeline import compile_topology
 from apc.eigen.balls import precision
 from tests.fifty_digits.truth import RIGID, Truth, classes_of, eigenvalues, frame_matrices, spectral_truth
@@ -38,7 +38,7 @@ def main() -> None:
     TRUTHS.write_text(json.dumps(found, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
-def truth_of(system: CompiledSystem) -> dict[str, Any]:
+def truth_of(system: Model) -> dict[str, Any]:
     """Return the radius (rigid modes left out), how many rigid modes there are, and the verdict."""
     truth = spectral_truth(system)
     assert isinstance(truth, Truth), truth
@@ -52,7 +52,7 @@ def truth_of(system: CompiledSystem) -> dict[str, Any]:
     return {"spectral_radius": truth.digits, "rigid_modes": truth.rigid - chains, "verdict": verdict}
 
 
-def _chains(system: CompiledSystem) -> int:
+def _chains(system: Model) -> int:
     """Return how many of the eigenvalues 1 have no vector of their own that stands still."""
     missing = 0
     with precision(1024):

@@ -41,12 +41,12 @@ def scene(text: str, more: str = "", start: str = "0 m") -> str:
     return f"{base}clocks: {{tick: 1 ms}}\nhands: {{own: {{type: Own, flange: device{clock}{more}}}}}\n"
 
 
-def model(folder: Path, *equations: str, variables: str = "", more: str = "") -> apc.CompiledSystem:
+def model(folder: Path, *equations: str, variables: str = "", more: str = "") -> apc.Model:
     """Return the compiled scene."""
     text = component(*equations, variables=variables)
     return compiled(scene(text, more), library(folder, text))
 
 
-def force(system: apc.CompiledSystem, x: float = 0.0, v: float = 0.0) -> float:
+def force(system: apc.Model, x: float = 0.0, v: float = 0.0) -> float:
     """Return the force of the component on the mass there: 2 kg times its acceleration, and its damping."""
     return 2 * rates(system, {"device.x": x, "device.v": v})["device.v"] + 3 * v

@@ -23,7 +23,7 @@ FILTERED = f"{ONE_MASS}clocks: {{tick: 1 ms}}\n"
 FILTERED += "couplers: {all: {type: Filter, flange: device, k: 9 N/m, clock: tick}}\n"
 
 
-def filtered(folder: Path, *equations: str) -> apc.CompiledSystem:
+def filtered(folder: Path, *equations: str) -> apc.Model:
     return compiled(FILTERED, library(folder, FILTER.format(*equations)))
 
 

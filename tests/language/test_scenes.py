@@ -23,11 +23,11 @@ from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, compiled, library,
 MS = Fraction(1, 1000)
 
 
-def changed(*pairs: tuple[str, str]) -> apc.CompiledSystem:
+def changed(*pairs: tuple[str, str]) -> apc.Model:
     return compiled(replaced(AVERAGE, *pairs))
 
 
-def exact(system: apc.CompiledSystem) -> dict[str, Any]:
+def exact(system: apc.Model) -> dict[str, Any]:
     """Return the exact numbers and times of a scene by name."""
     return {one.name: one.exact for one in system.parameters} | {
         one.name: one.value for one in system.timings

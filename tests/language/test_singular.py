@@ -33,7 +33,7 @@ equations:
 """
 
 
-def model(folder: Path, equations: list[str], x: str = "0 m") -> apc.CompiledSystem:
+def model(folder: Path, equations: list[str], x: str = "0 m") -> apc.Model:
     """Return a mass of 1 kg with 5 N*s/m that an own component joins to the ground."""
     clocked = any("sample" in one for one in equations)
     lines = "\n".join(f"  - {one}" for one in equations)

@@ -19,11 +19,11 @@ def listed(result: Any) -> list[float]:
     return [float(value) for value in casadi.DM(result).full().ravel()]
 
 
-def values(system: apc.CompiledSystem) -> dict[str, float]:
+def values(system: apc.Model) -> dict[str, float]:
     return {parameter.name: parameter.value for parameter in system.parameters}
 
 
-def at(system: apc.CompiledSystem, x: Mapping[str, float]) -> tuple[list[float], list[float], list[float]]:
+def at(system: apc.Model, x: Mapping[str, float]) -> tuple[list[float], list[float], list[float]]:
     """Return the states, with 0 for those not named, zeros for what is held, and the numbers."""
     (kind,) = system.kinds
     states = [state.name for state in kind.states]
@@ -32,7 +32,7 @@ def at(system: apc.CompiledSystem, x: Mapping[str, float]) -> tuple[list[float],
     return [x.get(one, 0.0) for one in states], [0.0] * len(kind.holds), [known[n] for n in kind.parameters]
 
 
-def rates(system: apc.CompiledSystem, x: Mapping[str, float], held: Sequence[float] = ()) -> dict[str, float]:
+def rates(system: apc.Model, x: Mapping[str, float], held: Sequence[float] = ()) -> dict[str, float]:
     """Return dx/dt by state."""
     (kind,) = system.kinds
     states, nothing, numbers = at(system, x)
@@ -41,7 +41,7 @@ def rates(system: apc.CompiledSystem, x: Mapping[str, float], held: Sequence[flo
 
 
 def ticked(
-    system: apc.CompiledSystem,
+    system: apc.Model,
     x: Mapping[str, float],
     memory: Sequence[float] = (),
     heard: Sequence[float] = (),
@@ -53,7 +53,7 @@ def ticked(
     return dict(zip(clock.outputs, found, strict=True))
 
 
-def pushes(system: apc.CompiledSystem, x: Mapping[str, float], held: Sequence[float] = ()) -> list[float]:
+def pushes(system: apc.Model, x: Mapping[str, float], held: Sequence[float] = ()) -> list[float]:
     """Return the force of all parts on each of `MASSES`: m dv/dt + b v."""
     found = rates(system, x, held)
     return [
@@ -63,9 +63,9 @@ def pushes(system: apc.CompiledSystem, x: Mapping[str, float], held: Sequence[fl
     ]
 
 
-def coupled(part: str, *, base: str = TWO) -> apc.CompiledSystem:
+def coupled(part: str, *, base: str = TWO) -> apc.Model:
     return compiled(f"{base}{CLOCK}couplers:\n  it: {{{part}}}\n")
 
 
-def held(part: str) -> apc.CompiledSystem:
+def held(part: str) -> apc.Model:
     return compiled(f"{ONE_MASS}hands:\n  it: {{{part}}}\n")

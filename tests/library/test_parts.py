@@ -205,7 +205,7 @@ def swings(mass: float, damping: float, stiffness: float) -> list[complex]:
     return sorted(found, key=lambda z: (z.imag, z.real))
 
 
-def in_a_second(system: apc.CompiledSystem) -> list[complex]:
+def in_a_second(system: apc.Model) -> list[complex]:
     """Return the eigenvalues of a frame of a second, which is what a scene without clocks has."""
     return sorted((mode.eigenvalue for mode in apc.analyze(system).modes), key=lambda z: (z.imag, z.real))
 

@@ -40,11 +40,11 @@ couplers: {wall: {type: Filtered, a: device, stiffness: 500 N/m, corner: 100 rad
 """
 
 
-def _set(system: apc.CompiledSystem, clock: str, period: str) -> apc.CompiledSystem:
+def _set(system: apc.Model, clock: str, period: str) -> apc.Model:
     return apc.set_parameters(system, {f"{clock}.period": period})
 
 
-def _motion(system: apc.CompiledSystem) -> tuple[float, list[list[float]]]:
+def _motion(system: apc.Model) -> tuple[float, list[list[float]]]:
     """Return the spectral radius of a scene, and the rows of its first moments."""
     run = apc.simulate(system, duration="60 ms", jit=False)
     return apc.analyze(system).spectral_radius, run.values.tolist()

@@ -33,7 +33,7 @@ def state(place: np.ndarray, speed: np.ndarray) -> dict[str, float]:
     return found | {f"device.v[{k + 1}]": float(one) for k, one in enumerate(speed)}
 
 
-def pushed(system: apc.CompiledSystem, *held: float) -> list[float]:
+def pushed(system: apc.Model, *held: float) -> list[float]:
     """Return the force on the mass of 2 kg at rest, when these are held."""
     return [2 * value for name, value in rates(system, {}, held).items() if name.startswith("device.v")]
 

@@ -45,7 +45,7 @@ def pulling(pull: Pull, damping: float = 0.0) -> Law:
     return law
 
 
-def same(system: apc.CompiledSystem, scheme: ByHand, method: Any = "auto") -> None:
+def same(system: apc.Model, scheme: ByHand, method: Any = "auto") -> None:
     found = apc.analyze(system, method=method)
     rigid, radius = magnitudes(scheme)
     assert found.rigid_modes == rigid

@@ -11,7 +11,7 @@ import pytest
 
 import apc
 from apc.__main__ import run
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from tests.schemes import ByHand, everybody, magnitudes, mean, played
 from tests.topologies import compiled, library
@@ -91,7 +91,7 @@ LAWS: dict[str, Law] = {
 }
 
 
-def scene(force: str, delay: str, folder: Path, text: str = SCENE) -> CompiledSystem:
+def scene(force: str, delay: str, folder: Path, text: str = SCENE) -> Model:
     return compiled(text.replace("DELAY", delay), library(folder, PART.replace("FORCE", force)))
 
 
@@ -102,7 +102,7 @@ def by_hand(law: Law, late: int) -> ByHand:
     return ByHand([[(0.2, 5.0, 0.0)]] * 3, everybody(3), forces, told=0, ratio=4, late=late)
 
 
-def same(system: CompiledSystem, hand: ByHand, method: str = "auto") -> None:
+def same(system: Model, hand: ByHand, method: str = "auto") -> None:
     found = apc.analyze(system, method=method)  # type: ignore[arg-type] # one of its methods
     rigid, radius = magnitudes(hand)
     assert found.rigid_modes == rigid
@@ -118,7 +118,7 @@ def test_a_coefficient_of_age_is_its_law_in_every_tick(force: str, late: int, tm
     same(scene(force, f"{late} ms", tmp_path), by_hand(LAWS[force], late))
 
 
-def positions(system: CompiledSystem, *, jit: bool = False) -> Any:
+def positions(system: Model, *, jit: bool = False) -> Any:
     run = apc.simulate(system, duration="200 ms", signals=["*.cube.x"], jit=jit)
     return np.array([run[one.name] for one in run.signals]).T
 
@@ -174,7 +174,7 @@ def test_what_was_heard_before_is_its_law(force: str, late: int, tmp_path: Path)
         assert positions(system, jit=True) == pytest.approx(found, abs=1e-15)
 
 
-def forces(system: CompiledSystem, *, jit: bool) -> list[Any]:
+def forces(system: Model, *, jit: bool) -> list[Any]:
     """Return what each peer computed at each tick but the last, over k."""
     run = apc.simulate(system, duration="300 ms", signals=["*.it.f"], jit=jit)
     assert len(run.signals) == 3

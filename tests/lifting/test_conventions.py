@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from apc.analysis.analysis import analyze
-from apc.analysis.conventions import Conventions, Outcome, conventions
+from apc.analysis.conventions import EventOrder, Outcome, conventions
 from apc.frame.schedule import ORDER
 from tests import bruteforce
 from tests.sites import MS, edged, paper
@@ -28,7 +28,7 @@ def radius(scene: bruteforce.Scene) -> float:
     return float(np.abs(np.delete(values, np.argmin(np.abs(values - 1.0)))).max())
 
 
-def outcome(found: Conventions, order: tuple[str, ...]) -> Outcome:
+def outcome(found: EventOrder, order: tuple[str, ...]) -> Outcome:
     [one] = [one for one in found.outcomes if order in one.orders]
     return one
 

@@ -9,7 +9,7 @@ import flint
 import pytest
 
 from apc.benchmark.truth import spectral_truth as of_balls
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.compiler.pipeline import compile_topology
 from apc.eigen.balls import precision
 from tests.bench.random_scenes import run
@@ -36,7 +36,7 @@ def test_what_bench_compares_with_is_the_truth_of_the_independent_engine(name: s
     assert found.digits[:45] == _truth(system).digits[:45]
 
 
-def _truth(system: CompiledSystem) -> Truth:
+def _truth(system: Model) -> Truth:
     found = spectral_truth(system)
     assert isinstance(found, Truth), found
     return found

@@ -44,7 +44,7 @@ def topology(more: str = "", *, x: str = "0 m", count: int = 1) -> str:
     )
 
 
-def model(folder: Path, force: str, more: str = ", K: 60000 N/m", x: str = "0 m") -> apc.CompiledSystem:
+def model(folder: Path, force: str, more: str = ", K: 60000 N/m", x: str = "0 m") -> apc.Model:
     return compiled(
         topology(more, x=x),
         library(folder, component("f = " + force, "flange.f = hold(f)", variables="f=N")),

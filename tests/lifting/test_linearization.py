@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from apc.analysis.analysis import analyze, lifted_groups
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.eigen.modes import dense, split
 from tests.bruteforce import Scene, frame_matrix
@@ -41,7 +41,7 @@ def test_an_edge_function_is_linearized_pair_by_pair(operator: str, graph: str, 
     assert apart(whole, expected) < 1e-11
 
 
-def _split(system: CompiledSystem) -> np.ndarray:
+def _split(system: Model) -> np.ndarray:
     """Return all eigenvalues of the split system, each as often as it counts."""
     systems = split(*lifted_groups(system))
     return np.concatenate([np.repeat(np.linalg.eigvals(one.matrix), one.multiplicity) for one in systems])

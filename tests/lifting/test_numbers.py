@@ -11,10 +11,10 @@ import pytest
 
 import apc
 from apc.__main__ import run
-from apc.compiler.compiled import CompiledSystem, counts_peers
+from apc.compiler.compiled import Model, counts_peers
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
-from apc.frame.names import Free, find, is_named
+from apc.frame.names import ParameterRef, find, is_named
 from apc.frame.overrides import Override, apply, parse_override
 from apc.frame.parameters import resolve
 from apc.vary.many import analyze_many
@@ -22,11 +22,11 @@ from apc.vary.margins import margins
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, library, replaced
 
 
-def _value(system: CompiledSystem, name: str, group: int = 0) -> float:
+def _value(system: Model, name: str, group: int = 0) -> float:
     return float(resolve(system).parameters[group][0, system.kinds[0].parameters.index(name)])
 
 
-def _column(system: CompiledSystem, name: str) -> list[float]:
+def _column(system: Model, name: str) -> list[float]:
     """Return a parameter's value of each peer of the first group."""
     numbers = resolve(system)
     return [
@@ -44,7 +44,7 @@ def test_an_override_reaches_every_group_or_the_one_named(name: str) -> None:
         )
     )
     override = parse_override(system, f"{name}=0.8 N/mm")
-    assert override == Override(Free("contact.stiffness"), Fraction(800))
+    assert override == Override(ParameterRef("contact.stiffness"), Fraction(800))
     changed = apply(system, [override])
     assert [_value(changed, "contact.stiffness", group) for group in (0, 1)] == [800.0, 800.0]
     changed = apply(system, [parse_override(system, "left.contact.stiffness=0.8 N/mm")])

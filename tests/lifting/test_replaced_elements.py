@@ -28,7 +28,7 @@ FRICTION = (
 )
 
 
-def wall(more: str = "", *, stiffness: str = "900 N/m", damping: str = "0.5 N*s/m") -> apc.CompiledSystem:
+def wall(more: str = "", *, stiffness: str = "900 N/m", damping: str = "0.5 N*s/m") -> apc.Model:
     flange = "encoder.measured" if "encoder" in more else "device"
     return compiled(WALL.format(damping=damping, more=more, flange=flange, stiffness=stiffness))
 

@@ -11,7 +11,7 @@ import pytest
 
 import apc
 from apc.__main__ import run
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.eigen.balls import precision
 from tests.bench.random_scenes import check, truth
@@ -225,7 +225,7 @@ equations:
 def test_what_turns_freely_is_a_rotation_and_what_shifts_freely_a_translation(
     angle: str, tmp_path: Path
 ) -> None:
-    wheels: CompiledSystem = compiled(WHEELS, library(tmp_path, WHEEL.replace("ANGLE", angle)))
+    wheels: Model = compiled(WHEELS, library(tmp_path, WHEEL.replace("ANGLE", angle)))
     free = apc.analyze(wheels)
     assert (free.translations, free.rotations, free.unfelt) == (2, 1, ())
     assert "2 translations and 1 rotation left out" in str(free)

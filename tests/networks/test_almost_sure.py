@@ -8,13 +8,13 @@ import re
 import pytest
 
 from apc.frame.instance import prepare
-from apc.moments.almost_sure import AlmostSure, almost_sure
-from apc.unserved import UnservedError
+from apc.moments.almost_sure import TopLyapunovExponent, almost_sure
+from apc.unserved import NotSupportedError
 from tests.held_scenes import scene, system_of
 from tests.networks.test_loss import judged
 
 
-def estimate(text: str) -> AlmostSure:
+def estimate(text: str) -> TopLyapunovExponent:
     system = system_of(text)
     return almost_sure(system, prepare(system))
 
@@ -60,5 +60,5 @@ def test_what_grows_in_mean_square_is_told_almost_surely_too() -> None:
 )
 def test_what_is_not_estimated_is_named(text: str, why: str) -> None:
     system = system_of(text)
-    with pytest.raises(UnservedError, match=f"^{re.escape(why)}"):
+    with pytest.raises(NotSupportedError, match=f"^{re.escape(why)}"):
         almost_sure(system, prepare(system))

@@ -15,9 +15,9 @@ import pytest
 
 import apc
 from apc.__main__ import run
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
-from apc.moments.network_verdict import NetworkVerdict
+from apc.moments.network_verdict import MeanSquareStability
 from tests.held_scenes import scene, system_of
 from tests.lossy import unreliable
 from tests.topologies import AVERAGE, compiled, replaced
@@ -63,7 +63,7 @@ CRITICAL = (
 STIFFNESS = "coordination.stiffness"
 
 
-def judged(text: str, **asked: bool) -> NetworkVerdict:
+def judged(text: str, **asked: bool) -> MeanSquareStability:
     found = apc.judge_network(system_of(text), **asked)
     assert found is not None
     return found
@@ -99,14 +99,14 @@ def test_where_a_reference_is_critical_the_radius_is_1(
     assert found.error is not None and found.error < 1e-7
 
 
-def by_critical(system: CompiledSystem, near: float) -> tuple[float, float]:
+def by_critical(system: Model, near: float) -> tuple[float, float]:
     found = apc.critical(system, STIFFNESS, lower="900 N/m", upper="1600 N/m")
     assert (found.criterion, found.left_out, found.stable_side) == ("mean-square", (), "below")
     assert found.value is not None and found.error is not None
     return found.value, found.error
 
 
-def by_margins(system: CompiledSystem, near: float) -> tuple[float, float]:
+def by_margins(system: Model, near: float) -> tuple[float, float]:
     from apc.frame.instance import prepare
     from apc.vary.margins import Margins, network_margins
 
@@ -117,13 +117,13 @@ def by_margins(system: CompiledSystem, near: float) -> tuple[float, float]:
     return row.value, row.error
 
 
-def by_sweep(system: CompiledSystem, near: float) -> tuple[float, float]:
+def by_sweep(system: Model, near: float) -> tuple[float, float]:
     found = apc.sweep(system, {STIFFNESS: f"{near - 1e-3!r},{near + 1e-3!r} N/m"}, jobs=1)
     assert found.column("verdict").tolist() == ["stable in mean square", "unstable in mean square"]
     return near, 1e-3
 
 
-def by_box(system: CompiledSystem, near: float) -> tuple[float, float]:
+def by_box(system: Model, near: float) -> tuple[float, float]:
     below, above = (
         apc.prove_box(system, {STIFFNESS: f"{low!r} N/m:{high!r} N/m"})
         for low, high in ((near - 1, near - 0.01), (near - 1, near + 0.01))
@@ -147,7 +147,7 @@ HOLD_10, ZERO_20 = ("loss: 10 %", 1143.224858916119), ("loss: 20 %, on_loss: zer
     ],
 )
 def test_every_way_to_ask_finds_the_stiffness_at_which_a_reference_is_critical(
-    way: Callable[[CompiledSystem, float], tuple[float, float]], more: str, stiffness: float
+    way: Callable[[Model, float], tuple[float, float]], more: str, stiffness: float
 ) -> None:
     value, error = way(compiled(unreliable(more)), stiffness)
     # The references' radii are known to 3e-10 and change by some 1.6e-4 a N/m.

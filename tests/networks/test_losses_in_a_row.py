@@ -16,12 +16,12 @@ import apc
 from apc.__main__ import run
 from apc.compiler.errors import ApcError
 from apc.frame.instance import prepare
-from apc.moments.worst import LossesInARow, worst_case
+from apc.moments.worst import ConsecutiveLosses, worst_case
 from tests.held_scenes import frames, growth, scene, system_of
 from tests.topologies import replaced
 
 
-def losses(text: str) -> LossesInARow:
+def losses(text: str) -> ConsecutiveLosses:
     return worst_case(system_of(text), prepare(system_of(text)))
 
 
@@ -116,7 +116,7 @@ def test_groups_rings_and_stars_are_what_is_written_peer_by_peer_and_edge_by_edg
 @pytest.mark.parametrize("stiffness", [0.0, 1e-3])
 def test_who_feels_nothing_of_the_others_bears_any_losses(stiffness: float) -> None:
     note = "1,000 losses in a row are harmless, where counting ends"
-    assert losses(scene(3, stiffness)) == LossesInARow(1000, None, None, note)
+    assert losses(scene(3, stiffness)) == ConsecutiveLosses(1000, None, None, note)
 
 
 TWICE = (

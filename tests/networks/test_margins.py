@@ -7,7 +7,7 @@ from contextlib import nullcontext
 import pytest
 
 import apc
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.frame.instance import prepare
 from apc.vary.margins import Margins, network_margins
@@ -19,7 +19,7 @@ from tests.networks.test_loss import STIFFNESS
 from tests.topologies import AVERAGE, compiled, replaced
 
 
-def grown(system: CompiledSystem) -> Margins:
+def grown(system: Model) -> Margins:
     return network_margins(system, prepare(system), Margins((), ""))
 
 

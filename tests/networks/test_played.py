@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import Column, CompiledSystem
+from apc.compiler.compiled import Model, PeerColumn
 from apc.simulation.rows_in_time import blocks
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
@@ -22,17 +22,17 @@ def rows_of(simulation: Simulation, run: int = 0) -> NDArray[np.float64]:
     return np.concatenate([block.values for block in blocks(simulation, run=run)])
 
 
-def played(system: CompiledSystem, *, duration: Fraction = Fraction(1), seed: int = 0) -> NDArray[np.float64]:
+def played(system: Model, *, duration: Fraction = Fraction(1), seed: int = 0) -> NDArray[np.float64]:
     return rows_of(prepare(system, Settings(duration, jit=False, seed=seed)))
 
 
-def scattered(system: CompiledSystem) -> CompiledSystem:
+def scattered(system: Model) -> Model:
     """Return a system whose peers all start elsewhere."""
     random = np.random.default_rng(1)
     groups = []
     for group in system.groups:
         starts = [one.start for one in system.kinds[group.kind].states if one.unit == "m"]
-        columns = tuple(Column(name, random.uniform(-0.01, 0.01, group.count)) for name in starts)
+        columns = tuple(PeerColumn(name, random.uniform(-0.01, 0.01, group.count)) for name in starts)
         kept = tuple(value for value in group.values if value.name not in starts)
         groups.append(replace(group, values=kept, columns=columns))
     return replace(system, groups=tuple(groups))

@@ -17,7 +17,7 @@ from apc.__main__ import run
 from apc.compiler.errors import ApcError
 from apc.compiler.language.probes import read_probe
 from apc.network.channel import ChannelLaw, PacketSource
-from apc.network.recorded import CONFIDENCE, NetworkRecording, describe
+from apc.network.recorded import CONFIDENCE, LinkFit, describe
 from tests.lossy import LINK
 from tests.topologies import AVERAGE, replaced
 
@@ -208,7 +208,7 @@ def test_no_text_is_taken_for_a_recording_that_is_none() -> None:
         assert probe is None or not np.isfinite(probe.delays).any()
 
 
-def recorded(folder: Path, law: ChannelLaw, count: int, seed: int) -> NetworkRecording:
+def recorded(folder: Path, law: ChannelLaw, count: int, seed: int) -> LinkFit:
     delays = PacketSource(law, "lan", [[0, 1]], seed=seed).take(count)[0]
     rows = ("lost" if math.isinf(delay) else repr(delay * 1e3) for delay in delays.tolist())
     (folder / "t.csv").write_text("\n".join(["delay [ms]", *rows]), encoding="utf-8")

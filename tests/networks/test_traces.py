@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import apc
-from apc.moments.network_verdict import NetworkVerdict
+from apc.moments.network_verdict import MeanSquareStability
 from tests.held_scenes import frames, growth, scene
 from tests.topologies import replaced
 
@@ -15,7 +15,7 @@ from tests.topologies import replaced
 NOMINAL = {"8": 0.9571713896251, "9": 0.9564057627899}
 
 
-def judged(folder: Path, rows: str, more: str = "", peers: int = 3) -> NetworkVerdict:
+def judged(folder: Path, rows: str, more: str = "", peers: int = 3) -> MeanSquareStability:
     (folder / "t.csv").write_text(f"delay [ms]\n{rows}", encoding="utf-8")
     text = replaced(scene(peers, 500.0), ("loss: 10 %", f"trace: t.csv{more}"))
     (folder / "s.yaml").write_text(text, encoding="utf-8")

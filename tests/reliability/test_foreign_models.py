@@ -18,12 +18,12 @@ import pytest
 import apc
 from apc.__main__ import run
 from apc.compiler import cache, seal, store
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from tests.commands import write
 from tests.reliability.test_unchanged_scenes import PART, TEXT
 from tests.topologies import AVERAGE, ROOT, compiled, replaced, told
 
-Other = Callable[[], CompiledSystem]
+Other = Callable[[], Model]
 MODEL = Path("scene.apc")
 OTHER = replaced(AVERAGE, ("1000 N/m", "9000 N/m"))
 DAMAGED = r"scene\.apc: E604 is damaged: it is not what apc compile writes\. Write: "
@@ -52,7 +52,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def other(monkeypatch: pytest.MonkeyPatch) -> Other:
     """Return what loads the model as another user, who reads none: what is opened was compiled."""
 
-    def load() -> CompiledSystem:
+    def load() -> Model:
         monkeypatch.setattr(seal, "_folder", lambda: Path("../theirs").resolve())
         monkeypatch.setattr(store, "decoded", lambda model: pytest.fail("it is read"))
         return apc.load(MODEL)

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from apc.compiler.errors import ApcError
-from apc.loop.packets import Address, Answer, Data, Hello, Post
-from apc.loop.peer import AT_ONCE, KNOCK, NANO, Loop
+from apc.loop.packets import Address, Data, Hello, HelloReply, Post
+from apc.loop.peer import AT_ONCE, KNOCK, NANO, PeerLoop
 from tests.fuzz.packets import run_packets
 from tests.surfaces.wire import HOUR, SOON, Other, Wire, loop_at, send_packets
 from tests.topologies import AVERAGE, compiled, replaced
@@ -56,7 +56,7 @@ def test_what_is_written_is_read(secret: bytes) -> None:
     assert [receiver.read(one or b"", HERE) for one in datagrams] == [
         Data(2, 17, 3, 4, (1.5, -0.0, 1e-300)),
         Hello(2, 18, sender.nonce, receiver.nonce),
-        Answer(2, 19, sender.nonce, receiver.nonce, 5, 6, -1, 8),
+        HelloReply(2, 19, sender.nonce, receiver.nonce, 5, 6, -1, 8),
     ]
     assert not receiver.dropped
     assert post(2, secret=secret).data(17, 1, 3, 4, ()) is None  # it has met nobody
@@ -96,7 +96,7 @@ def test_what_is_not_a_peers_changes_nothing_but_a_counter(secret: bytes) -> Non
 
 def played(
     wire: Wire, secret: bytes, value: float, replayed: Sequence[tuple[int, bytes, Address]] = ()
-) -> Loop:
+) -> PeerLoop:
     """Play a scene with two others; all that is replayed comes at once and when it came, twice."""
     loop, start = loop_at(wire, compiled(MOVING), DIGEST, secret), wire.time
     others = [Other(wire, number, DIGEST, secret) for number in (1, 2)]
@@ -276,7 +276,7 @@ def test_of_answers_the_shortest_round_trip_tells_a_clock_and_the_first_the_begi
     """A peer that starts slowly answers old hellos: these are answers too."""
     loop = loop_at(Wire(monkeypatch), compiled(MOVING), DIGEST, b"", "1")
     for asked, begins in ((1_000, 0), (2_000, 9_000), (1_000, 8_000)):
-        loop._met(Answer(1, 5_000, 3, 4, asked, 4_000, begins, int(begins > 0)), 6_000)
+        loop._met(HelloReply(1, 5_000, 3, 4, asked, 4_000, begins, int(begins > 0)), 6_000)
     assert loop.offsets[1][0] == 6_000 - 2_000 - 1_000
     assert loop.began is not None
     assert loop.began.begins == 9_000

@@ -15,9 +15,9 @@ import pytest
 import apc
 from apc.benchmark.hard import compare, run_hard_cases
 from apc.benchmark.scale import scale
-from apc.benchmark.speed_and_error import SAME, Bench, Measured, bench, pareto_front
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.benchmark.speed_and_error import SAME, Bench, MethodTiming, bench, pareto_front
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.present.bench_output import bench_picture
 from tests.commands import Cli, write
 from tests.hard.truths import HERE, TRUTHS, truth_of
@@ -29,8 +29,8 @@ def found() -> Bench:
     return bench(compiled(AVERAGE), rounds=1, duration=Fraction(1, 50))
 
 
-def _one(name: str, seconds: float, error: float | None, spread: float = 0.0) -> Measured:
-    return Measured(name, seconds, spread, 3, error, None, False)
+def _one(name: str, seconds: float, error: float | None, spread: float = 0.0) -> MethodTiming:
+    return MethodTiming(name, seconds, spread, 3, error, None, False)
 
 
 @pytest.mark.parametrize(
@@ -46,7 +46,7 @@ def _one(name: str, seconds: float, error: float | None, spread: float = 0.0) ->
     ],
 )
 def test_the_front_is_what_nothing_beats_in_both_ways(
-    measured: list[Measured], front: dict[str, bool]
+    measured: list[MethodTiming], front: dict[str, bool]
 ) -> None:
     marked = {one.name: one.front for one in pareto_front(measured)}
     assert marked == front
@@ -129,7 +129,7 @@ def test_what_goes_wrong_in_the_end_costs_no_figures(
     found: Bench, cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> None:
-        raise ApcError(Mistake("E601", Place("bench.png"), "can't be written: no space"))
+        raise ApcError(Diagnostic("E601", SourceLocation("bench.png"), "can't be written: no space"))
 
     assert found.faults == ()
     note = "WRONG: the bound of dense does not hold"
@@ -213,7 +213,7 @@ OPEN = "the bound says nothing; the verdict is left open: stable up to a common 
 def test_what_is_no_number_or_no_verdict_fails_and_is_counted(
     changes: dict[str, object], failed: str, cli: Cli
 ) -> None:
-    def solve(system: CompiledSystem) -> apc.Analysis:
+    def solve(system: Model) -> apc.Analysis:
         return replace(apc.analyze(system), **changes)  # type: ignore[arg-type] # some fields of it
 
     _one_case()

@@ -18,7 +18,7 @@ from apc.cli import progress
 from apc.cli.commands import apc as group
 from apc.cli.options import Command
 from apc.cli.progress import at_work
-from apc.compiler.errors import ApcError, Mistake, Place, visible
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, visible
 from apc.present.forms import document, json_text
 from tests.commands import Cli, Ran, folder, write
 from tests.topologies import AVERAGE, ROOT, SCENES, replaced
@@ -191,7 +191,11 @@ def test_what_is_not_printed_is_written_out_as_json_has_it() -> None:
     assert visible(ESCAPES) == r"\u001b[31m\u009b2J\u007f\u202e"
     assert json.loads(visible(json.dumps({"a": ESCAPES}, ensure_ascii=False))) == {"a": ESCAPES}
     assert json.loads(f'"{visible(chr(0xE0001))}"') == chr(0xE0001)
-    text = str(ApcError(Mistake("E101", Place(f"{ESCAPES}.yaml", 3, 1), "this", "that", ESCAPES, ESCAPES)))
+    text = str(
+        ApcError(
+            Diagnostic("E101", SourceLocation(f"{ESCAPES}.yaml", 3, 1), "this", "that", ESCAPES, ESCAPES)
+        )
+    )
     assert text.isprintable()
     assert text.count(r"\u001b") == 3
 

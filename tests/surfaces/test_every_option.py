@@ -60,7 +60,7 @@ SLOW = {
 }
 
 
-def words_for(call: str, model: apc.CompiledSystem) -> list[str] | None:
+def words_for(call: str, model: apc.Model) -> list[str] | None:
     """Return the words of a call, None if the topology has no parameter that it asks for."""
     known = {
         word: next(

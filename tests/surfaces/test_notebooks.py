@@ -65,7 +65,7 @@ def test_a_result_is_its_text_and_its_picture_and_elsewhere_a_line() -> None:
     for found in (*results, apc.parameters(model)):
         assert re.fullmatch(r"<\w+ .{1,80}>", repr(found))
         assert bundle(found)["text/html"].startswith("<pre>")
-    assert repr(model) == "<CompiledSystem three-users-average: 3 peers>"
+    assert repr(model) == "<Model three-users-average: 3 peers>"
     assert model._repr_html_() == f"<pre>{model}</pre>"
 
 

@@ -22,8 +22,8 @@ import numpy as np
 import pytest
 
 import apc
-from apc.compiler.compiled import CompiledSystem
-from apc.frame.names import Free
+from apc.compiler.compiled import Model
+from apc.frame.names import ParameterRef
 from apc.frame.overrides import parse_override
 from tests.commands import Cli, write
 from tests.surfaces.pages import CHROMIUM, MODEL, VERDICT, Tab, launched, served
@@ -36,7 +36,7 @@ from bokeh.document import Document
 from apc.explore import sections
 from apc.explore.desk import Desk
 from apc.explore.motion import motion_of
-from apc.explore.page import Page, scene_of
+from apc.explore.page import TopologyTab, scene_of
 from apc.explore.sections import SectionAnswer, Task, compute
 from apc.explore.server import MOST, _shortened
 from apc.explore.sliders import (
@@ -57,7 +57,7 @@ NOTHING = "topology: none\npeers: {user: {count: 1}}\nmasses: {}\n"
 LOSSY = AVERAGE.replace("delay: 8 ms}", "delay: 8 ms, loss: 10 %, jitter: 1 ms}")
 
 
-def compiled(text: str, folder: Path) -> CompiledSystem:
+def compiled(text: str, folder: Path) -> Model:
     (folder / "scene.yaml").write_text(text, encoding="utf-8")
     return apc.compile(folder / "scene.yaml")
 
@@ -238,7 +238,7 @@ def test_an_old_answer_never_takes_the_place_of_a_newer_one() -> None:
 )
 def test_a_value_is_written_where_it_stands(label: str, value: str, line: str, tmp_path: Path) -> None:
     system = compiled(AVERAGE, tmp_path)
-    text = with_values(AVERAGE, system, {Free(label): value})
+    text = with_values(AVERAGE, system, {ParameterRef(label): value})
     assert line in text
     changed = compiled(text, tmp_path)
     expected = apc.analyze(system, set={label: value})
@@ -478,7 +478,7 @@ class Asked:
 
 
 @pytest.fixture(scope="module")
-def page(tmp_path_factory: pytest.TempPathFactory) -> Page:
+def page(tmp_path_factory: pytest.TempPathFactory) -> TopologyTab:
     """Give the page of a tab without a browser, and without those who compute for it."""
     document, request = Document(), SimpleNamespace(arguments={})
     context = SimpleNamespace(request=request)
@@ -486,7 +486,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Page:
     scene = compiled(LOSSY, tmp_path_factory.mktemp("page"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("apc.explore.page.Desk", Asked)
-        found = Page(scene_of(scene, (), None), document)
+        found = TopologyTab(scene_of(scene, (), None), document)
     found._deliver("verdict", SectionAnswer(None, "none"))
     names = ["user[1].device.x", "user[1].cube.x"]
     felt = {"names": names, "at": names[0], "notes": ()} | {one: np.ones(2) for one in FELT}
@@ -502,7 +502,7 @@ ARRAY = {"type": "ndarray", "array": ZEROS, "dtype": "float64", "shape": [1], "o
 WRONG = [NAN, INFINITY, -5, -0.6, 10**6, 10**400, 1e308, True, None, "", "text", [1], {"type": "map"}, ARRAY]
 
 
-def says(page: Page, model: Any, value: Any) -> None:
+def says(page: TopologyTab, model: Any, value: Any) -> None:
     """Have the browser say a value, as Bokeh reads it; where that refuses it, nobody of the page is asked."""
     event = {"kind": "ModelChanged", "model": {"id": model.id}, "attr": "value", "new": value}
     try:
@@ -513,7 +513,7 @@ def says(page: Page, model: Any, value: Any) -> None:
         assert record.getMessage().startswith("a message of the page was ignored: ValueError(")
 
 
-def tapped(page: Page, x: Any, y: Any) -> None:
+def tapped(page: TopologyTab, x: Any, y: Any) -> None:
     """Have the browser say that the region was clicked."""
     values = [["model", {"id": page.region.plot.id}], ["x", x], ["y", y]]
     tap = {"type": "event", "name": "tap", "values": {"type": "map", "entries": values}}
@@ -522,7 +522,7 @@ def tapped(page: Page, x: Any, y: Any) -> None:
 
 
 @pytest.mark.whole
-def test_what_the_browser_can_t_say_changes_nothing(page: Page) -> None:
+def test_what_the_browser_can_t_say_changes_nothing(page: TopologyTab) -> None:
     models = [*page.handles, *page.selects, page.begins, page.meant, page.at]
     before = [one.value for one in models]
     for value in WRONG:
@@ -546,7 +546,7 @@ def status(link: str, **headers: str) -> int:
         connection.close()
 
 
-def test_what_the_browser_may_say_is_computed(page: Page) -> None:
+def test_what_the_browser_may_say_is_computed(page: TopologyTab) -> None:
     """A slider to its last value, an axis, what is played and what stable means, a hand, a click."""
     last = len(page.sliders[0].values) - 1
     for model, value in (

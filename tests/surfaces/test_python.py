@@ -21,7 +21,7 @@ PATH = SCENES / "three-users-average.yaml"
 
 
 @pytest.fixture(scope="module")
-def model() -> apc.CompiledSystem:
+def model() -> apc.Model:
     return apc.compile(PATH)
 
 
@@ -33,14 +33,14 @@ def test_every_public_name_is_there_and_nothing_else() -> None:
         apc.nothing  # noqa: B018 # looking it up is the test
 
 
-def test_a_saved_model_analyses_as_the_one_it_was(model: apc.CompiledSystem, tmp_path: Path) -> None:
+def test_a_saved_model_analyses_as_the_one_it_was(model: apc.Model, tmp_path: Path) -> None:
     path = tmp_path / "scene.apc"
     apc.save(model, path)
     assert apc.analyze(apc.load(path)) == apc.analyze(model)
     assert apc.analyze(path) == apc.analyze(str(PATH)) == apc.analyze(model)
 
 
-def test_setting_changes_a_copy_and_is_as_good_as_writing(model: apc.CompiledSystem, tmp_path: Path) -> None:
+def test_setting_changes_a_copy_and_is_as_good_as_writing(model: apc.Model, tmp_path: Path) -> None:
     settings = {"coordination.stiffness": "5 N/mm", "lan.delay": "16 ms"}
     changed = apc.set_parameters(model, settings)
     for system, value in ((changed, 5000), (model, 500)):
@@ -52,7 +52,7 @@ def test_setting_changes_a_copy_and_is_as_good_as_writing(model: apc.CompiledSys
     assert apc.analyze(changed).verdict == "unstable"
 
 
-def test_people_read_the_scene_s_own_units_and_programs_si(model: apc.CompiledSystem) -> None:
+def test_people_read_the_scene_s_own_units_and_programs_si(model: apc.Model) -> None:
     own = compiled(replaced(AVERAGE, ("500 N/m,", "0.5 N/mm,"), ("mass: 0.1 kg", "mass: 100 g")))
     stiffness, mass = "coordination.stiffness", "device.mass"
     axes = {"x": f"{stiffness}=0 N/m:2000 N/m", "y": f"{mass}=0.05 kg:0.2 kg"}
@@ -68,7 +68,7 @@ def test_people_read_the_scene_s_own_units_and_programs_si(model: apc.CompiledSy
         assert plain == same
 
 
-def test_results_are_frozen_and_plain_data(model: apc.CompiledSystem) -> None:
+def test_results_are_frozen_and_plain_data(model: apc.Model) -> None:
     result = apc.analyze(model)
     with pytest.raises(dataclasses.FrozenInstanceError):
         result.verdict = "stable"  # type: ignore[misc] # that it can't be done is the test
@@ -80,7 +80,7 @@ def test_results_are_frozen_and_plain_data(model: apc.CompiledSystem) -> None:
     assert sum(mode["multiplicity"] for mode in document["modes"]) == 3 * 8 - 1, "all but the translation"
 
 
-def test_a_list_of_no_scenes_is_refused_and_one_scene_needs_no_list(model: apc.CompiledSystem) -> None:
+def test_a_list_of_no_scenes_is_refused_and_one_scene_needs_no_list(model: apc.Model) -> None:
     assert told(apc.compare, []) == [
         'compare: E610 no scene is given. Write: apc.compare(["average.yaml", "mesh.yaml"])'
     ]
@@ -93,7 +93,7 @@ def test_a_list_of_no_scenes_is_refused_and_one_scene_needs_no_list(model: apc.C
     ]
 
 
-def test_what_tells_of_texts_refuses_a_compiled_model(model: apc.CompiledSystem) -> None:
+def test_what_tells_of_texts_refuses_a_compiled_model(model: apc.Model) -> None:
     for function, given in ((apc.report, model), (apc.report, [model]), (apc.show, model)):
         [mistake] = told(function, given)
         assert mistake.startswith("three-users-average.apc: E615 is a compiled model")
@@ -108,7 +108,7 @@ WRONG = [None, 7, ("contact.stiffness", "10 N/m", "3000 N/m"), {"a": 1}, [3], ob
 
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_an_argument_of_a_wrong_type_is_said_to_be_one(
-    name: str, model: apc.CompiledSystem, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    name: str, model: apc.Model, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Each argument of each function; what is of a right type, as None for an option, is left out."""
     monkeypatch.chdir(tmp_path)
@@ -128,7 +128,7 @@ def test_an_argument_of_a_wrong_type_is_said_to_be_one(
             assert isinstance(raised.value, apc.ApcError) or f"apc.{name}: {one} wants" in str(raised.value)
 
 
-def test_a_number_in_si_is_the_quantity(model: apc.CompiledSystem) -> None:
+def test_a_number_in_si_is_the_quantity(model: apc.Model) -> None:
     name, other = "contact.stiffness", "coordination.stiffness"
     assert apc.analyze(model, set={"lan.delay": 0.016, "user.count": 4, name: np.float64(800)}) == (
         apc.analyze(model, set={"lan.delay": "16 ms", "user.count": "4", name: "800 N/m"})
@@ -145,7 +145,7 @@ def test_a_number_in_si_is_the_quantity(model: apc.CompiledSystem) -> None:
     assert len(apc.simulate(model, duration=0.1).values) == 101
 
 
-def test_one_peer_is_struck(model: apc.CompiledSystem) -> None:
+def test_one_peer_is_struck(model: apc.Model) -> None:
     found = apc.simulate(model, strike="user[2]")  # as fast as a list says, with a value a peer
     text = replaced(AVERAGE, ("{count: 3}", "{count: 3, set: {device.v: [0 m/s, 0.1 m/s, 0 m/s]}}"))
     assert np.array_equal(found.values, apc.simulate(compiled(text), duration="1 s").values)
@@ -156,7 +156,7 @@ def test_one_peer_is_struck(model: apc.CompiledSystem) -> None:
 @pytest.mark.parametrize("wrong", [7, None, ("1 N/m", "2 N/m"), {"a": "b"}, [3]], ids=repr)
 @pytest.mark.parametrize("call", ["set", "critical", "sweep", "analyze_many", "prove_box"])
 def test_of_a_value_of_a_wrong_type_nothing_else_is_raised(
-    call: str, wrong: object, model: apc.CompiledSystem
+    call: str, wrong: object, model: apc.Model
 ) -> None:
     values: dict[str, Any] = {"contact.stiffness": wrong}
     calls: dict[str, Callable[[], object]] = {

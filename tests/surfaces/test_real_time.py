@@ -22,11 +22,11 @@ import numpy as np
 import pytest
 
 from apc.__main__ import run
-from apc.compiler.errors import ApcError, Mistake
+from apc.compiler.errors import ApcError, Diagnostic
 from apc.loop.device import device_function
 from apc.loop.run import run_of
 from apc.loop.run_folder import read_run
-from apc.loop.start import Part, Play, play_all
+from apc.loop.start import Play, RunPart, play_all
 from apc.processes import Workers
 from tests.surfaces.wire import Other, Wire, loop_at, send_packets
 from tests.topologies import AVERAGE, compiled, replaced
@@ -182,11 +182,13 @@ def test_a_peer_that_is_lost_or_silent_takes_nothing_of_the_others_along(
 ) -> None:
     """One ends at once with what it did, one is killed, one does not end when all are told to."""
     whole = run_of(loop_at(Wire(monkeypatch), compiled(MOVING), DIGEST, b"", "1"), DIGEST, ())
-    ended: dict[str, Future[Part]] = {f"user[{at}]": Future() for at in (1, 2, 3)}
-    ended["user[1]"].set_result(Part(whole))
+    ended: dict[str, Future[RunPart]] = {f"user[{at}]": Future() for at in (1, 2, 3)}
+    ended["user[1]"].set_result(RunPart(whole))
     ended["user[2]"].set_exception(BrokenProcessPool())
 
-    def workers(compute: object, shared: object, jobs: int, lost: Mistake) -> nullcontext[Workers[str, Part]]:
+    def workers(
+        compute: object, shared: object, jobs: int, lost: Diagnostic
+    ) -> nullcontext[Workers[str, RunPart]]:
         assert jobs == 1
         return nullcontext(Workers(ended.__getitem__, 2, lambda _: ApcError(lost)))
 

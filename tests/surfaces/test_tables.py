@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from apc.tables import BLOCK, Column, blocks_of, check_table_path, keep_room, read_table, write_table
+from apc.tables import BLOCK, TableColumn, blocks_of, check_table_path, keep_room, read_table, write_table
 from tests.topologies import told
 
-COLUMNS = (Column("x", "m"), Column("verdict", kind="text"), Column("modes", kind="count"))
+COLUMNS = (TableColumn("x", "m"), TableColumn("verdict", kind="text"), TableColumn("modes", kind="count"))
 ROWS = ((0.1 + 0.2, "stable, or so", 1), (5e-324, 'say "no"', None), (None, None, 3), (-1e300, "ρ\nσ", 4))
 
 

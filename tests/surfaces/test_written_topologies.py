@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import apc
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.explore.written import with_values, write_topology
 from apc.frame.names import find
@@ -35,7 +35,7 @@ USERS = "peers: {user: {count: 2}}\n"
 K, CONTACT = "coordination.stiffness", "contact.stiffness"
 
 
-def changed(text: str, values: Mapping[str, str], tmp_path: Path) -> tuple[str, CompiledSystem]:
+def changed(text: str, values: Mapping[str, str], tmp_path: Path) -> tuple[str, Model]:
     """Return a text with other values, and what it compiles to; no other number of any group is changed.
 
     The numbers of both are compared as `apc show --parameters` lists them, which the writer does not use.
@@ -54,7 +54,7 @@ def changed(text: str, values: Mapping[str, str], tmp_path: Path) -> tuple[str, 
     return new, written
 
 
-def listed(system: CompiledSystem) -> dict[str, tuple[float, float]]:
+def listed(system: Model) -> dict[str, tuple[float, float]]:
     """Return the range of each number by name, one of all groups once for each group."""
     rows = {row.name: (row.low, row.high) for row in parameters(system).rows}
     names = [group.name for group in system.groups]

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.loop.packets import Address, Hello, Post
-from apc.loop.peer import NANO, Loop
+from apc.loop.peer import NANO, PeerLoop
 
 OWN: Address = ("127.0.0.1", 5000)
 SOON = 100_000  # nanoseconds that a datagram is on its way
@@ -102,17 +102,17 @@ class Other:
 
 def loop_at(
     wire: Wire,
-    system: CompiledSystem,
+    system: Model,
     digest: bytes,
     secret: bytes,
     duration: str = "1/10",
     device: Any = None,
     stop: Any = None,
-) -> Loop:
+) -> PeerLoop:
     """Return the first peer of a scene at a wire, where the others are known."""
     names = [f"{group.name}[{at + 1}]" for group in system.groups for at in range(group.count)]
     others = {name: (OWN[0], OWN[1] + at) for at, name in enumerate(names) if at}
-    return Loop(
+    return PeerLoop(
         system,
         names[0],
         wire,  # type: ignore[arg-type] # it stands for a socket
@@ -125,7 +125,7 @@ def loop_at(
     )
 
 
-def send_packets(loop: Loop, others: list[Other], value: float) -> None:
+def send_packets(loop: PeerLoop, others: list[Other], value: float) -> None:
     """Send a packet of each other for every period, a millisecond after its sample."""
     link = loop.player.links[0]
     for count in range(loop.frames * link.slots):

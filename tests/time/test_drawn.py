@@ -11,7 +11,7 @@ from matplotlib.markers import MarkerStyle
 from scipy.spatial.transform import Rotation
 
 import apc
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.present.bodies import heading
 from apc.present.pictures import write_picture
 from apc.present.simulation_output import paths_of
@@ -21,7 +21,7 @@ from tests.topologies import AVERAGE, SCENES, compiled, library, replaced
 pytest.importorskip("matplotlib")
 
 
-def scene(name: str) -> CompiledSystem:
+def scene(name: str) -> Model:
     return compiled((SCENES / f"{name}.yaml").read_text(encoding="utf-8").partition("\n")[2])
 
 

@@ -11,7 +11,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.compiler.pipeline import compile_topology
 from apc.frame.overrides import apply, parse_override
 from apc.simulation.native import compiler
@@ -52,7 +52,7 @@ def test_the_papers_experiment_is_what_stepping_it_by_hand_gives(
     assert np.abs(users(found, 3) - expected).max() < tolerance
 
 
-def check_followed(system: CompiledSystem, duration: Fraction) -> None:
+def check_followed(system: Model, duration: Fraction) -> None:
     """Check a run against the course that the independent engine follows in balls."""
     followed = exact_course(system, duration)
     assert not isinstance(followed, str), followed

@@ -108,7 +108,7 @@ def by_quadrature(
         return [float(x), float(v)]
 
 
-def pushed(words: str, folder: Path, scene: str = SCENE) -> apc.CompiledSystem:
+def pushed(words: str, folder: Path, scene: str = SCENE) -> apc.Model:
     """Compile the scene with a force, the files it names in a folder."""
     (folder / "push.csv").write_text(TABLE, encoding="utf-8")
     for name, law in LAWS.items():

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
 from apc.network.channel import PacketSource, channel_law
@@ -108,7 +108,7 @@ equations:
 X = (0.01, -0.004, 0.007, -0.012)
 
 
-def scene(folder: Path, name: str, link: str) -> CompiledSystem:
+def scene(folder: Path, name: str, link: str) -> Model:
     """Return two near and two far peers whose bodies pull each other."""
     (folder / "parts").mkdir(exist_ok=True)
     force, _ = FORCES[name]
@@ -162,7 +162,7 @@ def punctual(delays: Callable[[int, int], int]) -> Late:
     return lambda i, j, tick: (max(-1, (tick - delays(i, j)) // 8), False)
 
 
-def check(system: CompiledSystem, expected: NDArray[np.float64], *, seed: int = 0, jit: bool = False) -> None:
+def check(system: Model, expected: NDArray[np.float64], *, seed: int = 0, jit: bool = False) -> None:
     found = simulate(system, duration=DURATION, signals=["body.*"], jit=jit, seed=seed)
     assert np.abs(expected).max() > 0.01
     # 300 steps: what rounding leaves, 1e-12 of the largest velocity.

@@ -6,7 +6,7 @@ import functools
 import tempfile
 from pathlib import Path
 
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from tests.topologies import compiled, library
 
 # x⁺ = e^{gT} x − p x(d ticks ago), p = pull (e^{gT} − 1)/g, which is pull·T where nothing grows.
@@ -67,7 +67,7 @@ SHAPES = {
 
 
 @functools.cache
-def built(text: str) -> CompiledSystem:
+def built(text: str) -> Model:
     """Compile a text that may use the parts of this file; the same text gives the same model."""
     return compiled(text, _parts())
 
@@ -79,7 +79,7 @@ def _parts() -> object:
         return library(Path(folder), LATE, FOLLOWER, *springs)
 
 
-def late(ticks: int, growth: float = 0.0) -> CompiledSystem:
+def late(ticks: int, growth: float = 0.0) -> Model:
     """Return one position pulled back by what it was so many ticks of 1 ms ago."""
     return built(
         "topology: late\nclocks: {tick: 1 ms}\npeers: {user: {count: 1}}\n"
@@ -87,7 +87,7 @@ def late(ticks: int, growth: float = 0.0) -> CompiledSystem:
     )
 
 
-def followers(packets: int, pull: float = 100.0) -> CompiledSystem:
+def followers(packets: int, pull: float = 100.0) -> Model:
     """Return three who follow one another's mean of so many packets ago, all at 1 kHz."""
     return built(
         "topology: followers\nclocks: {tick: 1 ms, network: 1 ms}\npeers: {user: {count: 3}}\n"
@@ -96,7 +96,7 @@ def followers(packets: int, pull: float = 100.0) -> CompiledSystem:
     )
 
 
-def sprung(shape: str, numbers: str = "low: 500 N/m, high: 8000 N/m, u: 2*dial - dial") -> CompiledSystem:
+def sprung(shape: str, numbers: str = "low: 500 N/m, high: 8000 N/m, u: 2*dial - dial") -> Model:
     """Return a device on a sampled spring whose stiffness follows a setting by a shape, 1 ms late."""
     return built(
         "topology: setting\nparameters: {dial: 700}\nclocks: {haptic: 1 ms}\npeers: {user: {count: 1}}\n"

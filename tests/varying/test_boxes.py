@@ -155,11 +155,11 @@ def test_a_box_over_a_delay_is_stable_where_every_delay_in_it_is() -> None:
         assert found.stable or not apc.analyze(system, set={"lan.delay": found.point[0]}).stable
 
 
-def changing(system: apc.CompiledSystem, low: float, high: float) -> Any:
+def changing(system: apc.Model, low: float, high: float) -> Any:
     return apc.prove_box(system, {"lan.delay": (low, high)}).changing
 
 
-def with_delays(system: apc.CompiledSystem, delays: list[float]) -> float:
+def with_delays(system: apc.Model, delays: list[float]) -> float:
     """Return the least that a scene grows by a frame if its packets have these delays again and again."""
     channel = Channel(None, None, "uniform", "newest", "hold", np.array(delays))
     recorded = replace(system, links=tuple(replace(link, channel=channel) for link in system.links))

@@ -13,7 +13,7 @@ import pytest
 
 import apc
 from apc.__main__ import run
-from apc.comparison.comparison import Comparison, Scheme
+from apc.comparison.comparison import Scheme, SchemeComparison
 from apc.compiler.errors import ApcError
 from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, compiled, replaced
 
@@ -42,7 +42,7 @@ hands: {push: {type: ConstantForce, flange: device, force: 1 N}}
 
 
 @cache
-def compared(*texts: str) -> Comparison:
+def compared(*texts: str) -> SchemeComparison:
     return apc.compare([compiled(text) for text in texts])
 
 

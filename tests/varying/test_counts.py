@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 import apc
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from tests.topologies import AVERAGE, MESH, compiled, replaced
 
@@ -17,7 +17,7 @@ RING, STAR = (replaced(MESH, ("delay: 8 ms}", f"delay: 8 ms, graph: {name}}}")) 
 EDGES = "{edges: [[1, 2], [2, 3]]}"
 
 
-def plain(system: CompiledSystem) -> tuple[object, ...]:
+def plain(system: Model) -> tuple[object, ...]:
     """Return what a scene is made of and how it moves."""
     groups = [(group.name, group.count) for group in system.groups]
     found = apc.analyze(system)

@@ -16,11 +16,11 @@ import pytest
 
 import apc
 from apc.__main__ import run
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.eigen.balls import precision
 from apc.vary.critical_values import Critical
-from apc.vary.crossing import ESTIMATE, OneStretch, Stretch, Verdict, search
+from apc.vary.crossing import ESTIMATE, SingleSegment, SmoothSegment, Verdict, search
 from apc.vary.line import one_by_one
 from apc.vary.margins import Margin
 from tests.bench import random_scans
@@ -54,7 +54,7 @@ DIFFERENT = replaced(
 )
 
 
-def scene(text: str) -> CompiledSystem:
+def scene(text: str) -> Model:
     """Return the scene of a text, or by its name."""
     if "\n" in text:
         return compiled(text)
@@ -62,13 +62,13 @@ def scene(text: str) -> CompiledSystem:
     return apc.compile(path if path.exists() else HARD / f"{text}.yaml")
 
 
-def stable_at(system: CompiledSystem, found: Critical | Margin, value: Fraction) -> bool | None:
+def stable_at(system: Model, found: Critical | Margin, value: Fraction) -> bool | None:
     """Return the verdict of an analysis with the number that was searched at a value."""
     unit = "" if found.unit == "1" else f" {found.unit}"
     return apc.analyze(system, set={found.parameter: f"{value}{unit}"}).stable
 
 
-def check(system: CompiledSystem, found: Critical, values: Sequence[Fraction] = ()) -> None:
+def check(system: Model, found: Critical, values: Sequence[Fraction] = ()) -> None:
     """Assert that analyses on both sides of every crossing, and at more values, say what the search says."""
     for one in found.crossings:
         # Bounds of an analysis may be wider than a crossing's own, that is proved with more digits.
@@ -181,7 +181,7 @@ def test_a_delay_that_stands_in_a_force_moves_the_force_as_well() -> None:
     ids=["an expression", "a start value", "a half width"],
 )
 def test_what_a_number_reaches_by_other_ways_has_its_known_value(
-    system: CompiledSystem, name: str, value: float, off: float
+    system: Model, name: str, value: float, off: float
 ) -> None:
     found = apc.critical(system, name, upper="40 mm" if "width" in name else None)
     (one,) = found.crossings
@@ -481,7 +481,7 @@ def test_a_long_delay_is_decided_as_an_analysis_decides_it(damping: str) -> None
 # ---- the search itself, on verdicts that are known ----
 
 
-class Known(OneStretch):
+class Known(SingleSegment):
     """A line of one stretch from 0 to 100 whose radius is a given function, open in a band about 1."""
 
     label = "number"
@@ -494,10 +494,10 @@ class Known(OneStretch):
         stable = None if abs(radius - 1) <= self.band else radius < 1
         return Verdict(stable, radius, self.band, (), "")
 
-    def stretches(self) -> Iterator[Stretch]:
+    def stretches(self) -> Iterator[SmoothSegment]:
         points = np.array([0.0, 1.0, 10.0, 50.0, 100.0])
         look = partial(one_by_one, self.judge)
-        yield Stretch(Fraction(0), Fraction(100), points, 1.0, look, self.judge, slow=True)
+        yield SmoothSegment(Fraction(0), Fraction(100), points, 1.0, look, self.judge, slow=True)
 
 
 def test_a_crossing_on_an_end_of_a_cell_is_held_from_both_sides() -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import apc
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.eigen.balls import precision
 from apc.vary.many import Analyses
@@ -20,7 +20,7 @@ from tests.paper_limit import BITS, truth
 from tests.topologies import AVERAGE, MESH, OSCILLATOR, ROOT, SCENES, compiled, replaced, told
 
 
-def as_alone(system: CompiledSystem, given: Mapping[str, Any], points: Any = None) -> Analyses:
+def as_alone(system: Model, given: Mapping[str, Any], points: Any = None) -> Analyses:
     """Analyse points and assert that each, or each of some, is as its own analysis says."""
     found = apc.analyze_many(system, given)
     rows = apc.parameters(system).rows

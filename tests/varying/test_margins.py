@@ -11,7 +11,7 @@ import pytest
 
 import apc
 from apc.__main__ import run
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.vary.margins import Margin
 from tests.topologies import AVERAGE, SCENES, compiled, replaced
 from tests.varying.test_critical_values import HARD, PRESSED, stable_at
@@ -43,11 +43,11 @@ def hasty(delay: str, stiffness: str = "60 N/m") -> str:
     )
 
 
-def rows_of(system: CompiledSystem) -> dict[str, Margin]:
+def rows_of(system: Model) -> dict[str, Margin]:
     return {one.parameter: one for one in apc.margins(system).rows}
 
 
-def holds(system: CompiledSystem, one: Margin) -> None:
+def holds(system: Model, one: Margin) -> None:
     """Assert that analyses decide otherwise on both sides of a margin."""
     assert one.value is not None and one.error is not None
     assert one.value > one.present and one.error <= 1e-6 * one.value

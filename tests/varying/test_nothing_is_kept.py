@@ -9,7 +9,7 @@ import sys
 import pytest
 
 import apc
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from tests.topologies import AVERAGE, ROOT, compiled, replaced
 
 OTHER = "user: {count: 2}\n  other: {count: 1, set: {device.mass: 0.3 kg}}"
@@ -31,7 +31,7 @@ SCENES: tuple[tuple[str, dict[str, str]], ...] = (
 DEEP, FIRST = (0, 1, 3, 5, 7), (5,)
 
 
-def scene(place: int) -> CompiledSystem:
+def scene(place: int) -> Model:
     text, change = SCENES[place]
     return apc.set_parameters(compiled(text), change)
 

@@ -9,8 +9,8 @@ import pytest
 
 import apc
 from apc.analysis.analysis import analyze
-from apc.compiler.compiled import CompiledSystem
-from apc.frame.names import Free
+from apc.compiler.compiled import Model
+from apc.frame.names import ParameterRef
 from apc.vary.timing_values import system_with_delay
 from tests.topologies import AVERAGE, compiled
 from tests.varying.closed_forms import built
@@ -28,7 +28,7 @@ couplers:
 """
 
 
-def pulled(delay_ms: int = 0, clocks: str = "", other: str = "", delay: str = "") -> CompiledSystem:
+def pulled(delay_ms: int = 0, clocks: str = "", other: str = "", delay: str = "") -> Model:
     """Return a position pulled back: x⁺ = x − p (T − d) x − p d x(a tick ago), stable below 2/p + 2 d."""
     return built(
         f"topology: pulled\nclocks: {{tick: 2 ms{clocks}}}\npeers: {{user: {{count: 1}}}}\n"
@@ -37,7 +37,7 @@ def pulled(delay_ms: int = 0, clocks: str = "", other: str = "", delay: str = ""
     )
 
 
-def beside(period: str) -> CompiledSystem:
+def beside(period: str) -> Model:
     """Return the same beside a second one that stays, and decides nothing."""
     other = "  that: {type: Late, pull: 1 Hz, growth: 0 Hz, clock: other, delay: 0 ms}\n"
     return pulled(0, f", other: {period}", other)
@@ -61,7 +61,7 @@ def test_beside_another_clock_the_error_is_the_gap_between_periods(period: str) 
     unit = Fraction(int(period[0]), 1000)
     for side, stable in ((-1, True), (1, False)):
         end = Fraction((one.value + side * one.error) / float(unit)).limit_denominator(400) * unit
-        assert analyze(system_with_delay(system, Free("tick.period"), end)).stable is stable
+        assert analyze(system_with_delay(system, ParameterRef("tick.period"), end)).stable is stable
 
 
 def test_the_textbook_wall_with_passive_hands_has_its_longest_period() -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import apc
 from apc.__main__ import run
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.present.region_picture import stable_outlines
 from apc.regions.boundary import relative_to
@@ -32,7 +32,7 @@ TOLERANCE = 1e-9
 
 
 @cache
-def scene(name: str) -> CompiledSystem:
+def scene(name: str) -> Model:
     folders = (SCENES, ROOT / "tests" / "scenes", ROOT / "tests" / "hard")
     return apc.compile(next(path for one in folders if (path := one / f"{name}.yaml").exists()))
 
@@ -47,7 +47,7 @@ def random_points(found: Region, count: int, seed: int = 7) -> list[list[float]]
     return (low + width * np.random.default_rng(seed).uniform(0, 1, (count, 2))).tolist()
 
 
-def stable(system: CompiledSystem, found: Region, x: float, y: float) -> bool | None:
+def stable(system: Model, found: Region, x: float, y: float) -> bool | None:
     values = zip((found.x, found.y), (x, y), strict=True)
     settings = {axis.free.label: f"{value!r} {axis.unit}".removesuffix(" 1") for axis, value in values}
     return apc.analyze(system, set=settings).stable
@@ -76,7 +76,7 @@ def true_error(found: Region, every: int) -> float:
 WALL = 3378.9392990035294
 
 
-def fields(first: str, second: str = "-1") -> CompiledSystem:
+def fields(first: str, second: str = "-1") -> Model:
     """Return two devices on walls of their own, stable where both functions of u and v are below 0."""
     wall = (
         f'type: SampledSpringDamper, b: ground, clock: tick, delay: 1 ms, stiffness: "scale*({WALL!r} + 1000*'
@@ -252,7 +252,7 @@ PLANES = {
 
 
 @cache
-def plane(name: str) -> tuple[CompiledSystem, Region]:
+def plane(name: str) -> tuple[Model, Region]:
     text, x, y, settings = PLANES[name]
     system = apc.set_parameters(compiled(text) if "\n" in text else scene(text), settings)
     return system, apc.region(system, x=x, y=y)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import apc
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import Model
 from apc.vary.sensitivity import Sensitivities
 from tests.bench.sensitivity_truth import check_sensitivities, run
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, library, replaced
@@ -83,7 +83,7 @@ def test_where_the_groups_differ_each_has_a_derivative_of_its_own() -> None:
         assert found[name] == pytest.approx(other[name], rel=1e-9)
 
 
-def changed(system: CompiledSystem, every: int) -> str:
+def changed(system: Model, every: int) -> str:
     """Set the number of every so many rows 1 ‰ off, as `--set` does; compare the radius with its row."""
     found = apc.sensitivities(system)
     radius = apc.analyze(system).spectral_radius

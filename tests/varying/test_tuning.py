@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import apc
-from apc.frame.names import Free
+from apc.frame.names import ParameterRef
 from apc.moments.changing_delay import loop_gain
 from apc.present.tuning_output import panels_of
 from apc.tuning.demands import read_against, read_demands
@@ -122,7 +122,7 @@ def test_a_front_is_the_best_of_a_gain_for_each_bound_on_what_is_felt() -> None:
 
 
 # What is to be best, whether large, and what it is with a stiffness.
-AIMS: dict[str, tuple[bool, Callable[[apc.Feel, float], float]]] = {
+AIMS: dict[str, tuple[bool, Callable[[apc.Transparency, float], float]]] = {
     "feel.error at 1 Hz": (False, lambda felt, _: abs(felt.error_per_force[0])),
     "feel.impedance at 5 Hz": (True, lambda felt, _: abs(felt.impedance[1])),
     "feel.error_h2": (False, lambda felt, _: felt.h2[0].error_m or np.nan),
@@ -237,7 +237,7 @@ def test_a_range_of_a_delay_is_of_constant_delays_and_changing_ones_are_reported
     assert with_delays(stable, by_turns) < 1
     # A part in fifty higher nothing is proved.
     more = apc.set_parameters(model, {K: 1.02 * asked.value})
-    assert loop_gain(more, Free("lan.delay"), Fraction("0.02"), Fraction("0.06")) > 1
+    assert loop_gain(more, ParameterRef("lan.delay"), Fraction("0.02"), Fraction("0.06")) > 1
 
 
 def test_what_cannot_be_asked_is_refused() -> None:
