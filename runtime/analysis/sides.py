@@ -105,7 +105,8 @@ def sides(system: Model, prepared: Prepared) -> tuple[Side, ...]:
     Raises
     ------
     ApcError
-        E808 an equation that jumps at the start values, or more than MOST_SIDES combinations.
+        E808 an equation that jumps at the start values, a kink in a sum over several senders, or more than
+        MOST_SIDES combinations.
     """
     if prepared.starting or all(_smooth(prepared.jacobians[group.kind]) for group in system.groups):
         return (Side("", system, prepared),)
@@ -133,8 +134,8 @@ def sides(system: Model, prepared: Prepared) -> tuple[Side, ...]:
             ) from None
     if not any(piece.taken for listed in pieces for piece in listed):
         return (Side("", system, replace(prepared, schedules=whole.schedules)),)
-    alike = _interchangeable(scene, origins, pieces)
-    count = math.prod(math.comb(len(peers) + len(pieces[peers[0]]) - 1, len(peers)) for peers in alike)
+    exchangeable = _interchangeable(scene, origins, pieces)
+    count = math.prod(math.comb(len(peers) + len(pieces[peers[0]]) - 1, len(peers)) for peers in exchangeable)
     large = any(
         len(listed) > 1 and group.count > 1 for group, listed in zip(parts, pieces, strict=True)
     )  # not divided
@@ -146,10 +147,11 @@ def sides(system: Model, prepared: Prepared) -> tuple[Side, ...]:
     ]
     result = []
     choices = (
-        itertools.combinations_with_replacement(range(len(pieces[peers[0]])), len(peers)) for peers in alike
+        itertools.combinations_with_replacement(range(len(pieces[peers[0]])), len(peers))
+        for peers in exchangeable
     )
     for chosen in itertools.product(*choices):
-        side_of = dict(zip(itertools.chain(*alike), itertools.chain(*chosen), strict=True))
+        side_of = dict(zip(itertools.chain(*exchangeable), itertools.chain(*chosen), strict=True))
         texts = [names[n][side_of[n]] for n in range(len(parts))]
         taken = [pieces[n][side_of[n]] for n in range(len(parts))]
         result.append(_side(scene, prepared, origins, taken, _named(scene, pieces, texts)))
@@ -274,10 +276,8 @@ def _points(starting: StartClasses, g: int) -> Iterable[Point]:
 def _refuse_several_senders(
     switched: SwitchedPeerType, starting: StartClasses, g: int, pieces: Sequence[LinearPiece]
 ) -> None:
-    """Refuse a kink in what a peer makes of each sender where it receives from several: one may be on each
-    side.
-    """
-    if len(pieces) < 2:
+    """Refuse a kink in a term of each sender where there are several: each may be on another side."""
+    if all(equal(piece.slopes, pieces[0].slopes) for piece in pieces):
         return
     for name, column in switched.columns.items():
         link = name.partition(" ")[2]

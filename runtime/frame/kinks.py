@@ -150,11 +150,11 @@ def pieces_at(switched: SwitchedPeerType, point: Point, *, every: bool = False) 
         values, slopes, sizes = map(np.asarray, functions.slopes(*columns, symbols))
         piece = LinearPiece(tuple(tied.items()), moving, values.ravel(), slopes)
         # No number on one side alone, as of a root or logarithm there, is a jump too.
-        beside = [result[0].values] if result else []
+        others = [result[0].values] if result else []
         if points & tied.keys():
             at = _symbols(switched, functions, columns, {**tied, **dict.fromkeys(points & tied.keys(), True)})
-            beside.append(np.asarray(functions.slopes(*columns, at)[0]).ravel())
-        if any(not (np.abs(piece.values - other) <= TIE * sizes.ravel()).all() for other in beside):
+            others.append(np.asarray(functions.slopes(*columns, at)[0]).ravel())
+        if any(not (np.abs(piece.values - other) <= TIE * sizes.ravel()).all() for other in others):
             raise _refused(switched, list(tied), "jumps there")
         if every or not any(equal(piece.slopes, other.slopes) for other in result):
             result.append(piece)

@@ -193,8 +193,8 @@ def _between_periods(strips: Sequence[_Strip]) -> list[_Strip]:
     result = []
     for n, strip in enumerate(strips):
         width = strip.end - strip.start
-        beside = [strips[k].area for k in (n - 1, n + 1) if 0 <= k < len(strips)]
-        off = strip.off + max((abs(area - strip.area) for area in beside), default=0.0) / 2
+        neighbours = [strips[k].area for k in (n - 1, n + 1) if 0 <= k < len(strips)]
+        off = strip.off + max((abs(area - strip.area) for area in neighbours), default=0.0) / 2
         arcs = tuple(replace(arc, errors=arc.errors + width) for arc in strip.arcs)
         result.append(replace(strip, arcs=arcs, off=off))
     return result

@@ -209,9 +209,9 @@ def periods_near(
         for end in (low, high):  # on both sides of it, as near as there is one
             for share in SHARES:
                 ends = sorted((near, near + (end - near) * share))
-                beside = long_period_between(system, free, unit, *ends)
-                if beside is not None:
-                    found.add(beside)
+                long_period = long_period_between(system, free, unit, *ends)
+                if long_period is not None:
+                    found.add(long_period)
                     break
     if len(found) < 2:
         span = " to ".join(with_unit(f"{float(end):g}", "s") for end in (targets[0], targets[-1]))
