@@ -33,10 +33,10 @@ _WAITING = """\
 import signal, sys, time
 from apc.__main__ import run
 from apc.cli import progress
-from apc.sweeps.finished_parts import Parts
+from apc.sweeps.finished_parts import SweepParts
 signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored by what a shell starts in the background
 progress.QUIET = float('inf')
-kept, write = [], Parts.write
+kept, write = [], SweepParts.write
 
 def write_and_wait(*arguments):
     write(*arguments)
@@ -44,7 +44,7 @@ def write_and_wait(*arguments):
     while len(kept) == int(sys.argv[1]):  # signal.pause() would miss a signal that comes just before it
         time.sleep(0.01)
 
-Parts.write = write_and_wait
+SweepParts.write = write_and_wait
 sys.exit(run(["sweep", *sys.argv[2:]]))
 """
 
