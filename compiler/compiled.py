@@ -362,11 +362,13 @@ class Experiment:
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """A range of a parameter, in SI, for a study."""
+    """A range of a parameter, in SI; `line` and `column` are where the topology gives it, 0 if not known."""
 
     parameter: str
     low: Fraction
     high: Fraction
+    line: int = 0
+    column: int = 0
 
 
 @dataclass(frozen=True, slots=True)

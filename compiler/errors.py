@@ -12,7 +12,7 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 SHOWN = 75  # characters of a source line, so that it fits a terminal of 80 with its indent
 
@@ -69,7 +69,8 @@ class Diagnostic:
     """One fault in the input: what it is about, what was got, what was expected, the line to write.
 
     It reads `PLACE: CODE WHAT wants EXPECTED, got GOT. Write: HINT`; `expected`, `got` and `hint`
-    may be empty, and then their part of the sentence is left out.
+    may be empty, and then their part of the sentence is left out. `subject` is the name of the unit, part or
+    number at fault, for decisions: no text has it.
     """
 
     code: str
@@ -78,6 +79,7 @@ class Diagnostic:
     expected: str = ""
     got: str = ""
     hint: str = ""
+    subject: str = field(default="", compare=False, repr=False)
 
     def __str__(self) -> str:
         """Return the message with the source line and a caret under the place."""
@@ -145,15 +147,16 @@ class Mistakes:
         expected: str = "",
         got: str = "",
         hint: str = "",
+        subject: str = "",
     ) -> None:
         """Record one mistake; the same mistake twice counts once.
 
         Parameters
         ----------
-        code, place, what, expected, got, hint
+        code, place, what, expected, got, hint, subject
             As `Diagnostic` has them.
         """
-        self._found[Diagnostic(code, place, what, expected, got, hint)] = None
+        self._found[Diagnostic(code, place, what, expected, got, hint, subject)] = None
 
     def take(self, error: ApcError) -> None:
         """Record every mistake of an error raised further down."""

@@ -20,12 +20,12 @@ from apc.analysis.methods import PAPER
 from apc.analysis.sides import Side
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
-from apc.eigen.spectrum import UNSTABLE
 from apc.frame.instance import Prepared, prepare
 from apc.result import Result
 from apc.vary.margins import NOT_STABLE, Margins, network_margins
 from apc.vary.margins import margins as margins_of
 from apc.vary.sensitivity import Sensitivities, network_sensitivities, sensitivities, varied
+from apc.verdict import StabilityVerdict, Term
 
 if TYPE_CHECKING:
     from apc.analysis.box_proof import RobustStability
@@ -301,6 +301,7 @@ def proved_at(
     from apc.analysis.box_proof import RobustStability
     from apc.network.nominal import unreliable
 
+    verdict: Term
     if passive:
         from apc.hands.passivity import passive_hands
 
@@ -381,7 +382,7 @@ def _margins(system: Model, prepared: Prepared, analysis: Analysis, *, wanted: b
     """Return the margins, or only why they couldn't be had."""
     if wanted is False:
         return Margins((), "not looked for: they were not wanted")
-    if analysis.stable is None or analysis.verdict == UNSTABLE:
+    if analysis.stable is None or analysis.verdict is StabilityVerdict.UNSTABLE:
         return Margins((), NOT_STABLE.format("proved stable" if analysis.stable is None else "stable"))
     if why := _too_many_peers(system, analysis):
         return Margins((), why)

@@ -38,12 +38,11 @@ def option_value(option: str, text: str, *, what: str, unit: str) -> Fraction:
     from apc.compiler.language.units import quantity
 
     try:
-        return Fraction(quantity(text, SourceLocation(option), what=what, unit=unit).value)
+        return Fraction(quantity(text, SourceLocation(option), what=what, unit=unit, before="").value)
     except ApcError as error:
-        hints = [mistake.hint.replace(f"{what}: ", "") for mistake in error.mistakes]
         raise ApcError(
-            replace(mistake, hint=f'{option} "{hint}"' if hint else "")
-            for mistake, hint in zip(error.mistakes, hints, strict=True)
+            replace(mistake, hint=f'{option} "{mistake.hint}"' if mistake.hint else "")
+            for mistake in error.mistakes
         ) from None
 
 
@@ -88,11 +87,12 @@ def option_values(
     right: list[str] = []  # what is to be written of each
     for text in with_last_unit(texts):
         try:
-            values.append(Fraction(quantity(text, place, what=label, unit=unit).value))
+            read = quantity(text, place, what=label, unit=unit, before="", one_fix=True)
+            values.append(Fraction(read.value))
             right.append(text)
         except ApcError as error:
             mistakes += error.mistakes
-            right.append(error.mistakes[0].hint.partition(", or ")[0].removeprefix(f"{label}: "))
+            right.append(error.mistakes[0].hint)
     if mistakes:
         hint = f"{label}={between.join(right)}{rest}" if all(right) else ""
         raise ApcError(replace(mistakes[0], hint=hint))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import enum
 import functools
 import graphlib
 import importlib
@@ -13,6 +14,7 @@ import re
 import subprocess
 import sys
 import zipfile
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import pytest
@@ -33,6 +35,7 @@ UNPICKLING = {"pickle", "marshal", "shelve", "dill", "cloudpickle"}
 class Module:
     """What a module imports, anywhere in it; what it calls by which line; its kinds of results."""
 
+    path: str
     text: str
     imports: set[str]
     calls: list[str]
@@ -52,7 +55,7 @@ def modules() -> dict[str, Module]:
 
 def read(path: Path) -> Module:
     tree = ast.parse(text := path.read_text(encoding="utf-8"))
-    module = Module(text, set(), [], [])
+    module = Module(path.relative_to(ROOT).as_posix(), text, set(), [], [])
     defined = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -146,6 +149,82 @@ def test_what_holds_arrays_is_not_compared_by_them() -> None:
                     wrong += [f"{name}.{one.__name__}"] if one.__eq__ is not object.__eq__ else []
     assert looked > 10
     assert not wrong
+
+
+# Fields of results and messages that hold our own prose, or the data that it is made from.
+PROSE = {"verdict", "proof", "note", "notes", "hint", "left_out", "what", "sentence", "reason", "warnings"}
+# Fields whose name others use for codes, too: none of them is taken apart as a text.
+CODED = {"why", "expected", "got", "refusal", "refused", "summary"}
+READING = {"startswith", "endswith", "partition", "rpartition", "split", "replace", "find", "index", "count"}
+READING |= {"removeprefix", "removesuffix"}
+MATCHING = {"search", "match", "fullmatch", "findall", "finditer", "sub"}
+# Sentences put into another one without their full stop, and equal ones listed once.
+JOINED = {"runtime/benchmark/speed_and_error.py", "compiler/errors.py"}
+
+
+def prose_in(node: ast.AST, bound: Mapping[str, str]) -> str:
+    """Return the field of prose that an expression is, or an element of which it is; "" of none."""
+    if isinstance(node, ast.Attribute) and node.attr in PROSE | CODED:
+        return node.attr
+    if isinstance(node, ast.Name):
+        return bound.get(node.id, node.id if node.id in PROSE - {"what", "reason"} else "")
+    return ""
+
+
+def is_text(node: ast.AST, names: Mapping[str, object]) -> bool:
+    """Return whether an expression is a text and no member of an enum, or holds one."""
+    if isinstance(node, ast.Tuple | ast.Set | ast.List):
+        return any(is_text(item, names) for item in node.elts)
+    value = node.value if isinstance(node, ast.Constant) else None
+    if isinstance(node, ast.Name):
+        value = names.get(node.id)
+    values = value if isinstance(value, tuple | set | frozenset | list) else [value]
+    return isinstance(node, ast.JoinedStr) or any(
+        isinstance(item, str) and not isinstance(item, enum.Enum) and item for item in values
+    )
+
+
+def prose_read(tree: ast.AST, names: Mapping[str, object]) -> Iterator[tuple[int, str]]:
+    """Yield the lines at which code reads prose, and how.
+
+    Parameters
+    ----------
+    tree, names
+        A module's code, and the values of its global names.
+    """
+    bound: dict[str, str] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.comprehension | ast.For) and (field := prose_in(node.iter, {})):
+            *_, last = [part for part in ast.walk(node.target) if isinstance(part, ast.Name)]
+            bound[last.id] = field
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            read = []
+            if node.func.attr in READING and not (node.func.attr == "index" and node.keywords):
+                read = [node.func.value]
+            elif node.func.attr in MATCHING:
+                read = [part for argument in node.args for part in ast.walk(argument)]
+            if any(prose_in(part, bound) for part in read):
+                yield node.lineno, ast.unparse(node)
+        elif isinstance(node, ast.Compare):
+            sides = [node.left, *node.comparators]
+            fields = {prose_in(side, bound) for side in sides} & PROSE
+            if fields and any(is_text(side, names) for side in sides):
+                yield node.lineno, ast.unparse(node)
+
+
+def test_no_decision_reads_a_sentence() -> None:
+    """A verdict, proof or limitation is data: its words are for people."""
+    wrong = [
+        f"{path}:{line}: {code}"
+        for name, module in modules().items()
+        for path in [module.path]
+        for line, code in prose_read(ast.parse(module.text), vars(importlib.import_module(name)))
+        if path not in JOINED
+    ]
+    assert not wrong, "\n".join(wrong)
+    found = 'result.verdict.startswith("stable")', '"bits" in verdict.proof', 'row.proof == "proved"'
+    assert all([*prose_read(ast.parse(code), {})] for code in found)
 
 
 def python(code: str, folder: Path) -> str:

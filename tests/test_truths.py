@@ -39,7 +39,7 @@ def _point(name: str, **asked: object) -> Said:
     if asked.get("certify"):
         # Floats that decided stay where balls do not; of determinants there is no proof.
         said = ("proved", "decided with") if one.stable is not None else "undecided at"
-        assert one.proof.startswith(said) or one.method == "determinant"
+        assert str(one.proof).startswith(said) or one.method == "determinant"
     return Said(
         one.spectral_radius, one.spectral_radius_error, one.rigid_modes, one.stable, one.verdict, one.notes
     )
@@ -243,7 +243,7 @@ LIMIT = _limits()
 def _critical(one: Limit) -> float:
     found = apc.critical(compiled(one.text), one.parameter, lower="1 N/m", upper=f"{2 * one.value} N/m")
     first = found.crossings[0]
-    assert first.stable_side == "below" and first.proof.startswith("proved") and found.whole
+    assert first.stable_side == "below" and str(first.proof).startswith("proved") and found.whole
     assert first.error <= 1e-12 * first.value
     return first.value
 

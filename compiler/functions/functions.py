@@ -123,7 +123,7 @@ def build_functions(system: SortedSystem, origin: Origin, *, linear: SortedSyste
         followers_of(parameters, timings.found, groups),
         warning_texts(scene.warnings),
         tuple(
-            Axis(f"{link.name}.delay", *link.within)
+            Axis(f"{link.name}.delay", *link.within, link.place.line, link.place.column)
             for link in scene.links
             if link.within and link.name in used
         ),

@@ -31,11 +31,18 @@ class ParseError(Exception):
     """A mistake that does not know yet where its text stands, so that results can be kept by text."""
 
     def __init__(
-        self, code: str, at: int | Token | None, what: str, expected: str = "", got: str = "", hint: str = ""
+        self,
+        code: str,
+        at: int | Token | None,
+        what: str,
+        expected: str = "",
+        got: str = "",
+        hint: str = "",
+        subject: str = "",
     ) -> None:
         super().__init__(what)
         self.offset = (at.start_pos if isinstance(at, Token) else at) or 0
-        self.mistake = Diagnostic(code, SourceLocation(""), what, expected, got, hint)
+        self.mistake = Diagnostic(code, SourceLocation(""), what, expected, got, hint, subject)
 
 
 @contextmanager

@@ -153,7 +153,15 @@ def parse_quantity(text: str, place: SourceLocation) -> Quantity:
         return _quantity(text)
 
 
-def quantity(text: str, place: SourceLocation, *, what: str, unit: str) -> Quantity:
+def quantity(
+    text: str,
+    place: SourceLocation,
+    *,
+    what: str,
+    unit: str,
+    before: str | None = None,
+    one_fix: bool = False,
+) -> Quantity:
     """Read a quantity that has to fit a unit.
 
     Parameters
@@ -166,6 +174,10 @@ def quantity(text: str, place: SourceLocation, *, what: str, unit: str) -> Quant
         The name it is given to, for messages.
     unit
         A unit that fits; `1` for a plain number.
+    before
+        What stands before the value in a fix, the name and a colon by default.
+    one_fix
+        Whether a fix is one quantity, where two may be meant.
 
     Raises
     ------
@@ -174,6 +186,7 @@ def quantity(text: str, place: SourceLocation, *, what: str, unit: str) -> Quant
     """
     wanted = parse_unit(unit, place)
     named = "a plain number" if unit == "1" else unit
+    before = f"{what}: " if before is None else before
     try:
         parsed = parse_quantity(text, place)
     except ApcError as error:
@@ -182,12 +195,11 @@ def quantity(text: str, place: SourceLocation, *, what: str, unit: str) -> Quant
         if mistake.code == "E223" and mistake.hint:
             meant = unit if alone and not _is_of(mistake.hint, wanted.dimension) else mistake.hint
             if not place.line:  # of an option, whose value is written anew
-                name = mistake.what.removeprefix("there is no unit ").split(" ")[0]
-                meant = f"{what}: {text.strip().replace(name, meant)}"
+                meant = f"{before}{text.strip().replace(mistake.subject, meant)}"
             raise ApcError(replace(mistake, hint=meant)) from None
         if mistake.code != "E221" or mistake.hint:
             raise
-        example = f"{what}: 1 {unit}".removesuffix(" 1")
+        example = f"{before}1 {unit}".removesuffix(" 1")
         raise ApcError(Diagnostic("E221", place, what, named, cut(text) or "nothing", example)) from None
     actual, due = parsed.unit.dimension, wanted.dimension
     got, right = cut(text.strip()), unit
@@ -198,17 +210,17 @@ def quantity(text: str, place: SourceLocation, *, what: str, unit: str) -> Quant
         turns = TURN if due.turning == "rad" else 1 / TURN
         same = f"{float(parsed.value * turns / wanted.scale):.9g} {unit}"
         got += f", which is {same}"
-        hint = f"{what}: {same}, or {what}: {parsed.number} {unit}"
+        hint = f"{before}{same}" + f", or {before}{parsed.number} {unit}" * (not one_fix)
     else:
         if parsed.unit == NO_UNIT:
             got += " (no unit)"
         else:
             right, slip = _meant(parsed.unit, wanted)
             got += f" ({slip} is {_long_name(slip)}: case matters)" if slip else ""
-        hint = f"{what}: {parsed.number} {right}".removesuffix(" 1") if right else ""
+        hint = f"{before}{parsed.number} {right}".removesuffix(" 1") if right else ""
         # A rate in the place of a time, or the other way round; radians don't say how long a turn takes.
         if actual == due.power(-1) and actual.turning != "rad" and parsed.value:
-            hint = f"{what}: {float(1 / (parsed.value * wanted.scale)):.9g} {unit}"
+            hint = f"{before}{float(1 / (parsed.value * wanted.scale)):.9g} {unit}"
     raise ApcError(Diagnostic("E204", place, what, named, got, hint))
 
 
@@ -399,7 +411,7 @@ def _looked_up(name: Token) -> str:
     # Nm is a yarn count to Pint, and a slip for N*m to everyone else.
     others = [(prefix, unit) for prefix, unit, _ in every.parse_unit_name(name) if unit != "number_meter"]
     if not others:
-        raise ParseError("E223", name, f"there is no unit {cut(name)}", hint=_proposal(name))
+        raise ParseError("E223", name, f"there is no unit {cut(name)}", hint=_proposal(name), subject=name)
     (prefix, unit), *_ = others
     spelled = f"{prefix}{unit}".replace("_", " ")
     roots = every.get_root_units(unit)[1]._units
@@ -412,7 +424,7 @@ def _looked_up(name: Token) -> str:
     what = f"there is no unit {name} here: {spelled} is out of use{proposed}"
     lower = name.lower()
     similar = (other for other in like if lower == other.lower() or lower.startswith(other))
-    raise ParseError("E223", name, what, hint=next(similar, ""))
+    raise ParseError("E223", name, what, hint=next(similar, ""), subject=name)
 
 
 def _proposal(name: str) -> str:

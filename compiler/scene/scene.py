@@ -106,16 +106,18 @@ def library_folders(source: Source) -> tuple[Path, ...]:
     return tuple(paths)
 
 
-def readable_library(folder: Path, text: str, place: SourceLocation, hint: str = "library: ./parts") -> Path:
+def readable_library(
+    folder: Path, text: str, place: SourceLocation, *, key: str = "library:", example: str = "./parts"
+) -> Path:
     """Return a folder of components. Raises ApcError (E214), at a place, for one that can't be read."""
     try:
         files_below(folder, SUFFIX)
     except RefusedError as refused:
-        what, form = f"the library folder {brief(text)} {refused.words}", hint.rpartition(" ")[0]
-        hint *= refused.why == "large"
+        what = f"the library folder {brief(text)} {refused.words}"
+        hint = f"{key} {example}" if refused.why == "large" else ""
         if refused.why == "missing" and folder.is_file():
             what = f"the library {brief(text)} is a file, and a library is a folder"
-            hint = f"{form} {text.rpartition('/')[0] or '.'}"
+            hint = f"{key} {text.rpartition('/')[0] or '.'}"
         elif refused.why == "missing" and folder != Path(text):
             what += f": {folder} was looked for, as paths begin beside the topology"
         raise fault("E214", place, what, hint=hint) from None

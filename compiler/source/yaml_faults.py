@@ -48,6 +48,15 @@ _PROBLEMS: tuple[tuple[str, str, str], ...] = (
 )
 
 
+# The problems whose place is that of the context: what is open, or broken, begins there.
+_OF_CONTEXT = (
+    "unexpected end of stream",
+    "quoted scalar",
+    "<document start>",
+    "flow mapping",
+    "flow sequence",
+)
+
 # A line that is a key with its value, which nothing can belong to.
 _KEY_AND_VALUE = re.compile(r"[^\s:{}\[\]'\"]+: +[^\s|>&]")
 
@@ -140,7 +149,7 @@ def not_yaml(error: yaml.MarkedYAMLError, lines: Lines) -> Diagnostic:
                 return mistake
     for part, sentence, hint in _PROBLEMS:
         if part in problem:
-            if error.context_mark and sentence.startswith("this ") and "indented" not in sentence:
+            if error.context_mark and part in _OF_CONTEXT:
                 place = lines.of(error.context_mark)
             return Diagnostic("E109", place, sentence, hint=hint)
     return Diagnostic("E109", place, f"this is not YAML: {error.problem}")

@@ -29,15 +29,7 @@ from apc.eigen.modes import arrange
 from apc.eigen.peers import MOST_STATES, PeerClass, peer_groups, representatives, states_of, used_ways
 from apc.eigen.rest import unrest
 from apc.eigen.rigid import NeutralModes, what_stands
-from apc.eigen.spectrum import (
-    DRIFTS,
-    STABLE_TRANSLATING,
-    TO_DRIFT,
-    Mode,
-    Spectrum,
-    solve_spectrum,
-    up_to,
-)
+from apc.eigen.spectrum import Mode, Spectrum, solve_spectrum, up_to
 from apc.frame.ages import linear_sites
 from apc.frame.discretize import TOO_LARGE
 from apc.frame.exchange import CommunicationGraph
@@ -47,6 +39,16 @@ from apc.frame.names import ParameterRef
 from apc.network.nominal import left_out, unreliable
 from apc.result import PlotStyle, Result
 from apc.threads import single_threaded
+from apc.verdict import (
+    NO_PROOF,
+    Limitation,
+    LimitationCode,
+    Note,
+    ProofOutcome,
+    ProofScope,
+    StabilityProof,
+    StabilityVerdict,
+)
 
 NOT_LINEAR = (
     "left out: the scene is not linear, and this holds near its start values only: of contacts and limits "
@@ -62,7 +64,7 @@ class Analysis(Result):
 
     `states_per_peer` is that of the largest kind of peer in the scene. `method` is one of `methods.METHODS`.
     `linearized` says that some site is not affine: the answer then holds near its start values only. `notes`
-    say why it was analysed as it was; `proof` says what ball arithmetic proved, "" where floats decided;
+    say why it was analysed as it was; `proof` is what ball arithmetic proved, false where floats decided;
     `left_out` says what of the scene the answer does not look at. Of the rigid modes
     `translations` and `rotations` move something; the others are of what `unfelt` names, memories that
     nothing reads at these values. `beyond` is how much larger than 1 the radius is, at least and at most,
@@ -77,15 +79,15 @@ class Analysis(Result):
     frame_s: float
     states_per_peer: int
     method: str
-    verdict: str
+    verdict: StabilityVerdict
     stable: bool | None
     spectral_radius: float
     spectral_radius_error: float
     rigid_modes: int
     modes: Sequence[Mode]
     linearized: bool
-    notes: tuple[str, ...]
-    proof: str = ""
+    notes: tuple[Note, ...]
+    proof: StabilityProof = NO_PROOF
     left_out: tuple[str, ...] = ()
     translations: int = 0
     rotations: int = 0
@@ -237,6 +239,7 @@ def _analyze(system: Model, *, method: str, prepared: Prepared, certify: bool) -
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         scene = instance(system, prepared)
         plan = make_plan(scene, method)
+        notes: tuple[Note, ...]
         if not plan.groups:
             spectrum, notes = _solve_populations(scene)
         elif plan.method == "determinant":
@@ -253,20 +256,24 @@ def _analyze(system: Model, *, method: str, prepared: Prepared, certify: bool) -
         if method == "determinant" and not np.isfinite(spectrum.spectral_radius_error):
             raise cannot_serve(system, method, "what a frame's ticks round hides the peers' own eigenvalues")
         if certify and (not plan.groups or plan.method == "determinant"):
-            notes = (*notes, f"not proved, as method {plan.method} has no matrix of balls")
+            notes = (*notes, Limitation(LimitationCode.NO_BALLS, (plan.method,)))
         nonlinear = not scene.affine
         elements = replaced_elements(system)
         linearized = nonlinear or bool(elements)
         population = () if plan.loops else representatives(scene)
         stands = _what_stands(spectrum, plan.loops, population)
         verdict, stable = spectrum.verdict, spectrum.stable
-        if verdict in (STABLE_TRANSLATING, DRIFTS):
-            text = up_to(stands.translations, stands.rotations)
-            verdict, stable = (DRIFTS, False) if stands.drifts else (text, True)
-        proof = spectrum.proof if verdict == DRIFTS else spectrum.proof.replace(TO_DRIFT, "stable")
-        of = (("linearization", linearized), ("nominal network", bool(unreliable(system))))
-        if proof and any(is_so for _, is_so in of):
-            proof += f", of the {' on the '.join(name for name, is_so in of if is_so)}"
+        if verdict in (StabilityVerdict.STABLE_TRANSLATING, StabilityVerdict.DRIFTS):
+            verdict = (
+                StabilityVerdict.DRIFTS if stands.drifts else up_to(stands.translations, stands.rotations)
+            )
+            stable = verdict.stable
+        proof = spectrum.proof
+        if proof.outcome is ProofOutcome.DRIFTS and verdict is not StabilityVerdict.DRIFTS:
+            proof = replace(proof, outcome=ProofOutcome.STABLE)  # what drifts is a memory that nothing reads
+        of = ((ProofScope.LINEARIZATION, linearized), (ProofScope.NOMINAL_NETWORK, bool(unreliable(system))))
+        if proof:
+            proof = replace(proof, scope=tuple(scope for scope, is_so in of if is_so))
     return Analysis(
         topology=system.name,
         peers=scene.exchange.peers,
@@ -348,7 +355,7 @@ def _solve_determinant(loops: Sequence[ModalSystem]) -> Spectrum:
     return solve_loops(loops)
 
 
-def _solve_populations(scene: Instance) -> tuple[Spectrum, tuple[str, ...]]:
+def _solve_populations(scene: Instance) -> tuple[Spectrum, tuple[Note, ...]]:
     """Solve peers that all differ."""
     from apc.large.determinant_spectrum import solve_populations
     from apc.large.populations import populations

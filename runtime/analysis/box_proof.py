@@ -29,15 +29,16 @@ from apc.analysis.cells import Cell, ParametricClosedLoop, contracted, matrices_
 from apc.compiler.compiled import Model
 from apc.compiler.timings import part
 from apc.eigen.rigid import find_rigid_modes, stays_rigid, what_stands
-from apc.eigen.spectrum import UNSTABLE, up_to
+from apc.eigen.spectrum import up_to
 from apc.frame.instance import Prepared, prepare
 from apc.frame.names import Range
 from apc.frame.overrides import Override, apply
 from apc.result import Result
 from apc.threads import single_threaded
+from apc.verdict import BoxVerdict, StabilityVerdict, Term
 
 Floats = NDArray[np.float64]
-UNDECIDED = "undecided"
+UNDECIDED = BoxVerdict.UNDECIDED
 
 # Work for each closed system, in analyses of a point, at some ten milliseconds each; a cell in floats is this
 # part of one.
@@ -75,7 +76,7 @@ class RobustStability(Result):
 
     topology: str
     ranges: tuple[Range, ...]
-    verdict: str
+    verdict: Term
     stable: bool | None
     cells: int
     open_share: float
@@ -132,7 +133,7 @@ def prove_box(
             values = [Override(interval.free, value) for interval, value in zip(ranges, point, strict=True)]
             analysis = analyze(apply(system, values), prepared=prepared)
             return (
-                analysis.verdict == UNSTABLE
+                analysis.verdict is StabilityVerdict.UNSTABLE
                 or analysis.spectral_radius - analysis.spectral_radius_error > inside
             )
 
@@ -142,7 +143,7 @@ def prove_box(
             partial(_looked, opened.questions, is_unstable),
             is_unstable,
             stable=up_to(opened.translations, opened.rotations),
-            unstable=UNSTABLE,
+            unstable=StabilityVerdict.UNSTABLE,
             cells=0 if opened.notes else cells,
         )
         if opened.notes and box_proof.stable is None:
@@ -196,8 +197,8 @@ def search_box(
     looks: CellTest,
     is_unstable: Callable[[tuple[Fraction, ...]], bool],
     *,
-    stable: str,
-    unstable: str,
+    stable: Term,
+    unstable: Term,
     cells: int | None = None,
 ) -> RobustStability:
     """Look at the middle and the corners of a box, then prove it cell by cell, the larger before the smaller.
@@ -218,8 +219,8 @@ def search_box(
     whole: Cell = tuple((interval.low, interval.high) for interval in ranges)
     looked, work = 0, 0.0
 
-    def answer(verdict: str, left: float, point: Sequence[Fraction]) -> RobustStability:
-        known = {stable: True, unstable: False}.get(verdict)
+    def answer(known: bool | None, left: float, point: Sequence[Fraction]) -> RobustStability:
+        verdict = UNDECIDED if known is None else stable if known else unstable
         where = tuple(map(float, point))
         return RobustStability(name, tuple(ranges), verdict, known, max(looked, 1), left, where, ())
 
@@ -228,14 +229,14 @@ def search_box(
 
     for point in (middle(whole), *itertools.product(*whole)):
         if is_unstable(point):
-            return answer(unstable, 1.0, point)
+            return answer(False, 1.0, point)
     level = [whole]
     while level and not enough():
         halves, done = list[Cell](), 0
         for cell, look in zip(level, looks(level), strict=False):
             looked, done, work = looked + 1, done + 1, work + look.work
             if look.unstable:
-                return answer(unstable, 1.0, middle(cell))
+                return answer(False, 1.0, middle(cell))
             if look.reach is not None:
                 widest = int(np.argmax(look.reach))
                 low, high = cell[widest]
@@ -245,9 +246,9 @@ def search_box(
                 break
         level = level[done:] + halves
     if not level:
-        return answer(stable, 0.0, ())
+        return answer(True, 0.0, ())
     share = sum(_volume(cell) for cell in level) / _volume(whole)
-    return answer(UNDECIDED, float(share), middle(level[0]))
+    return answer(None, float(share), middle(level[0]))
 
 
 def middle(cell: Cell) -> tuple[Fraction, ...]:

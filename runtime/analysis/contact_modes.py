@@ -22,13 +22,13 @@ from apc.analysis.switches import SwitchingPart, bind, switching_parts
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.compiler.timings import part
-from apc.eigen.spectrum import UNSTABLE
 from apc.frame.decisions import SwitchedPeerType, find_switches
 from apc.frame.instance import Prepared, prepare
 from apc.frame.jacobians import SubsystemJacobians
 from apc.frame.linearize import linearize
 from apc.frame.parameters import ResolvedNumbers, resolve
 from apc.result import Result
+from apc.verdict import StabilityVerdict
 
 EVERYONE = "on at every peer"
 NOBODY = "on at no peer"
@@ -43,12 +43,12 @@ class ContactMode:
 
     The spectral radius is per frame; `frequency_hz` is that of the mode of motion with it. `linearized` says
     that some piece is not linear, so that the answer holds near the start values only. Where a mode can't be
-    analysed, `verdict` is "" and `refusal` says why.
+    analysed, `verdict` is None and `refusal` is the reason.
     """
 
     name: str
     on: tuple[tuple[str, tuple[str, ...]], ...]
-    verdict: str
+    verdict: StabilityVerdict | None
     stable: bool | None
     spectral_radius: float
     spectral_radius_error: float
@@ -75,7 +75,7 @@ class ContactModes(Result):
     @property
     def unstable(self) -> tuple[str, ...]:
         """The names of the modes that are unstable."""
-        return tuple(mode.name for mode in self.modes if mode.verdict == UNSTABLE)
+        return tuple(mode.name for mode in self.modes if mode.verdict is StabilityVerdict.UNSTABLE)
 
     @property
     def summary(self) -> str:
@@ -150,7 +150,7 @@ def contact_modes(system: Model, *, prepared: Prepared | None = None) -> Contact
                 refusal = error.mistakes[0].sentence
         if analysis is None:
             nan = float("nan")
-            return ContactMode(name, on, "", None, nan, nan, 0.0, linearized=False, refusal=refusal)
+            return ContactMode(name, on, None, None, nan, nan, 0.0, linearized=False, refusal=refusal)
         return ContactMode(
             name=name,
             on=on,

@@ -34,6 +34,7 @@ from apc.frame.schedule import ORDER, ClockedValue, HoldUpdate, Propagate, Sched
 from apc.frame.scheduling import build_schedules
 from apc.frame.site import LinearSubsystem
 from apc.result import Result
+from apc.verdict import StabilityVerdict
 
 Order = tuple[str, ...]
 
@@ -65,13 +66,13 @@ class Outcome:
 
     `orders` are the orders of coincident events that mean this frame, `departures` in words what they all do
     other than the default order; `start` is what is heard before the first packet, "" where it can't matter.
-    Where the analysis refuses this reading, `verdict` is "" and `refusal` says why.
+    Where the analysis refuses this reading, `verdict` is None and `refusal` is the reason.
     """
 
     orders: tuple[Order, ...]
     departures: tuple[str, ...]
     start: str
-    verdict: str
+    verdict: StabilityVerdict | None
     stable: bool | None
     spectral_radius: float
     spectral_radius_error: float
@@ -114,7 +115,7 @@ class EventOrder(Result):
     def warning(self) -> str:
         """A warning in one sentence if the verdict flips, else ""."""
         default = self.outcomes[0]
-        other = next((outcome for outcome in self.outcomes if outcome.verdict != default.verdict), None)
+        other = next((outcome for outcome in self.outcomes if outcome.verdict is not default.verdict), None)
         if other is None:
             return ""
         verdict = other.verdict or "not analysed"
@@ -165,7 +166,7 @@ def conventions(
         )
         if isinstance(analysis, ApcError):
             nan, refusal = float("nan"), analysis.mistakes[0].sentence
-            return Outcome(tuple(orders), departures, start, "", None, nan, nan, frame_s, refusal)
+            return Outcome(tuple(orders), departures, start, None, None, nan, nan, frame_s, refusal)
         radius, error = analysis.spectral_radius, analysis.spectral_radius_error
         answer = analysis.verdict, analysis.stable, radius, error, analysis.frame_s
         return Outcome(tuple(orders), departures, start, *answer, refusal="", beyond=analysis.beyond)

@@ -45,7 +45,7 @@ from apc.eigen.modes import dense
 from apc.eigen.peers import PeerClass
 from apc.eigen.relative import relative_bounded, relative_coordinates, relative_places
 from apc.eigen.rigid import RigidModes, find_rigid_modes, what_stands
-from apc.eigen.spectrum import STABLE, Spectrum, solve_spectrum, up_to
+from apc.eigen.spectrum import Spectrum, solve_spectrum, up_to
 from apc.frame.discretize import discretize
 from apc.frame.finite_equations import finite_equations
 from apc.frame.lift import FrameMap
@@ -54,6 +54,7 @@ from apc.frame.schedule import CouplingTerm
 from apc.network.nominal import left_out
 from apc.result import Result
 from apc.threads import load_pool, single_threaded
+from apc.verdict import StabilityVerdict
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
@@ -152,7 +153,6 @@ def analyze_paper(system: Model) -> Analysis:
             raise _not_of_the_form(system, ["a scene in which nothing drifts"])
         spectrum = _with_turns(solve_spectrum([_without_rigid(loop, whole, rigid)]), solve_spectrum([whole]))
     stands = what_stands(whole)
-    text = up_to(stands.translations, stands.rotations)
     zero, size = (loop.ratio - 1) * len(loop.states), loop.starts[-1]
     return Analysis(
         topology=system.name,
@@ -160,7 +160,11 @@ def analyze_paper(system: Model) -> Analysis:
         frame_s=loop.frame_s,
         states_per_peer=-(-(size - zero) // system.peers),
         method=PAPER,
-        verdict=text if spectrum.verdict == STABLE else spectrum.verdict,
+        verdict=(
+            up_to(stands.translations, stands.rotations)
+            if spectrum.verdict is StabilityVerdict.STABLE
+            else spectrum.verdict
+        ),
         stable=spectrum.stable,
         spectral_radius=spectrum.spectral_radius,
         spectral_radius_error=spectrum.spectral_radius_error,

@@ -24,7 +24,7 @@ from apc.compiler.compiled import Group, Model, PeerColumn
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.eigen.peers import start_classes
 from apc.frame.decisions import SwitchedPeerType, find_switches
-from apc.frame.finite_equations import at_its_part, finite_equations
+from apc.frame.finite_equations import at_its_part, finite_equations, part_of
 from apc.frame.instance import Instance, Prepared, instance
 from apc.frame.jacobians import DECIDING, SubsystemJacobians, with_equations
 from apc.frame.kinks import (
@@ -41,6 +41,7 @@ from apc.frame.kinks import (
 )
 from apc.frame.linearize import at_start, of_rows, start_values
 from apc.frame.start_classes import StartClasses
+from apc.verdict import StabilityVerdict
 
 # Combinations of pieces that are analyzed one by one; peers of a group that are divided to find them.
 MOST_SIDES, MOST_PEERS = 16, 64
@@ -68,7 +69,7 @@ class SideVerdict:
     """The verdict of one side; the radius is per frame."""
 
     name: str
-    verdict: str
+    verdict: StabilityVerdict
     stable: bool | None
     spectral_radius: float
     spectral_radius_error: float
@@ -454,4 +455,5 @@ def _too_many(scene: Instance, pieces: Sequence[Sequence[LinearPiece]]) -> ApcEr
     ]
     kinks = ", ".join(dict.fromkeys(names))
     what = f"{kinks}: more than {MOST_SIDES} combinations of sides meet at the start values"
-    return ApcError(Diagnostic("E808", SourceLocation(scene.system.origin.topology), what))
+    place = SourceLocation(scene.system.origin.topology)
+    return ApcError(Diagnostic("E808", place, what, subject=part_of(names[0])))

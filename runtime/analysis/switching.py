@@ -30,13 +30,20 @@ from apc.compiler.timings import part
 from apc.frame.instance import Prepared, prepare
 from apc.result import Result
 from apc.unserved import NotSupportedError
+from apc.verdict import Term
 
-STABLE, CANNOT, OPEN = "stable", "cannot be", "not decided"
+
+class SwitchingVerdict(Term):
+    """The verdict over all patterns of contacts."""
+
+    STABLE = "stable"
+    CANNOT = "cannot be"
+    OPEN = "not decided"
 
 
 @dataclass(frozen=True, slots=True)
 class ArbitrarySwitching(Result):
-    """Whether a scene is stable however its contacts switch; `verdict` is one of STABLE, CANNOT and OPEN.
+    """Whether a scene is stable however its contacts switch; open if neither is proved.
 
     `reach` is how many times as stiff all contacts might be for the criterion to hold (infinite: any), None
     where it was not worked out; `mode` is where it is nearest to failing. `reason` says why it is not stable
@@ -46,7 +53,7 @@ class ArbitrarySwitching(Result):
     shown_by = "analysis_output:switching"
 
     topology: str
-    verdict: str
+    verdict: SwitchingVerdict
     reason: str
     reach: float | None = None
     mode: str = ""
@@ -55,7 +62,7 @@ class ArbitrarySwitching(Result):
     @property
     def stable(self) -> bool | None:
         """True where proved, False where some pattern is unstable, None where it is open."""
-        return {STABLE: True, CANNOT: False}.get(self.verdict)
+        return {SwitchingVerdict.STABLE: True, SwitchingVerdict.CANNOT: False}.get(self.verdict)
 
 
 @part("switching")
@@ -73,22 +80,24 @@ def switching(system: Model, modes: ContactModes, *, prepared: Prepared | None =
     """
     if any(link.channel is not None for link in system.links):
         return ArbitrarySwitching(
-            system.name, OPEN, "packets may be lost or late, and it is looked for on time only"
+            system.name,
+            SwitchingVerdict.OPEN,
+            "packets may be lost or late, and it is looked for on time only",
         )
     if modes.unstable:
         named = " or ".join(modes.unstable)
         when = "in any mode" if len(modes.unstable) == len(modes.modes) else f"when {named}"
-        return ArbitrarySwitching(system.name, CANNOT, f"it is not stable {when}")
+        return ArbitrarySwitching(system.name, SwitchingVerdict.CANNOT, f"it is not stable {when}")
     unknown = [mode.name for mode in modes.modes if mode.stable is None or mode.linearized]
     if unknown or modes.notes:
         reason = f"not known when {' or '.join(unknown)}" if unknown else modes.notes[0]
-        return ArbitrarySwitching(system.name, OPEN, reason)
+        return ArbitrarySwitching(system.name, SwitchingVerdict.OPEN, reason)
     try:
         return _judge(system.name, open_loops(system, prepared or prepare(system)))
     except NotSupportedError as why:
-        return ArbitrarySwitching(system.name, OPEN, str(why))
+        return ArbitrarySwitching(system.name, SwitchingVerdict.OPEN, str(why))
     except ApcError as error:
-        return ArbitrarySwitching(system.name, OPEN, error.mistakes[0].sentence)
+        return ArbitrarySwitching(system.name, SwitchingVerdict.OPEN, error.mistakes[0].sentence)
 
 
 def _judge(topology: str, loops: Sequence[LurePlant]) -> ArbitrarySwitching:
@@ -97,7 +106,7 @@ def _judge(topology: str, loops: Sequence[LurePlant]) -> ArbitrarySwitching:
     try:
         weights = weights_of(loops)
     except NotSupportedError as why:
-        return ArbitrarySwitching(topology, OPEN, str(why), jumps=jumps)
+        return ArbitrarySwitching(topology, SwitchingVerdict.OPEN, str(why), jumps=jumps)
     least, worst = min(((least_of(loop, weights), loop.name) for loop in loops), default=(np.inf, ""))
     reach = float("inf") if least >= 0 else float(-1 / least)
     if not reach > 1:
@@ -105,5 +114,5 @@ def _judge(topology: str, loops: Sequence[LurePlant]) -> ArbitrarySwitching:
     elif fails := [loop.name for loop in loops if not is_proved(loop, weights)]:
         reason = f"the circle criterion holds too narrowly to be proved in the {fails[0]} mode"
     else:
-        return ArbitrarySwitching(topology, STABLE, "", reach, worst, jumps)
-    return ArbitrarySwitching(topology, OPEN, reason, reach, worst, jumps)
+        return ArbitrarySwitching(topology, SwitchingVerdict.STABLE, "", reach, worst, jumps)
+    return ArbitrarySwitching(topology, SwitchingVerdict.OPEN, reason, reach, worst, jumps)

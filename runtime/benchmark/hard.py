@@ -27,6 +27,7 @@ from apc.compiler.pipeline import compile_topology
 from apc.compiler.source.nodes import MAX_BYTES
 from apc.result import Result
 from apc.threads import single_threaded
+from apc.verdict import StabilityVerdict
 
 TRUTHS = "truths.json"
 FOLDER = "--hard FOLDER, of scenes and their truths, as tests/hard of a copy of the repository"
@@ -48,7 +49,7 @@ class HardCase:
     about: str
     peers: int
     method: str
-    verdict: str
+    verdict: StabilityVerdict
     radius: str
     error: float
     bound: float

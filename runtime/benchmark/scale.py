@@ -30,6 +30,7 @@ from apc.compiler.words import counted
 from apc.processes import Patience, local_processes, results
 from apc.result import Result
 from apc.unserved import NotSupportedError
+from apc.verdict import StabilityVerdict
 
 Found = TypeVar("Found")
 
@@ -51,7 +52,7 @@ class ScaleRow:
     error: float | None
     bound: float
     method: str
-    verdict: str
+    verdict: StabilityVerdict
 
 
 @dataclass(frozen=True, slots=True)

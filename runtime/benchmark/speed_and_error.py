@@ -41,6 +41,7 @@ from apc.simulation.settings import CVODES, DEFAULT, EXACT, RK4, SEMI_IMPLICIT, 
 from apc.simulation.simulation import Simulation, prepare
 from apc.threads import single_threaded
 from apc.unserved import NotSupportedError
+from apc.verdict import Limitation, LimitationCode, Note, code_of
 
 Floats = NDArray[np.float64]
 
@@ -56,7 +57,8 @@ SAME = 64 * UNIT
 # How long the scene is played: longer than any start-up.
 DURATION = Fraction(1, 4)
 
-FAILED, WRONG = "FAILED, which is a bug", "WRONG"  # how what must not be is said
+# Limitations that no method may have.
+WRONG = {LimitationCode.WRONG_VERDICT, LimitationCode.OPEN_VERDICT, LimitationCode.WRONG_BOUND}
 
 # Of `analyze(method=…)`, and the two that are called otherwise.
 CERTIFIED = "certified"
@@ -101,8 +103,8 @@ class TaskComparison:
     timed: str
     measured: tuple[MethodTiming, ...]
     reference: str
-    refused: tuple[tuple[str, str], ...]
-    notes: tuple[str, ...] = ()
+    refused: tuple[tuple[str, Note], ...]
+    notes: tuple[Note, ...] = ()
     left_out: tuple[str, ...] = ()
 
     @property
@@ -113,8 +115,9 @@ class TaskComparison:
     @property
     def faults(self) -> tuple[str, ...]:
         """What must not be: a wrong verdict or bound, or a method that crashes."""
-        wrong = [note for note in self.notes if note.startswith(WRONG)]
-        return (*wrong, *(f"{name} {why}" for name, why in self.refused if why.startswith(FAILED)))
+        wrong = [note for note in self.notes if code_of(note) in WRONG]
+        crashed = [pair for pair in self.refused if code_of(pair[1]) is LimitationCode.CRASHED]
+        return (*map(str, wrong), *(f"{name} {reason}" for name, reason in crashed))
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,13 +225,13 @@ def bench_analysis(system: Model, *, rounds: int = ROUNDS) -> TaskComparison:
         for name, result in results.items()
     ]
     notes = [
-        f"{WRONG}: {name} says {result.verdict}, {default.method} {default.verdict}"
+        Limitation(LimitationCode.WRONG_VERDICT, (name, result.verdict, default.method, default.verdict))
         for name, result in results.items()
         if result.stable is not None and default.stable is not None and result.verdict != default.verdict
     ]
     if default.stable is None:
-        notes.append(f"{WRONG}: analyze leaves the verdict open: {default.verdict}")
-    notes += [f"{WRONG}: the bound of {item.name} does not hold" for item in measured if item.fails]
+        notes.append(Limitation(LimitationCode.OPEN_VERDICT, (default.verdict,)))
+    notes += [Limitation(LimitationCode.WRONG_BOUND, (item.name,)) for item in measured if item.fails]
     return TaskComparison(
         task="analyze",
         quantity="spectral radius",
@@ -244,11 +247,12 @@ def bench_analysis(system: Model, *, rounds: int = ROUNDS) -> TaskComparison:
 
 def _not_proved(analysis: Analysis) -> str:
     """Return why an analysis that was to prove its verdict did not, "" if it did."""
-    if analysis.proof.startswith("proved"):
+    outcome = analysis.proof.outcome
+    if outcome is not None and outcome.proved:
         return ""
-    return (
-        "; ".join(note for note in analysis.notes if "not proved" in note) or f"not proved: {analysis.proof}"
-    )
+    unproved = (LimitationCode.NOT_PROVED, LimitationCode.NO_BALLS)
+    reasons = [str(note) for note in analysis.notes if code_of(note) in unproved]
+    return "; ".join(reasons) or f"not proved: {analysis.proof}"
 
 
 def bench_simulation(system: Model, duration: Fraction = DURATION, *, rounds: int = ROUNDS) -> TaskComparison:
@@ -278,9 +282,8 @@ def bench_simulation(system: Model, duration: Fraction = DURATION, *, rounds: in
         )
         for name, item in ready.items()
     ]
-    text = dict(refused).get(
-        EXACT, "the exact transition, itself off by what one rounding of each number makes"
-    )
+    exact_by = "the exact transition, itself off by what one rounding of each number makes"
+    text = str(dict(refused).get(EXACT, exact_by))
     return _simulation(duration, pareto_front(measured), text, refused, tuple(notes))
 
 
@@ -288,8 +291,8 @@ def _simulation(
     duration: Fraction,
     measured: tuple[MethodTiming, ...],
     reference: str,
-    refused: tuple[tuple[str, str], ...],
-    notes: tuple[str, ...] = (),
+    refused: tuple[tuple[str, Note], ...],
+    notes: tuple[Note, ...] = (),
 ) -> TaskComparison:
     return TaskComparison(
         task="simulate",
@@ -376,16 +379,17 @@ def _distance(simulation: Simulation, exact: Simulation) -> float:
 
 def _first(
     calls: Mapping[str, Callable[[], Any]],
-) -> tuple[dict[str, Any], tuple[tuple[str, str], ...], dict[str, list[float]]]:
+) -> tuple[dict[str, Any], tuple[tuple[str, Note], ...], dict[str, list[float]]]:
     """Call everything once; return what came out, what was refused and why, and the times of slow ones."""
-    results, refused, slow = {}, [], {}
+    results, slow = {}, {}
+    refused: list[tuple[str, Note]] = []
     for name, call in calls.items():
         try:
             taken, results[name] = timed(call)
         except ApcError as error:
             refused.append((name, reason_of(error)))
         except Exception as error:  # a bug of one method is a result, and no reason to lose the others'
-            refused.append((name, f"{FAILED}: {error!r}"))
+            refused.append((name, Limitation(LimitationCode.CRASHED, (repr(error),))))
         else:
             if taken > ENOUGH:
                 slow[name] = [taken]

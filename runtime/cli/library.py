@@ -46,7 +46,10 @@ def library_command(
 
     own = () if folder is None else (folder,)
     library = Library(
-        tuple(readable_library(path, str(path), SourceLocation("--folder"), "--folder parts") for path in own)
+        tuple(
+            readable_library(path, str(path), SourceLocation("--folder"), key="--folder", example="parts")
+            for path in own
+        )
     )
     if name is None:
         document, lines = catalogue.library_document(library), catalogue.library_lines(library)

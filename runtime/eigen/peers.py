@@ -215,6 +215,10 @@ def check_size(sites: Sequence[SubsystemJacobians], exchange: CommunicationGraph
         raise too_large(exchange, f"{len(sites):,} different peers", states)
 
 
+# The subject of a refusal that a method without the matrix of all states avoids.
+MATRIX = "the matrix of all states"
+
+
 def too_large(exchange: CommunicationGraph, what: str, states: int, *, auto: bool = False) -> ApcError:
     """Return the refusal of a system of too many states, by the method `auto` or one that it may spare."""
     spared = "" if auto else "; apc analyze --method auto needs no such matrix of linear ones"
@@ -224,6 +228,7 @@ def too_large(exchange: CommunicationGraph, what: str, states: int, *, auto: boo
             SourceLocation(exchange.scene),
             f"{what} make one system of {states:,} states; the matrix of one may have {MOST_STATES:,}",
             hint=f"fewer peers that differ{spared}",
+            subject="" if auto else MATRIX,
         )
     )
 

@@ -33,19 +33,21 @@ from apc.frame.schedule import Propagate
 from apc.frame.site import every_matrix
 from apc.later import LazyTuple
 from apc.threads import single_threaded
+from apc.verdict import (
+    NO_PROOF,
+    Limitation,
+    LimitationCode,
+    Note,
+    ProofMethod,
+    ProofOutcome,
+    StabilityProof,
+    StabilityVerdict,
+)
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 Integers = NDArray[np.intp]
 Matrix = NDArray[Any]  # float64 or complex128
-
-STABLE = "stable"
-STABLE_TRANSLATING = "stable up to a common translation"
-STABLE_TURNING = "stable up to a common rotation"
-STABLE_MOVING = "stable up to a common translation and rotation"
-DRIFTS = "drifts"
-UNSTABLE = "unstable"
-UNDECIDED = "undecided: |ρ−1| below the error bound"
 
 # So many modes are looked at as a rule, twice the rows of a table; how the rest move is made together.
 LOOKED_AT = 64
@@ -114,9 +116,9 @@ class Spectrum:
 
     `spectral_radius` is per frame; `stable` is None when the verdict is undecided. The error bounds the
     radius from both sides, the verdict needs one: where hardly anything bounds it from below, a system can be
-    stable by less than its error. `proof` says what ball arithmetic proved, "" where floats decided; `notes`
-    say what could not be proved. `beyond` is how much larger than 1 the radius is, at least and at most,
-    where something was proved: it can be closer to 1 than floats are to each other.
+    stable by less than its error. `proof` is what ball arithmetic proved, false where floats decided;
+    `notes` are what could not be proved. `beyond` is how much larger than 1 the radius is, at least and at
+    most, where something was proved: it can be closer to 1 than floats are to each other.
     """
 
     modes: Sequence[Mode]
@@ -124,10 +126,10 @@ class Spectrum:
     spectral_radius_error: float
     rigid_modes: int
     drifts: int
-    verdict: str
+    verdict: StabilityVerdict
     stable: bool | None
-    proof: str
-    notes: tuple[str, ...]
+    proof: StabilityProof
+    notes: tuple[Note, ...]
     beyond: tuple[float, float] | None = None
 
 
@@ -153,7 +155,7 @@ def solve_spectrum(
     """
     solved = [_solve(system, rigid_modes_of(system)) for system in systems]
     lowest = max((item.low for item in solved), default=0.0)
-    notes: list[str] = []
+    notes: list[Note] = []
     for place, system in enumerate(systems):
         item = solved[place]
         drifting = bool(item.free.names) and not item.clear_of_one
@@ -168,7 +170,7 @@ def solve_spectrum(
             solved[place] = _prove(system, item)
             continue
         if certify or _is_open(item, lowest):
-            notes.append(f"{system.name}: not proved, as {reason}")
+            notes.append(Limitation(LimitationCode.NOT_PROVED, (system.name, reason)))
         if drifting and (free := find_rigid_modes(system)).drifts:
             solved[place] = _solve(system, free)
     low = max((item.low for item in solved), default=0.0)
@@ -188,7 +190,7 @@ def solve_spectrum(
         drifts=drifts,
         verdict=verdict,
         stable=stable,
-        proof=_proof_in_words(solved, drifts),
+        proof=_proof(solved, drifts),
         notes=tuple(notes),
         beyond=_beyond(solved),
     )
@@ -255,41 +257,38 @@ def _is_open(solved: _SolvedLoop, lowest: float) -> bool:
     )
 
 
-# What a proof says of a scene that drifts; a drift that nothing reads is none of the scene's.
-TO_DRIFT = "to drift"
-
-
-def _proof_in_words(solved: Sequence[_SolvedLoop], drifts: int) -> str:
-    """Say what was proved, "" where floats decided everything."""
+def _proof(solved: Sequence[_SolvedLoop], drifts: int) -> StabilityProof:
+    """Return what was proved, nothing where floats decided everything."""
     bits = max((item.bits for item in solved), default=0)
     if not bits:
-        return ""
+        return NO_PROOF
     unstable = [item.bits for item in solved if item.inside is False]
+    outcome = ProofOutcome.DRIFTS if drifts else ProofOutcome.STABLE
     if any(unstable):
-        return f"proved unstable with {max(unstable)} bits"
-    if any(item.inside is None for item in solved):
-        return f"undecided at {bits} bits"
-    if unstable or not all(item.bits for item in solved if len(item.pairs.values)):
-        return f"decided with {bits} bits where floats left it open"
-    return f"proved {TO_DRIFT if drifts else 'stable'} with {bits} bits"
+        outcome, bits = ProofOutcome.UNSTABLE, max(unstable)
+    elif any(item.inside is None for item in solved):
+        outcome = ProofOutcome.UNDECIDED
+    elif unstable or not all(item.bits for item in solved if len(item.pairs.values)):
+        outcome = ProofOutcome.PARTLY
+    return StabilityProof(ProofMethod.BALLS, bits, outcome)
 
 
-def judge(inside: Sequence[bool | None], rigid: int, drifts: int) -> tuple[str, bool | None]:
+def judge(inside: Sequence[bool | None], rigid: int, drifts: int) -> tuple[StabilityVerdict, bool | None]:
     """Return the verdict and whether it means stable, from where the eigenvalues of each system are."""
     if False in inside:
-        return UNSTABLE, False
+        return StabilityVerdict.UNSTABLE, False
     if None in inside:
-        return UNDECIDED, None
+        return StabilityVerdict.UNDECIDED, None
     if drifts:
-        return DRIFTS, False
+        return StabilityVerdict.DRIFTS, False
     return up_to(rigid), True
 
 
-def up_to(translations: int, rotations: int = 0) -> str:
+def up_to(translations: int, rotations: int = 0) -> StabilityVerdict:
     """Return the verdict of what is stable up to so many motions."""
     if translations:
-        return STABLE_MOVING if rotations else STABLE_TRANSLATING
-    return STABLE_TURNING if rotations else STABLE
+        return StabilityVerdict.STABLE_MOVING if rotations else StabilityVerdict.STABLE_TRANSLATING
+    return StabilityVerdict.STABLE_TURNING if rotations else StabilityVerdict.STABLE
 
 
 def _solve(system: ClosedLoop, free: RigidModes) -> _SolvedLoop:

@@ -1,6 +1,7 @@
 """Equations without a finite value, told as the user's mistake they are.
 
-Takes: a block of code that evaluates a scene's equations. Gives: `finite_equations`, `at_its_part`.
+Takes: a block of code that evaluates a scene's equations. Gives: `finite_equations`, `at_its_part`,
+`part_of`.
 Guarantees: a division by zero, a logarithm of a negative number or a loop that Newton's method does not solve
 becomes one `ApcError`; a mistake of numbers that know no scene is placed in this one; every other exception
 passes.
@@ -20,7 +21,7 @@ from apc.compiler.source.source import parse_source
 
 SOMEWHERE = SourceLocation("the scene")  # of a mistake in numbers by themselves
 
-_PART = re.compile(r"(?:^|\bder\(|\bslope of )(\w+)(?:[.\[]| of )")  # of what is not finite, or has a kink
+_PART = re.compile(r"(?:der\()?(\w+)[.\[]")  # of a variable, or of its derivative
 
 # What Python's math module and CasADi's Newton solver say of a point where a function has no value.
 _NO_VALUE = ("math domain error", "rootfinder", "Evaluation failed", "Newton", "cannot convert NaN")
@@ -55,6 +56,12 @@ def finite_equations(scene: str) -> Iterator[None]:
         raise
 
 
+def part_of(variable: str) -> str:
+    """Return the name of the part that a variable, or the derivative of one, belongs to; "" of none."""
+    part = _PART.match(variable)
+    return part[1] if part else ""
+
+
 def at_its_part(mistake: Diagnostic, topology: str, texts: Iterable[tuple[str, bytes]]) -> Diagnostic:
     """Return a mistake of a value that is not finite where the topology names the part of it.
 
@@ -65,14 +72,14 @@ def at_its_part(mistake: Diagnostic, topology: str, texts: Iterable[tuple[str, b
     topology, texts
         The file of the topology, and the texts of a scene by their files.
     """
-    text, part = dict(texts).get(topology), _PART.search(mistake.what)
-    if mistake.code != "E808" or part is None or text is None:
+    text = dict(texts).get(topology)
+    if mistake.code != "E808" or not mistake.subject or text is None:
         return mistake
     root = parse_source(text, file=topology).root
     for section in ("masses", "couplers", "hands", "links"):
         node = root.get(section) if isinstance(root, Mapping) else None
         for key, _ in node.entries if isinstance(node, Mapping) else ():
-            if key.text == part[1]:
+            if key.text == mistake.subject:
                 return replace(mistake, place=key.place)
     return replace(mistake, place=SourceLocation(topology))
 

@@ -29,6 +29,7 @@ from apc.compiler.compiled import PeerType
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.interpolation import jacobian
 from apc.frame.decisions import SwitchedPeerType, decided_kind, find_switches
+from apc.frame.finite_equations import part_of
 
 # A guard of this size relative to its terms is zero: its evaluation rounds some ten times.
 TIE = 2.0**-46
@@ -233,13 +234,14 @@ def _refused(switched: SwitchedPeerType, places: Sequence[int], why: str) -> Apc
         symbols = [switched.decisions[place].symbol for place in places]
         listed = (name for f in switched.functions for s in symbols for name in f.names(f.output, s))
         names = tuple(dict.fromkeys(_GENERATED.sub("", name) for name in listed))
-    return at_a_kink(switched.kind.name, f"{', '.join(names) or 'an equation'} {why}")
+    return at_a_kink(switched.kind.name, f"{', '.join(names) or 'an equation'} {why}", names)
 
 
-def at_a_kink(where: str, what: str) -> ApcError:
-    """Return the refusal of a point without a linearization."""
+def at_a_kink(where: str, what: str, names: Sequence[str]) -> ApcError:
+    """Return the refusal of a point without a linearization, at which the variables of these names switch."""
     text = f"{what}: there is no linearization at the start values, only on one side of it"
-    return ApcError(Diagnostic("E808", SourceLocation(where), text))
+    subject = part_of(names[0]) if names else ""
+    return ApcError(Diagnostic("E808", SourceLocation(where), text, subject=subject))
 
 
 def one_sided(switched: SwitchedPeerType, taken: Mapping[int, bool], moving: Moving) -> PeerType:
@@ -325,4 +327,4 @@ def refuse_kinks(kind: PeerType, where: str, point: Point) -> None:
     pieces = pieces_at(switched, point)
     if len(pieces) > 1:
         names = names_of(switched, [place for place, _ in pieces[0].taken])
-        raise at_a_kink(where, f"{', '.join(names) or 'an equation'} of {where} has a kink there")
+        raise at_a_kink(where, f"{', '.join(names) or 'an equation'} of {where} has a kink there", names)

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import PEERS, Model, PeerType
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.frame.exact import evaluate_exact
+from apc.frame.finite_equations import part_of
 from apc.frame.jacobians import SubsystemJacobians
 from apc.frame.kinks import refuse_kinks, tie_indicators
 from apc.frame.names import ParameterRef
@@ -327,7 +328,11 @@ def _check_finite(rows: Sequence[str], values: NDArray[np.float64], what: str, w
             hint = "start values at which every equation has a finite value and slope"
             raise ApcError(
                 Diagnostic(
-                    "E808", SourceLocation(where), f"{text}a number below zero, or the like", hint=hint
+                    "E808",
+                    SourceLocation(where),
+                    f"{text}a number below zero, or the like",
+                    hint=hint,
+                    subject=part_of(row),
                 )
             )
 

@@ -33,7 +33,7 @@ SECTIONS = ("clocks", "couplers", "hands", "links", "masses", "parameters")
 # A number of one peer, which is none that can be set: user[1].device.x.
 _ONE_PEER = re.compile(r"(?P<group>\w+)\[(?P<peer>\d{1,9})\]\.(?P<rest>.+)")
 
-GIVEN = "…"  # where the value stands that was to be set
+GIVEN = "…"  # in the place of a value that is not known
 MOST_LISTED = 20  # peers whose values are written out
 
 # The numbers of the hand that `--hands held` puts on each device.
@@ -92,7 +92,14 @@ def given_ranges(system: Model, others: Collection[Range] = ()) -> list[Range]:
 UNWRITTEN = {"loss": "0 %", "jitter": "0 ms"}
 
 
-def find(system: Model, name: str, place: SourceLocation = OVERRIDE, *, counts: bool = False) -> ParameterRef:
+def find(
+    system: Model,
+    name: str,
+    place: SourceLocation = OVERRIDE,
+    *,
+    counts: bool = False,
+    value: str = GIVEN,
+) -> ParameterRef:
     """Return the parameter or timing a person's name means, of the group it names, if any.
 
     Parameters
@@ -101,6 +108,8 @@ def find(system: Model, name: str, place: SourceLocation = OVERRIDE, *, counts: 
         The compiled scene, the name, and where it was given.
     counts
         Whether it may be the number of peers of a group, `user.count`.
+    value
+        The value to be set, for messages.
 
     Raises
     ------
@@ -134,10 +143,10 @@ def find(system: Model, name: str, place: SourceLocation = OVERRIDE, *, counts: 
         raise ApcError(Diagnostic("E623", place, what))
     if name in HELD and not any(text.startswith("hand.") for text in known):
         what = f"{written} is of the hand that --hands held puts on each device"
-        raise ApcError(Diagnostic("E622", place, what, hint=f"--hands held --set {name}=…"))
+        raise ApcError(Diagnostic("E622", place, what, hint=f"--hands held --set {name}={value}"))
     one_peer = _ONE_PEER.fullmatch(name)
     if one_peer is not None and one_peer["group"] in groups and one_peer["rest"] in parameters:
-        raise _of_one_peer(system, one_peer, place)
+        raise _of_one_peer(system, one_peer, place, value)
     if name not in known and rest in UNWRITTEN and any(link.name == first for link in system.links):
         what = f"{written} is not written in the topology, and only what is written can be varied"
         raise ApcError(
@@ -171,14 +180,14 @@ def overlap(system: Model, free: ParameterRef, other: ParameterRef) -> bool:
     return free.name in times_of(system, other.name) or other.name in times_of(system, free.name)
 
 
-def _of_one_peer(system: Model, result: re.Match[str], place: SourceLocation) -> ApcError:
+def _of_one_peer(system: Model, result: re.Match[str], place: SourceLocation, given: str) -> ApcError:
     """Return what is told of a value for one peer of a group: `user[1].device.x`."""
     group, rest = next(group for group in system.groups if group.name == result["group"]), result["rest"]
     what = f"{result[0]} is of one peer, and a setting is of all or of one group: a list gives each its own"
     parameter = next(parameter for parameter in system.parameters if parameter.name == rest)
     own = next((value for value in group.values if value.name == rest), parameter)
     value = with_unit(f"{own.value:.12g}", own.unit)
-    values = [GIVEN if k == int(result["peer"]) else value for k in range(1, group.count + 1)]
+    values = [given if k == int(result["peer"]) else value for k in range(1, group.count + 1)]
     hint = f"peers: {{{group.name}: {{count: {group.count}, set: {{{rest}: [{', '.join(values)}]}}}}}}"
     if group.count > MOST_LISTED:
         hint = f"peers: {{{group.name}: {{table: users.csv}}}}, a row a peer, and a column of {rest}"

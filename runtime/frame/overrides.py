@@ -23,7 +23,7 @@ from apc.compiler.language.evaluation import exact_value
 from apc.compiler.peer_counts import peers_of, recounted
 from apc.compiler.words import with_unit
 from apc.frame.display_units import DisplayUnit, as_shown
-from apc.frame.names import GIVEN, OVERRIDE, ParameterRef, find, unit_of
+from apc.frame.names import OVERRIDE, ParameterRef, find, unit_of
 from apc.frame.parameters import ParameterScope, columns_of, scope_of, with_times_of_groups
 
 N = TypeVar("N", Parameter, Timing)
@@ -54,20 +54,9 @@ def parse_override(system: Model, text: str) -> Override:
     if not (equals and name and value):
         form = "contact.stiffness=800 N/m"
         raise ApcError(Diagnostic("E621", OVERRIDE, "an override", "NAME=VALUE", text[:80], form))
-    try:
-        free = find(system, name, OVERRIDE, counts=True)
-    except ApcError as error:  # of one peer, with the value that it was to have
-        raise ApcError(
-            replace(mistake, hint=mistake.hint.replace(GIVEN, value)) for mistake in error.mistakes
-        ) from None
+    free = find(system, name, OVERRIDE, counts=True, value=value)
     unit = unit_of(system, free.name)
-    try:
-        result = quantity(value, OVERRIDE, what=name, unit=unit)
-    except ApcError as error:  # what is to be written is a setting, too
-        mistakes = [
-            replace(mistake, hint=mistake.hint.replace(f"{name}: ", f"{name}=")) for mistake in error.mistakes
-        ]
-        raise ApcError(mistakes) from None
+    result = quantity(value, OVERRIDE, what=name, unit=unit, before=f"{name}=")
     return Override(free, result.value)
 
 
@@ -197,9 +186,11 @@ def _check_bounds(system: Model) -> None:
     for timing in system.timings:
         got = _in_ms(timing.value)
         if timing.name in periods and timing.value <= 0:
-            mistakes.add("E625", OVERRIDE, timing.name, expected="a time above 0 s", got=got)
+            expected = "a time above 0 s"
+            mistakes.add("E625", OVERRIDE, timing.name, expected=expected, got=got, subject=timing.name)
         elif timing.value < 0:
-            mistakes.add("E625", OVERRIDE, timing.name, expected="a time of 0 s or more", got=got)
+            expected = "a time of 0 s or more"
+            mistakes.add("E625", OVERRIDE, timing.name, expected=expected, got=got, subject=timing.name)
     seconds = {timing.name: timing.value for timing in system.timings}
     for clock in system.clocks:
         if not seconds[clock.phase] < seconds[clock.period] and seconds[clock.period] > 0:
@@ -231,7 +222,9 @@ def check_bounds(
         return with_unit(f"{number * by:g}", unit)
 
     def out(expected: str, number: float) -> None:
-        mistakes.add(code, place, name, expected=f"{expected} {shown(number)}", got=shown(value))
+        mistakes.add(
+            code, place, name, expected=f"{expected} {shown(number)}", got=shown(value), subject=name
+        )
 
     if low is not None and parameter.open_minimum and value <= low:
         out("more than", low)

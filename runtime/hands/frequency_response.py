@@ -33,15 +33,13 @@ from apc.hands.viscosity import NetworkDamping, network_viscosity
 from apc.network.nominal import left_out
 from apc.result import PlotStyle, Result
 from apc.threads import single_threaded
+from apc.verdict import Limitation, LimitationCode
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 # What is told beside the responses.
 BESIDE = ("low_frequency", "network_viscosity", "hinf", "h2")
-
-# What is left out of the largest gains where copies are apart in modes of peers that differ, too.
-COUPLED = "largest gains leave out how far the copies of peers that differ move apart together"
 
 # The harmonics of the frame rate that are looked at beside the fundamental.
 ALIASES = (0, 1, -1)
@@ -136,7 +134,7 @@ class Transparency(Result):
     stable: bool | None
     linearized: bool
     left_out: tuple[str, ...]
-    notes: tuple[str, ...]
+    notes: tuple[Limitation, ...]
 
     def plot(self, ax: Any = None, *, kind: str = "bode", **look: Unpack[PlotStyle]) -> Any:
         """Draw Bode's plot or Nyquist's, as `look` says (see `result.PlotStyle`); return the matplotlib
@@ -216,16 +214,13 @@ def feel(
         for item, device in ((port, answers.device), (other, answers.other))
     )
     directions = [text for text in named if text.partition(".")[0] == named[0].partition(".")[0]]
-    others = (
-        f"along one direction; along others: {', '.join(f'--at {direction}' for direction in directions[1:])}"
-    )
-    notes = {
-        others: len(directions) > 1,
-        "of the map: the scene is unstable": verdict.stable is False,
-        "of slow motions nothing is told: something of the scene is slower still": not slow
-        and "low_frequency" in beside,
-        COUPLED: "hinf" in beside and bool(answers.error[0]),
-        "what noise does is not told: the fastest clock has a phase": steady and not h2 and "h2" in beside,
+    others = ", ".join(f"--at {direction}" for direction in directions[1:])
+    limitations = {
+        Limitation(LimitationCode.ONE_DIRECTION, (others,)): len(directions) > 1,
+        Limitation(LimitationCode.UNSTABLE_MAP): verdict.stable is False,
+        Limitation(LimitationCode.SLOWER_MOTION): not slow and "low_frequency" in beside,
+        Limitation(LimitationCode.COUPLED_COPIES): "hinf" in beside and bool(answers.error[0]),
+        Limitation(LimitationCode.CLOCK_PHASE): steady and not h2 and "h2" in beside,
     }
     return Transparency(
         topology=system.name,
@@ -247,7 +242,7 @@ def feel(
         stable=verdict.stable,
         linearized=not linear,
         left_out=(*near_start(system, prepared), *left_out(system)),
-        notes=tuple(note for note, applies in notes.items() if applies),
+        notes=tuple(limitation for limitation, applies in limitations.items() if applies),
     )
 
 

@@ -39,14 +39,11 @@ from apc.network.nominal import left_out
 from apc.result import Result
 from apc.threads import load_pool, single_threaded
 from apc.unserved import NotSupportedError
+from apc.verdict import NO_PROOF, ProofMethod, ProofScope, StabilityProof, Term
 
 Complexes = NDArray[np.complex128]
 
 OPTION = "--hands passive"
-STABLE, UNSTABLE = "stable with any passive hands", "unstable with some passive hands"
-UNDECIDED, NEVER = "undecided", "unstable with some passive hands, however much damping there is"
-
-PROVED = "proved by floats whose every rounding is bounded"
 
 CIRCULATES = (
     "What devices feel of one another at rest is not what springs give: moved slowly round, they give back "
@@ -62,6 +59,15 @@ SHOWN = (1e-7, 1e-5)
 
 # Two frequencies fit a motion alike, relatively.
 ALIKE = 1e-6
+
+
+class PassivityVerdict(Term):
+    """The verdict with all passive hands; `NEVER` where no damping makes it stable."""
+
+    STABLE = "stable with any passive hands"
+    UNSTABLE = "unstable with some passive hands"
+    UNDECIDED = "undecided"
+    NEVER = "unstable with some passive hands, however much damping there is"
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +109,7 @@ class AbsoluteStability(Result):
     shown_by = "hands_output:passive"
 
     topology: str
-    verdict: str
+    verdict: PassivityVerdict
     stable: bool | None
     clamped_stable: bool | None
     clamped_radius: float
@@ -111,7 +117,7 @@ class AbsoluteStability(Result):
     modes: tuple[PassiveMode, ...]
     joined: bool
     why: str
-    proof: str
+    proof: StabilityProof
     linearized: bool
     left_out: tuple[str, ...]
 
@@ -216,14 +222,19 @@ def _one_sided_hands(
         stable = False
     elif all(mode.passive for mode in modes) and fixed.stable:
         stable = True
-    verdict = {True: STABLE, False: UNSTABLE, None: UNDECIDED}[stable]
-    of = ", of the linearization" if not linear else ""
-    proof = "" if stable is None else f"{PROVED}{of}"
+    verdict = {
+        True: PassivityVerdict.STABLE,
+        False: PassivityVerdict.UNSTABLE,
+        None: PassivityVerdict.UNDECIDED,
+    }[stable]
+    bounded = StabilityProof(ProofMethod.ROUNDED, scope=(ProofScope.LINEARIZATION,) * (not linear))
+    proof = NO_PROOF if stable is None else bounded
     if certify and fixed.stable is False and not never:
-        proof = f"with its devices clamped it is unstable: {fixed.proof or PROVED}{of}"
+        proof = fixed.proof or bounded
+        proof = replace(proof, scope=(*proof.scope, ProofScope.CLAMPED_DEVICES))
     return AbsoluteStability(
         topology=system.name,
-        verdict=NEVER if never else verdict,
+        verdict=PassivityVerdict.NEVER if never else verdict,
         stable=stable,
         clamped_stable=fixed.stable,
         clamped_radius=fixed.spectral_radius,

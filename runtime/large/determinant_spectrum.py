@@ -25,6 +25,7 @@ from apc.large.determinant import TransferMember, of_loop, of_populations
 from apc.large.populations import HeterogeneousGroup, hear_themselves, lines_of, turned_by
 from apc.large.transfer import CHUNK, TransferSubsystems
 from apc.large.zeros import Zero, Zeros, find_zeros, near_poles
+from apc.verdict import NO_PROOF
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -119,7 +120,7 @@ def _spectrum(solved: Sequence[_SolvedSystem], multiplicities: Sequence[int]) ->
     if not all(item.zeros.counted for item in solved):
         notes = ["the largest modes found; the count that none is larger was had farther out only"]
     error = max(high - radius, radius - low, 0.0)
-    return Spectrum(tuple(modes), radius, error, rigid, drifts, verdict, stable, "", tuple(notes))
+    return Spectrum(tuple(modes), radius, error, rigid, drifts, verdict, stable, NO_PROOF, tuple(notes))
 
 
 def _solve_loop(loop: ModalSystem) -> _SolvedSystem:

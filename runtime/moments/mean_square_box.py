@@ -41,7 +41,7 @@ from apc.frame.radius import UNIT
 from apc.frame.taylor import hull, within
 from apc.moments.crowd import Classes, build_hearing, classes_of, moments_of, peer_classes, remembered_of
 from apc.moments.mean_loops import RouteMemory
-from apc.moments.network_verdict import STABLE, UNSTABLE, growth
+from apc.moments.network_verdict import MeanSquareVerdict, growth
 from apc.moments.operator import dies_out
 from apc.moments.packet_memory import is_memoryless
 from apc.network.channel import channel_law
@@ -98,7 +98,14 @@ def prove_box(system: Model, ranges: Sequence[Range], *, cells: int | None = Non
                 return RobustStability(system.name, tuple(ranges), UNDECIDED, None, 0, 1.0, (), (note,))
         is_unstable = partial(_is_unstable, asked)
         looks = partial(_looked, asked), is_unstable
-        return search_box(system.name, ranges, *looks, stable=STABLE, unstable=UNSTABLE, cells=cells)
+        return search_box(
+            system.name,
+            ranges,
+            *looks,
+            stable=MeanSquareVerdict.STABLE,
+            unstable=MeanSquareVerdict.UNSTABLE,
+            cells=cells,
+        )
 
 
 def _question(system: Model, ranges: Sequence[Range]) -> _Question:

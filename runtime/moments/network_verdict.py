@@ -37,14 +37,8 @@ from apc.network.nominal import unreliable
 from apc.result import Result
 from apc.threads import single_threaded
 from apc.unserved import NotSupportedError
+from apc.verdict import NO_PROOF, ProofMethod, ProofOutcome, ProofScope, StabilityProof, Term
 
-STABLE = "stable in mean square"
-UNSTABLE = "unstable in mean square"
-UNDECIDED = "undecided"
-NOT_JUDGED = "not judged"
-
-STABLE_PROVED = "proved stable in mean square, by floats whose every rounding is bounded"
-UNSTABLE_PROVED = "proved unstable in mean square, by floats whose every rounding is bounded"
 UNPROVED = "not proved: the radius is that of an iteration in floats"
 
 # Peers whose bursts are followed with all tags, and with so many at most; the orders then compared.
@@ -77,6 +71,17 @@ DOUBTFUL = 1e-9
 EARLIEST = {"uniform": 1.0, "normal": LATEST["normal"], "pareto": 2 / 3}
 
 
+class MeanSquareVerdict(Term):
+    """The verdict on second moments; `PROBABLY` where the growth is an estimate."""
+
+    STABLE = "stable in mean square"
+    UNSTABLE = "unstable in mean square"
+    PROBABLY_STABLE = "probably stable in mean square"
+    PROBABLY_UNSTABLE = "probably unstable in mean square"
+    UNDECIDED = "undecided"
+    NOT_JUDGED = "not judged"
+
+
 @dataclass(frozen=True, slots=True)
 class MeanSquareStability(Result):
     """What becomes of a scene whose packets get lost or come late by chance.
@@ -91,12 +96,12 @@ class MeanSquareStability(Result):
     shown_by = "network_output:network"
 
     topology: str
-    verdict: str
+    verdict: MeanSquareVerdict
     stable: bool | None
     mean_square_radius: float | None
     error: float | None
     exact: bool
-    proof: str
+    proof: StabilityProof
     rms_error_m: float | None
     almost_sure: TopLyapunovExponent | None
     losses_in_a_row: ConsecutiveLosses | None
@@ -399,9 +404,13 @@ def _judge_network(system: Model, prepared: Prepared, *, certify: bool) -> MeanS
         mean_square_radius=result.radius if judged else None,
         error=max(result.high - result.radius, result.radius - result.low) if judged else None,
         exact=result.exact,
-        proof=(STABLE_PROVED if result.stable else UNSTABLE_PROVED)
+        proof=StabilityProof(
+            ProofMethod.ROUNDED,
+            outcome=ProofOutcome.STABLE if result.stable else ProofOutcome.UNSTABLE,
+            scope=(ProofScope.MEAN_SQUARE,),
+        )
         if certify and decided and result.proved
-        else "",
+        else NO_PROOF,
         rms_error_m=metres,
         almost_sure=surely,
         losses_in_a_row=worst,
@@ -422,12 +431,15 @@ def _rms_error(growth: StabilityMeasure) -> tuple[float | None, str]:
         return None, str(why)
 
 
-def verdict_of(growth: StabilityMeasure) -> str:
-    """Return the verdict in words."""
+def verdict_of(growth: StabilityMeasure) -> MeanSquareVerdict:
+    """Return the verdict on second moments of this growth."""
     if not np.isfinite(growth.radius):
-        return NOT_JUDGED
-    verdict = {True: STABLE, False: UNSTABLE, None: UNDECIDED}[growth.stable]
-    return f"probably {verdict}" if not growth.exact and growth.stable is not None else verdict
+        return MeanSquareVerdict.NOT_JUDGED
+    if growth.stable is None:
+        return MeanSquareVerdict.UNDECIDED
+    if growth.exact:
+        return MeanSquareVerdict.STABLE if growth.stable else MeanSquareVerdict.UNSTABLE
+    return MeanSquareVerdict.PROBABLY_STABLE if growth.stable else MeanSquareVerdict.PROBABLY_UNSTABLE
 
 
 def _almost_sure(

@@ -9,7 +9,6 @@ Does not: answer for an unreliable network (see `moments`), or for all of a rang
 
 from __future__ import annotations
 
-import re
 from collections.abc import Collection
 from fractions import Fraction
 
@@ -71,11 +70,8 @@ def refuse_range(system: Model) -> None:
         )
         what = f"{interval.free.label} is a range, {low} to {high}, of which this takes one"
         hint = f'--set "{interval.free.label}={middle}"'
-        matches = (
-            re.search(rf":(\d+):(\d+): W275 {re.escape(interval.free.label)} ", text)
-            for text in system.warnings
-        )
-        line, column = next((map(int, result.groups()) for result in matches if result), (0, 0))
+        axes = (axis for axis in system.within if axis.parameter == interval.free.name)
+        line, column = next(((axis.line, axis.column) for axis in axes), (0, 0))
         raise ApcError(
             Diagnostic("E899", SourceLocation(system.origin.topology, line, column), what, hint=hint)
         )

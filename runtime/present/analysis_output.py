@@ -40,6 +40,7 @@ from apc.present.forms import (
     table,
 )
 from apc.present.pictures import COLOURS, legend_below, new_figure
+from apc.verdict import StabilityVerdict
 
 if TYPE_CHECKING:
     from apc.analysis.analysis import Analysis
@@ -68,17 +69,17 @@ NOT_PLAYED = "not predicted and played: --buzz"
 SHOWN = 1e-9  # digits of a contact mode's spectral radius that its column has room for
 
 _WORDS = {
-    "stable": "Every motion dies out.",
-    "stable up to a common translation": (
+    StabilityVerdict.STABLE: "Every motion dies out.",
+    StabilityVerdict.STABLE_TRANSLATING: (
         "Nothing ties the peers to the ground; moved together they stay where they are.\n"
         "Every other motion dies out."
     ),
-    "stable up to a common rotation": (
+    StabilityVerdict.STABLE_TURNING: (
         "Nothing holds the peers' angles; turned together they stay as they are.\n"
         "Every other motion dies out."
     ),
-    "drifts": "Nothing slows a common motion down. Every other motion dies out.",
-    "unstable": "Some motion grows until the devices shake or hit their limits.",
+    StabilityVerdict.DRIFTS: "Nothing slows a common motion down. Every other motion dies out.",
+    StabilityVerdict.UNSTABLE: "Some motion grows until the devices shake or hit their limits.",
 }
 
 SIZE = (5.6, 4.6)  # inches
@@ -131,7 +132,7 @@ def analysis_text(result: Analysis) -> Lines:
     words = _WORDS.get(result.verdict, "The spectral radius lies nearer to 1 than its error bound.")
     named = (("translation", result.translations), ("rotation", result.rotations))
     free = " and ".join(counted(count, noun) for noun, count in named if count)
-    if result.translations + result.rotations > 1 and result.verdict.startswith("stable up to"):
+    if result.translations + result.rotations > 1 and result.verdict.up_to_rigid_modes:
         words = (
             f"{free} are held back by nothing, of all peers together or of some beside others: moved so, "
             "they stay where they are. Every other motion dies out."
@@ -153,7 +154,7 @@ def analysis_text(result: Analysis) -> Lines:
         ("spectral radius", f"{radius} per frame of {quantity(result.frame_s, 's')}"),
         ("peers", f"{result.peers}, {result.states_per_peer} states each"),
         ("method", result.method + (f", {free} left out" if free else "")),
-        ("proof", result.proof),
+        ("proof", str(result.proof)),
         ("left out", unfelt if result.unfelt else ""),
     )
     yield ""
@@ -426,8 +427,8 @@ def contact_modes_text(contact_modes: ContactModes) -> Lines:
         error = max(mode.spectral_radius_error, SHOWN if abs(mode.spectral_radius - 1) > NEAR else 0.0)
         radius = radius_text(mode.spectral_radius, error, mode.beyond)
         frequency = in_hertz(mode.frequency_hz) if mode.frequency_hz else "–"
-        verdict = mode.verdict.partition(" up to ")[0].partition(":")[0]
-        rows.append((radius, frequency, verdict + "*" * mode.linearized, mode.name))
+        assert mode.verdict is not None, "a mode without refusal has a verdict"
+        rows.append((radius, frequency, mode.verdict.word + "*" * mode.linearized, mode.name))
     yield ""
     yield from table(rows, "<><<")
     if any(mode.linearized for mode in contact_modes.modes):

@@ -17,6 +17,7 @@ from apc.benchmark.speed_and_error import SAME, Bench, MethodTiming, TaskCompari
 from apc.compiler.words import counted, wrapped
 from apc.present.forms import Lines, notes, record, table
 from apc.present.pictures import COLOURS, legend_below, new_figure
+from apc.verdict import StabilityVerdict
 
 if TYPE_CHECKING:
     from apc.benchmark.hard import HardReport
@@ -30,7 +31,8 @@ BETTER = (
     "* on the Pareto front: none here is faster by more than both spreads and no less right, or more right "
     f"and no slower; errors below {SAME:.1g} are roundings, and equal"
 )
-STARRED = "stable*: stable up to a common translation"
+STARRED = {StabilityVerdict.STABLE_TRANSLATING: "stable*"}
+_SHORT = {**STARRED, StabilityVerdict.UNDECIDED: StabilityVerdict.UNDECIDED.word}
 
 
 def bench_text(bench: Bench) -> Lines:
@@ -96,14 +98,13 @@ def hard_text(hard_report: HardReport) -> Lines:
     rows = [("scene", "error", "bound", "bound÷error", "time", "verdict")]
     for case in hard_report.cases:
         loose = f"{case.looseness:.2g}" if math.isfinite(case.looseness) else NOTHING
-        verdict = case.verdict.replace("stable up to a common translation", "stable*").partition(":")[0]
-        mark = "FAILED" if case.failed else verdict
+        mark = "FAILED" if case.failed else _SHORT.get(case.verdict, case.verdict)
         rows.append((case.name, _size(case.error), _size(case.bound), loose, _time(case.seconds), mark))
     yield from table(rows, "<>>>><")
     yield ""
     yield from notes("error and bound are of the spectral radius ρ, divided by ρ where it is above 1")
-    if any(row[-1] == "stable*" for row in rows):
-        yield from notes(STARRED)
+    if any(case.verdict in STARRED and not case.failed for case in hard_report.cases):
+        yield from notes(*(f"{word}: {verdict}" for verdict, word in STARRED.items()))
     yield from notes(*(f"{name} has no truth beside it: left out" for name in hard_report.without))
     yield from notes(*(f"FAILED {case.name}: {case.failed}" for case in hard_report.failures))
     if hard_report.failures:

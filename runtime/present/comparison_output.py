@@ -166,7 +166,7 @@ def _in_time(scheme: Scheme, feet: dict[str, int]) -> tuple[str, str]:
     if scheme.played is None:
         return _marked(NONE, _why(scheme, "played"), feet), NONE
     summary = scheme.played.summary
-    text = summary.verdict
+    text = str(summary.verdict)
     if summary.settled is not None:
         text += f", settling time {summary.settled:.3g} s"
     elif summary.stopped_at is not None:
@@ -191,11 +191,12 @@ def _varied(scheme: Scheme, key: str, feet: dict[str, int]) -> tuple[str, str]:
 def _reach(critical: Critical) -> str:
     """Return in words how far a scene is stable."""
     if critical.value is None:
+        assert critical.verdict is not None
         if not critical.enters:
-            return f"{critical.verdict.partition(' ')[0]} whatever it is"
-        if critical.verdict.startswith("stable"):
+            return f"{critical.verdict.word} whatever it is"
+        if critical.verdict.stable:
             return f"none up to {quantity(critical.scanned[1], critical.unit)}"
-        return f"{critical.verdict.partition(' ')[0]} from {span(*critical.scanned, critical.unit)}"
+        return f"{critical.verdict.word} from {span(*critical.scanned, critical.unit)}"
     value = uncertain(critical.value, critical.error or 0.0, critical.unit).removesuffix(", exact")
     return value if critical.stable_side == "below" else f"{value}, stable above it"
 
@@ -325,9 +326,10 @@ def _reach_bar(critical: Critical | None, scale: float) -> _Bar:
     """Return how far a scheme is stable: up to a crossing, or beyond all that was looked at."""
     if critical is not None and critical.value is not None and critical.stable_side == "below":
         return _Bar(scale * critical.value, f"{scale * critical.value:.4g}")
-    if critical is not None and critical.value is None and critical.verdict.startswith("stable"):
+    verdict = None if critical is None else critical.verdict
+    if critical is not None and verdict is not None and verdict.stable:
         return _Bar(scale * critical.scanned[1], f"> {scale * critical.scanned[1]:.4g}", further=True)
-    return _Bar(0.0, "unstable" if critical is not None and critical.verdict.startswith("unstable") else NONE)
+    return _Bar(0.0, verdict.word if verdict is not None and verdict.stable is False else NONE)
 
 
 def _draw(ax: Any, title: str, bars: Sequence[_Bar]) -> None:

@@ -21,6 +21,7 @@ from apc.compiler.words import measured, with_unit, wrapped
 from apc.frame.display_units import as_shown
 from apc.later import LazyTuple
 from apc.result import Result
+from apc.verdict import Note, Sentence, Term
 
 # What stable means by a criterion, where it is not that motions die out.
 MEANT = {
@@ -48,6 +49,8 @@ def document(value: Any) -> Any:
     value
         Dataclasses, mappings, sequences and arrays of numbers, texts and None.
     """
+    if isinstance(value, Term | Sentence):
+        return str(value)
     if value is None or isinstance(value, str | int):
         return value
     if isinstance(value, float):
@@ -153,10 +156,10 @@ def listed(names: Sequence[str], most: int = 6) -> str:
     return ", ".join([*names[:most], *["…"][: max(len(names) - most, 0)]]) or "none"
 
 
-def notes(*texts: str) -> Lines:
+def notes(*texts: Note) -> Lines:
     """Yield texts beneath one another as lines that stand a little to the right; nothing of an empty one."""
     for text in texts:
-        yield from wrapped(text, "  ", "    ")
+        yield from wrapped(str(text), "  ", "    ")
 
 
 def sentences(*texts: str) -> Lines:

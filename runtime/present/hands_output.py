@@ -70,7 +70,7 @@ def passive_text(passive_hands: AbsoluteStability) -> Lines:
         if passive_hands.clamped_radius or passive_hands.clamped_error
         else "nothing moves"
     )
-    yield from labelled(("devices clamped", moves), ("proof", passive_hands.proof))
+    yield from labelled(("devices clamped", moves), ("proof", str(passive_hands.proof)))
     if passive_hands.modes:
         yield ""
         yield from table(

@@ -23,11 +23,9 @@ if TYPE_CHECKING:
     from apc.network.recorded import LinkFit, Share
 
 _WORDS = {
-    "stable in mean square": (
-        "Over the network as it is, the mean square of every motion dies out that something holds back."
-    ),
-    "unstable in mean square": "Over the network as it is, the mean square of some motion grows.",
-    "undecided": "The growth of mean squares lies nearer to 1 than its error bound.",
+    True: "Over the network as it is, the mean square of every motion dies out that something holds back.",
+    False: "Over the network as it is, the mean square of some motion grows.",
+    None: "The growth of mean squares lies nearer to 1 than its error bound.",
 }
 
 
@@ -38,7 +36,7 @@ def network_text(result: MeanSquareStability) -> Lines:
     yield f"{result.topology}: {result.verdict}{where}{LINEARIZED if result.linearized else ''}"
     yield ""
     if radius is not None:
-        yield from sentences(_WORDS[result.verdict.removeprefix("probably ")])
+        yield from sentences(_WORDS[result.stable])
         yield ""
         error, root = result.error or 0.0, math.sqrt(radius)
         rooted = radius_text(root, error / (2 * root) if root else error)
@@ -55,7 +53,7 @@ def network_text(result: MeanSquareStability) -> Lines:
         yield from labelled(("almost surely", exponent))
     if result.losses_in_a_row is not None:
         yield from labelled(*_losses(result.losses_in_a_row))
-    yield from labelled(("proof", result.proof))
+    yield from labelled(("proof", str(result.proof)))
     yield from notes(*result.notes)
 
 
@@ -68,11 +66,11 @@ def _losses(losses_in_a_row: ConsecutiveLosses) -> Iterator[tuple[str, str]]:
         )
         yield "losses in a row", f"{harmless} is certified harmless"
     pattern = "".join("×" if lost else "·" for lost in losses_in_a_row.unstable_pattern or ())
-    grows = f"grow by {losses_in_a_row.growth:.6g} a frame" if pattern else ""
+    by = f"by {losses_in_a_row.growth:.6g} a frame" if pattern else ""
     if "×" in pattern:
-        yield "worst pattern", f"{pattern} lost again and again (×) makes a motion {grows}"
+        yield "worst pattern", f"{pattern} lost again and again (×) makes a motion grow {by}"
     elif pattern:
-        yield "losses in a row", f"with none a motion {grows.replace('grow', 'grows', 1)}"
+        yield "losses in a row", f"with none a motion grows {by}"
 
 
 def network_document(result: MeanSquareStability) -> Plain:

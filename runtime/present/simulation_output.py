@@ -36,15 +36,7 @@ from apc.present.forms import (
 )
 from apc.present.pictures import colours_of, new_figure
 from apc.simulation.settings import EXACT
-from apc.simulation.verdicts import (
-    AT_REST,
-    DECAYS,
-    DIVERGES,
-    DRIFTS,
-    DRIVEN,
-    NOT_DETERMINED,
-    OSCILLATES,
-)
+from apc.simulation.verdicts import MotionVerdict
 
 if TYPE_CHECKING:
     from apc.simulation.accuracy import ErrorEstimate
@@ -79,12 +71,12 @@ MOST_CURVES = 24  # in a panel: more can't be told apart
 WIDTH, HEIGHT = 9.0, 2.4  # inches: of the figure, of a panel
 PATHS = 2.0  # times as high is a plane
 _WORDS = {
-    AT_REST: "No {position} changes.",
-    DECAYS: "The motion decays.",
-    OSCILLATES: "At the end an oscillation neither decays nor grows.",
-    DIVERGES: "The motion grows.",
-    DRIFTS: "At the end a {position} moves on at a constant velocity or acceleration.",
-    DRIVEN: "A force or another equation changes with time until the end.",
+    MotionVerdict.AT_REST: "No {position} changes.",
+    MotionVerdict.DECAYS: "The motion decays.",
+    MotionVerdict.OSCILLATES: "At the end an oscillation neither decays nor grows.",
+    MotionVerdict.DIVERGES: "The motion grows.",
+    MotionVerdict.DRIFTS: "At the end a {position} moves on at a constant velocity or acceleration.",
+    MotionVerdict.DRIVEN: "A force or another equation changes with time until the end.",
 }
 OVERFLOW = "{stopped} leaves the range of numbers after {stopped_at}."
 LEAST_ERROR = 5e-7  # of a value: more digits than six are in the document
@@ -120,7 +112,7 @@ def played_text(played: SimulationReport) -> Lines:
     units = {extent.name: extent.unit for extent in summary.extents}
     yield f"{played.topology}: {summary.verdict}\n"
     words = f"Not determined from {summary.end:g} s: {summary.reason}."
-    if summary.verdict != NOT_DETERMINED:
+    if summary.verdict is not MotionVerdict.NOT_DETERMINED:
         words = OVERFLOW if summary.stopped else _WORDS[summary.verdict]
         words = words.format(
             position="recorded position" if summary.unrecorded else "position",
@@ -473,7 +465,13 @@ def ensemble_document(ensemble: Ensemble) -> Plain:
         "duration": ...,
         "duration_s": ensemble.duration,
         "runs": n,
-        "mean_square": None if mean_square is None else {**document(mean_square), "agrees": ensemble.agrees},
+        "mean_square": None
+        if mean_square is None
+        else {
+            **document(mean_square),
+            "verdict": document(mean_square.verdict or ""),
+            "agrees": ensemble.agrees,
+        },
         "verdicts": shares,
     }
     for name in LABELS:
@@ -507,13 +505,18 @@ def _uncertain(value: float, error: float, unit: str) -> str:
 def _facts(played: SimulationReport, units: Mapping[str, str]) -> Iterator[tuple[str, str]]:
     """Yield what a run amounts to, each fact with its label; `units` are those of its signals by name."""
     summary = played.summary
-    moves = summary.verdict != AT_REST
+    moves = summary.verdict is not MotionVerdict.AT_REST
     if summary.settled is not None:
         about = f" (at most {_quantity(summary.settled_error, 's')} less)" if summary.settled_error else ""
         yield "settling time", f"{_quantity(summary.settled, 's')}{about}: {BAND_TEXT}"
-    elif summary.verdict in (DECAYS, OSCILLATES):
+    elif summary.verdict in (MotionVerdict.DECAYS, MotionVerdict.OSCILLATES):
         yield "settling time", f"not reached in {summary.end:g} s: {BAND_TEXT}"
-    if summary.fit is not None and summary.verdict in (DECAYS, OSCILLATES, DIVERGES, NOT_DETERMINED):
+    if summary.fit is not None and summary.verdict in (
+        MotionVerdict.DECAYS,
+        MotionVerdict.OSCILLATES,
+        MotionVerdict.DIVERGES,
+        MotionVerdict.NOT_DETERMINED,
+    ):
         yield from _fitted(summary.fit, summary.oscillating, units)
     if summary.largest_force and (summary.largest_force[1] or moves):
         name, size, at = summary.largest_force

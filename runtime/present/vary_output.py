@@ -72,8 +72,9 @@ def critical_text(critical: Critical) -> Lines:
         now += f", to be one value for all {'groups' if len(critical.groups) > 1 else 'its peers'}"
     text = _stable_ranges(critical)
     if not text:
-        wording = ("value scanned", "number looked at") if critical.counted else ("", "")
-        text = critical.verdict.replace(*wording)
+        text = str(critical.verdict or "")
+        if critical.counted and critical.verdict and critical.enters:
+            text = f"{critical.verdict.word} at every number looked at"
     yield from wrapped(f"{critical.topology}: {text}")
     meant = MEANT.get(critical.criterion, "")
     yield from notes(meant, *critical.left_out, f"{critical.parameter} is now {now}")
@@ -191,7 +192,7 @@ def critical_picture(critical: Critical, ax: Any) -> Any:
 
 def critical_document(critical: Critical) -> Plain:
     """Return where a scene's verdict changes with a parameter as plain data."""
-    return record(critical, {"groups": dict(critical.groups)})
+    return record(critical, {"verdict": critical.verdict or "", "groups": dict(critical.groups)})
 
 
 def margins_text(margins: Margins) -> Lines:

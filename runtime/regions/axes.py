@@ -65,11 +65,10 @@ def parse_axes(
                 Diagnostic("E901", PLACE, f"--{letter}", "PATH=LOW:HIGH", text[:80] or "nothing", hint)
             )
         try:
-            axis = parse_axis(system, name, f"{span}:2")
+            axis = parse_axis(system, name, span, ends=True)
         except ApcError as error:
             raise ApcError(
-                replace(mistake, place=SourceLocation(f"--{letter}"), hint=mistake.hint.removesuffix(":2"))
-                for mistake in error.mistakes
+                replace(mistake, place=SourceLocation(f"--{letter}")) for mistake in error.mistakes
             ) from None
         refuse_phase(system, axis.free, PLACE, code="E903")
         low, high = axis.values[0], axis.values[-1]

@@ -34,7 +34,7 @@ from apc.regions.stable_region import region
 from apc.result import Result
 from apc.simulation.strike import WATCHED, impulse_text, strike
 from apc.simulation.trajectory import simulate
-from apc.simulation.verdicts import AT_REST
+from apc.simulation.verdicts import MotionVerdict
 from apc.vary.critical_values import critical
 from apc.vary.growth import MEAN_SQUARE, NOMINAL
 from apc.vary.margins import STIFFNESSES, coupler_parameters
@@ -256,7 +256,7 @@ def _response(system: Model, call: str) -> Section:
     duration, remarks = system.experiment.duration, []
     length = "" if duration else f" --duration {shlex.quote(f'{float(WATCHED):g} s')}"
     trajectory = simulate(system, duration=duration or WATCHED)
-    if trajectory.summary.verdict == AT_REST:
+    if trajectory.summary.verdict is MotionVerdict.AT_REST:
         try:
             struck, what = strike(system)
         except ApcError as error:

@@ -27,7 +27,7 @@ from apc.compiler.timings import part
 from apc.frame import instance
 from apc.frame.finite_equations import finite_equations
 from apc.memory import refuse_beyond
-from apc.moments.network_verdict import growth, verdict_of
+from apc.moments.network_verdict import MeanSquareVerdict, growth, verdict_of
 from apc.network.nominal import unreliable
 from apc.processes import (
     Patience,
@@ -44,7 +44,7 @@ from apc.simulation.rows_in_time import blocks
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
 from apc.simulation.summary import BAND, SummaryAccumulator
-from apc.simulation.verdicts import AT_REST, DECAYS, DIVERGES, OSCILLATES
+from apc.simulation.verdicts import MotionVerdict
 from apc.threads import single_threaded
 
 Floats = NDArray[np.float64]
@@ -52,7 +52,10 @@ Floats = NDArray[np.float64]
 QUANTILES = (0.05, 0.5, 0.95)
 SURE = 1.959963984540054  # standard deviations of a normal within which 95 % lie
 # Verdicts of runs that decay, and of those that don't.
-CALM, SUSTAINED = (AT_REST, DECAYS), (OSCILLATES, DIVERGES)
+CALM, SUSTAINED = (
+    (MotionVerdict.AT_REST, MotionVerdict.DECAYS),
+    (MotionVerdict.OSCILLATES, MotionVerdict.DIVERGES),
+)
 PART = 100  # runs handed to a process at a time: enough to pay for the way, few enough to share out evenly
 RUN = 300  # bytes of a run that is over
 
@@ -65,7 +68,7 @@ class EnsembleRun:
     """
 
     number: int
-    verdict: str
+    verdict: MotionVerdict
     settled: float | None
     largest_force: float | None
     copies_apart: float | None
@@ -92,7 +95,7 @@ class MeanSquare:
     of small motions about the start.
     """
 
-    verdict: str
+    verdict: MeanSquareVerdict | None
     stable: bool | None
     settles_in: float | None
     linearized: bool
@@ -134,7 +137,7 @@ class Ensemble(Result):
         return any(run.verdict in SUSTAINED for run in self.runs)
 
     @property
-    def verdicts(self) -> tuple[tuple[str, int], ...]:
+    def verdicts(self) -> tuple[tuple[MotionVerdict, int], ...]:
         """How many runs have each verdict, the most frequent first."""
         return tuple(Counter(run.verdict for run in self.runs).most_common())
 
@@ -225,7 +228,7 @@ def _mean_square(system: Model) -> MeanSquare | None:
             prepared = instance.prepare(system)
             result = growth(system, prepared)
     except ApcError as error:  # what can't be analysed can be played
-        return MeanSquare("", None, None, False, error.mistakes[0].what)
+        return MeanSquare(None, None, None, False, error.mistakes[0].what)
     linearized = not is_linear(system, prepared)
     settles_in = None
     if 0 < result.radius < 1:

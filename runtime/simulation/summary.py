@@ -44,8 +44,6 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Analysis, analyze
 from apc.compiler.compiled import ANGLES, LENGTH, Group, Model
 from apc.compiler.errors import ApcError
-from apc.eigen.spectrum import DRIFTS as RADIUS_DRIFTS
-from apc.eigen.spectrum import STABLE as RADIUS_STABLE
 from apc.frame.jacobians import jacobians
 from apc.network.nominal import unreliable
 from apc.simulation.decay import Fit, fit_motion
@@ -53,15 +51,8 @@ from apc.simulation.driven import driven_until
 from apc.simulation.rows_in_time import OutputBlock
 from apc.simulation.signals import Signal
 from apc.simulation.simulation import Simulation
-from apc.simulation.verdicts import (
-    AT_REST,
-    DECAYS,
-    DIVERGES,
-    DRIFTS,
-    DRIVEN,
-    NOT_DETERMINED,
-    OSCILLATES,
-)
+from apc.simulation.verdicts import MotionVerdict
+from apc.verdict import StabilityVerdict
 
 Floats = NDArray[np.float64]
 
@@ -119,7 +110,7 @@ class Summary:
     went beyond, the first one first. `unrecorded` positions of the scene were not evaluated.
     """
 
-    verdict: str
+    verdict: MotionVerdict
     reason: str
     settled: float | None
     settled_error: float
@@ -220,7 +211,7 @@ class SummaryAccumulator:
         moved = [extents[i] for i in self.positions]
         all_settled = bool(moved) and not np.isnan(settled[self.positions]).any()
         verdict, reason = self._verdict(block, moved, fit, float(ends[-1]), settled=all_settled)
-        all_settled &= verdict not in (AT_REST, DIVERGES, DRIVEN)
+        all_settled &= verdict not in (MotionVerdict.AT_REST, MotionVerdict.DIVERGES, MotionVerdict.DRIVEN)
         largest = max(self.forces, key=lambda i: float(self.peak[i]), default=-1)
         work = tuple(zip(self.simulation.population.parts, block.work.tolist(), strict=True))
         force = None
@@ -253,27 +244,27 @@ class SummaryAccumulator:
 
     def _verdict(
         self, block: OutputBlock, moved: Sequence[SignalRange], fit: Fit | None, end: float, *, settled: bool
-    ) -> tuple[str, str]:
+    ) -> tuple[MotionVerdict, str]:
         """Return the verdict, and why it is not determined."""
         if block.stopped:
-            return DIVERGES, ""
+            return MotionVerdict.DIVERGES, ""
         if not moved:
-            return NOT_DETERMINED, "no position was recorded"
+            return MotionVerdict.NOT_DETERMINED, "no position was recorded"
         if self.until > LATE * end:
-            return DRIVEN, ""
+            return MotionVerdict.DRIVEN, ""
         if all(extent.low == extent.high for extent in moved):
-            return AT_REST, ""
+            return MotionVerdict.AT_REST, ""
         if fit is None:
-            return (DECAYS, "") if settled else (NOT_DETERMINED, SHORT)
+            return (MotionVerdict.DECAYS, "") if settled else (MotionVerdict.NOT_DETERMINED, SHORT)
         if fit.grows and not fit.ended:
-            return DIVERGES, ""
+            return MotionVerdict.DIVERGES, ""
         if fit.lasts and not fit.ended:
-            return OSCILLATES, ""
+            return MotionVerdict.OSCILLATES, ""
         if fit.ramp and not fit.ended:
-            return DRIFTS, ""
+            return MotionVerdict.DRIFTS, ""
         if fit.decays or fit.ended or settled:
-            return DECAYS, ""
-        return NOT_DETERMINED, SHORT
+            return MotionVerdict.DECAYS, ""
+        return MotionVerdict.NOT_DETERMINED, SHORT
 
     def _settled(self, low: Floats, high: Floats, ends: Floats) -> Floats:
         """Return the settling time of each signal; NaN if that is too near to the end."""
@@ -367,8 +358,12 @@ def agreed(summary: Summary, system: Model) -> Summary:
     system
         The topology that was simulated.
     """
-    driven = summary.verdict == DRIVEN
-    if summary.verdict == AT_REST or (summary.driven_until and not driven) or system.peers > MOST_LINEAR:
+    driven = summary.verdict is MotionVerdict.DRIVEN
+    if (
+        summary.verdict is MotionVerdict.AT_REST
+        or (summary.driven_until and not driven)
+        or system.peers > MOST_LINEAR
+    ):
         return summary
     if not all(jacobians(kind).affine for kind in system.kinds) or unreliable(system):
         return summary
@@ -377,21 +372,25 @@ def agreed(summary: Summary, system: Model) -> Summary:
     except ApcError:  # what can't be analysed can be simulated
         return summary
     if driven:
-        if analysis.stable is not False or analysis.verdict == RADIUS_DRIFTS:
+        if analysis.stable is not False or analysis.verdict is StabilityVerdict.DRIFTS:
             return summary
         reason = f"driven; apc analyze: {analysis.verdict}{_time_constant(analysis)}"
-        return replace(summary, verdict=DIVERGES, reason=reason)
-    decays, lasts = summary.verdict == DECAYS, summary.verdict in (DECAYS, DRIFTS)
-    drifts = analysis.verdict == RADIUS_DRIFTS
+        return replace(summary, verdict=MotionVerdict.DIVERGES, reason=reason)
+    decays, lasts = (
+        summary.verdict is MotionVerdict.DECAYS,
+        summary.verdict in (MotionVerdict.DECAYS, MotionVerdict.DRIFTS),
+    )
+    drifts = analysis.verdict is StabilityVerdict.DRIFTS
     contradicted = {
-        True: not lasts or (summary.verdict == DRIFTS and analysis.verdict == RADIUS_STABLE),
-        False: decays or (summary.verdict != DIVERGES and not drifts),
+        True: not lasts
+        or (summary.verdict is MotionVerdict.DRIFTS and analysis.verdict is StabilityVerdict.STABLE),
+        False: decays or (summary.verdict is not MotionVerdict.DIVERGES and not drifts),
         None: False,
     }[analysis.stable]
     if not contradicted:
         return summary
     reason = f"{summary.reason or CONTRADICTION}; apc analyze: {analysis.verdict}{_time_constant(analysis)}"
-    return replace(summary, verdict=NOT_DETERMINED, reason=reason)
+    return replace(summary, verdict=MotionVerdict.NOT_DETERMINED, reason=reason)
 
 
 def _time_constant(analysis: Analysis) -> str:

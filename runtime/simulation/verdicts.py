@@ -1,10 +1,21 @@
 """The verdicts of a simulated motion.
 
 Takes: nothing.
-Gives: `AT_REST`, `DECAYS`, `OSCILLATES`, `DIVERGES`, `DRIFTS`, `DRIVEN`, `NOT_DETERMINED`.
+Gives: `MotionVerdict`.
 Guarantees: the words of every output.
 Does not: decide (see `summary`).
 """
 
-AT_REST, DECAYS, OSCILLATES, DIVERGES = "at rest", "decays", "oscillates", "diverges"
-DRIFTS, DRIVEN, NOT_DETERMINED = "drifts", "driven", "not determined"
+from apc.verdict import Term
+
+
+class MotionVerdict(Term):
+    """The verdict of a simulated motion, see `summary`."""
+
+    AT_REST = "at rest"
+    DECAYS = "decays"
+    OSCILLATES = "oscillates"
+    DIVERGES = "diverges"
+    DRIFTS = "drifts"
+    DRIVEN = "driven"
+    NOT_DETERMINED = "not determined"

@@ -113,7 +113,7 @@ def _refuse_many(counts: Sequence[int]) -> None:
         raise ApcError(Diagnostic("E883", PLACE, "a sweep", f"at most {MOST_POINTS:,} points", got))
 
 
-def parse_axis(system: Model, name: str, text: str) -> GridAxis:
+def parse_axis(system: Model, name: str, text: str, *, ends: bool = False) -> GridAxis:
     """Read the values of a swept parameter.
 
     Parameters
@@ -125,6 +125,8 @@ def parse_axis(system: Model, name: str, text: str) -> GridAxis:
     text
         `LOW:HIGH`, `LOW:HIGH:COUNT`, `LOW:HIGH:COUNT:log` (equal ratios instead of equal steps), or a list
         `V1, V2, V3`. A number without a unit takes the unit of the last one: `0,8 ms`.
+    ends
+        Whether the values are the two ends of `LOW:HIGH` alone.
 
     Raises
     ------
@@ -135,9 +137,10 @@ def parse_axis(system: Model, name: str, text: str) -> GridAxis:
     free = find(system, name.strip(), PLACE, counts=True)
     unit = unit_of(system, free.name)
     whole = reaches_count(system, free)
-    values = (_range if ":" in text else _list)(free.label, unit, text)
+    default = 2 if ends else DEFAULT_COUNT
+    values = _range(free.label, unit, text, default) if ":" in text else _list(free.label, unit, text)
     if whole and ":" in text:
-        values = _whole_numbers(free.label, values, every=text.count(":") == 1)
+        values = _whole_numbers(free.label, values, every=text.count(":") == 1 and not ends)
     axis = GridAxis(free, unit, values)
     for value in (min(values), max(values)):
         _check_bounds(system, axis, value)
@@ -165,8 +168,8 @@ def _list(label: str, unit: str, text: str) -> tuple[Fraction, ...]:
     return values
 
 
-def _range(label: str, unit: str, text: str) -> tuple[Fraction, ...]:
-    """Return the values of LOW:HIGH, LOW:HIGH:COUNT or LOW:HIGH:COUNT:log."""
+def _range(label: str, unit: str, text: str, default: int) -> tuple[Fraction, ...]:
+    """Return the values of LOW:HIGH, so many by default, of LOW:HIGH:COUNT or LOW:HIGH:COUNT:log."""
     what = f"the range of {label}"
     ends, rest = text.split(":")[:2], text.split(":")[2:]
     logarithmic = bool(rest) and rest[-1].strip() == "log"
@@ -176,7 +179,7 @@ def _range(label: str, unit: str, text: str) -> tuple[Fraction, ...]:
         raise ApcError(
             Diagnostic("E881", PLACE, what, "LOW:HIGH:COUNT or LOW:HIGH:COUNT:log", text[:80], _FORM)
         )
-    count = _count(what, rest[0].strip()) if rest else DEFAULT_COUNT
+    count = _count(what, rest[0].strip()) if rest else default
     low, high = option_values(
         label, unit, ends, PLACE, rest="".join(f":{part}" for part in text.split(":")[2:])
     )
@@ -214,8 +217,7 @@ def _check_bounds(system: Model, axis: GridAxis, value: Fraction) -> None:
         mistakes = [
             mistake
             for mistake in error.mistakes
-            if mistake.what in (axis.free.label, axis.free.name)
-            and (mistake.code == "E624" or (mistake.code == "E625" and mistake.expected.startswith("a time")))
+            if mistake.code in ("E624", "E625") and mistake.subject in (axis.free.label, axis.free.name)
         ]
         if mistakes:
             raise ApcError(replace(mistakes[0], place=PLACE)) from None

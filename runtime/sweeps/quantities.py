@@ -227,10 +227,10 @@ def _critical(system: Model, argument: str, criterion: str = "nominal") -> Sweep
     def evaluate(changed: Model) -> Row:
         result = critical(changed, argument, criterion=criterion)
         if result.value is None or result.error is None:
-            return (result.verdict, None, None, 0, None, "")
+            return (str(result.verdict), None, None, 0, None, "")
         verdict = f"stable {result.stable_side} the value"
         proof = next(crossing.proof for crossing in result.crossings if crossing.value == result.value)
-        return (verdict, finite(result.value), finite(result.error), len(result.crossings), proof, "")
+        return (verdict, finite(result.value), finite(result.error), len(result.crossings), str(proof), "")
 
     return SweepQuantity(columns, _one_by_one(system, columns, evaluate))
 

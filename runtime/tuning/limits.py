@@ -32,7 +32,7 @@ from apc.compiler.errors import ApcError, Diagnostic
 from apc.eigen.eigenpairs import eigenvalues
 from apc.frame.instance import Prepared
 from apc.frame.overrides import Override, apply
-from apc.hands.frequency_response import COUPLED, feel
+from apc.hands.frequency_response import feel
 from apc.moments.changing_delay import loop_gain
 from apc.threads import load_pool
 from apc.tuning.demands import HINF, PLACE, SUBJECT, Objective, TransparencyMetric, TuningSpec
@@ -41,6 +41,7 @@ from apc.vary.batch import BatchEvaluator, MatrixSource
 from apc.vary.delay_box import standing_delays
 from apc.vary.evaluator import evaluator_of_many
 from apc.vary.growth import BY_GROWTH, RadiusEvaluator
+from apc.verdict import LimitationCode
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -431,7 +432,7 @@ def felt_in(
         elif felt.name == "error_h2" and felt_response.h2 and felt_response.h2[0].error_m is not None:
             value, off = felt_response.h2[0].error_m, felt_response.h2[0].errors[0] or 0.0
         elif felt.name == HINF:
-            if COUPLED in felt_response.notes:
+            if any(note.code is LimitationCode.COUPLED_COPIES for note in felt_response.notes):
                 what = f"{felt.label} is not told of peers that differ, which move apart together"
                 raise ApcError(Diagnostic("E996", PLACE, what, hint="feel.error_h2"))
             for mode in (mode for mode in felt_response.hinf if mode.of == "error"):

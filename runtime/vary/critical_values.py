@@ -67,6 +67,7 @@ from apc.vary.growth import (
 from apc.vary.line import OPEN, SPAN, DelayPath, MatrixPath, PeerCountPath, delay_reach, judged
 from apc.vary.periods import PeriodLine
 from apc.vary.timing_values import delay_now, is_scaled, reaches_period, refuse_phase
+from apc.verdict import Sentence, Term
 
 _PLACE = SourceLocation("critical value")
 
@@ -81,6 +82,34 @@ Ends = tuple[float | None, float | None]
 PIECES, FURTHER = 64, 2
 
 
+class ConstantReason(Term):
+    """Why no value was found at which the verdict changes."""
+
+    SCANNED = "at every value scanned"
+    NO_DAMPING = "whatever its value: apc analyze --hands passive says why"
+    NO_EFFECT_AT_START = (
+        "where the scene starts: there nothing depends on this number (--set may start it elsewhere)"
+    )
+    NO_EFFECT = "whatever its value: nothing that decides stability depends on it"
+
+
+@dataclass(frozen=True, slots=True)
+class ConstantVerdict(Sentence):
+    """The one verdict of all values scanned, undecided if `stable` is None."""
+
+    stable: bool | None
+    reason: ConstantReason
+
+    @property
+    def word(self) -> str:
+        """The verdict in a word."""
+        return {True: "stable", False: "unstable", None: "undecided"}[self.stable]
+
+    def __str__(self) -> str:
+        """Return the verdict with its reason."""
+        return f"{self.word} {self.reason}"
+
+
 @dataclass(frozen=True, slots=True)
 class Critical(Result):
     """Where a scene's verdict changes with one parameter, all else as it is.
@@ -88,7 +117,7 @@ class Critical(Result):
     `crossings` are all that were found from `scanned[0]` to `scanned[1]`, in order. `value` is the one that
     matters: with the present value stable, the first crossing above it or else the first below it; with the
     present value unstable, the lowest crossing at which stability is lost or else the lowest. It is None when
-    there is no crossing; `verdict` then says whether all that was scanned is stable. `looked` values were
+    there is no crossing; `verdict` is then that of all that was scanned, else None. `looked` values were
     looked at, and cells in which another crossing might hide divided down to `cell` of the value. `enters`
     says whether anything that decides depends on the parameter: on a start value of a linear scene nothing
     does. `left_open` and `alone` are those of `crossing.CrossingReport`. `counted` says that it is a number
@@ -113,7 +142,7 @@ class Critical(Result):
     whole: bool
     looked: int
     enters: bool
-    verdict: str
+    verdict: ConstantVerdict | None
     system: Model = field(compare=False, repr=False)
     left_out: tuple[str, ...] = ()
     criterion: str = NOMINAL
@@ -197,7 +226,7 @@ def critical(
 
         chosen = _chosen(result, present, stable_now)
         near = near_start(system, prepared)
-        verdict = "" if chosen else _everywhere(result, present, stable_now, chosen_criterion, near)
+        verdict = None if chosen else _everywhere(result, present, stable_now, chosen_criterion, near)
     return Critical(
         topology=system.name,
         parameter=free.label,
@@ -320,21 +349,19 @@ def _everywhere(
     stable_now: Callable[[], bool | None],
     criterion: str,
     near: Sequence[str],
-) -> str:
+) -> ConstantVerdict:
     """Return the one verdict of all values, where none was found at which it changes."""
     side = search.stable[0] if search.stable else None
     if search.scanned[0] <= present <= search.scanned[1] and present not in search.alone:
         # Floats alone say of which side all samples are; the analysis bounds its error.
         side = side if stable_now() == side else None
-    words = {True: "stable", False: "unstable", None: "undecided"}[side]
     if search.enters:
-        return f"{words} at every value scanned"
-    if criterion == PASSIVE and side is False:
-        return f"{words} whatever its value: apc analyze --hands passive says why"
-    if near:
-        elsewhere = "there nothing depends on this number (--set may start it elsewhere)"
-        return f"{words} where the scene starts: {elsewhere}"
-    return f"{words} whatever its value: nothing that decides stability depends on it"
+        reason = ConstantReason.SCANNED
+    elif criterion == PASSIVE and side is False:
+        reason = ConstantReason.NO_DAMPING
+    else:
+        reason = ConstantReason.NO_EFFECT_AT_START if near else ConstantReason.NO_EFFECT
+    return ConstantVerdict(side, reason)
 
 
 def _line(system: Model, free: ParameterRef, ends: Ends, prepared: Prepared) -> ParameterPath:

@@ -18,7 +18,6 @@ tangents of the two ends miss each other by half-way stands for what the cubic d
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -32,6 +31,7 @@ from apc.compiler.errors import ApcError
 from apc.compiler.words import counted
 from apc.eigen.spectrum import Mode
 from apc.threads import load_pool
+from apc.verdict import ProofMethod, StabilityProof
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -82,8 +82,8 @@ STILL = 4
 # A crossing between two periods of a clock.
 PERIOD = "period"
 
-# What is said of a crossing that no bounds hold.
-ESTIMATE = "estimated in floats"
+# The proof of a crossing that no bounds hold.
+ESTIMATE = StabilityProof(ProofMethod.ESTIMATED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +94,7 @@ class Verdict:
     radius: float
     error: float
     modes: Sequence[Mode]
-    proof: str
+    proof: StabilityProof
 
     @property
     def frequency_hz(self) -> float:
@@ -119,7 +119,7 @@ class Crossing:
     stable_side: str
     frequency_hz: float
     kind: str
-    proof: str
+    proof: StabilityProof
     stable_at: bool | None = None
 
     @property
@@ -578,8 +578,9 @@ def _held(
 ) -> Crossing:
     """Return the crossing between two values of these verdicts, the stable one on a side."""
     dies, grows = verdicts if side == "below" else verdicts[::-1]
-    bits = re.search(r"\d+ bits", " ".join(verdict.proof for verdict in verdicts))
-    proof = f"proved with {bits[0]}" if bits else grows.proof or "bounded in floats"
+    bits = next((verdict.proof.bits for verdict in verdicts if verdict.proof.bits), 0)
+    bounded = grows.proof or StabilityProof(ProofMethod.BOUNDED)
+    proof = StabilityProof(ProofMethod.BALLS, bits) if bits else bounded
     middle, kind, at = (left + right) / 2, "crossing", None
     change = grows.radius - dies.radius - grows.error - dies.error
     if right - left < JUMP * abs(middle) and change > JUMP:

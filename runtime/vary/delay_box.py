@@ -23,6 +23,7 @@ from apc.moments.changing_delay import loop_gain, unstable_delays
 from apc.unserved import NotSupportedError
 from apc.vary.delays import delay_pieces
 from apc.vary.timing_values import system_with_delay
+from apc.verdict import Term
 
 PLACE = SourceLocation("box")
 
@@ -72,7 +73,8 @@ def prove_over_delay(
     (delay,) = delays
     rest = [interval for interval in ranges if interval is not delay]
     place, width = list(ranges).index(delay), delay.high - delay.low
-    cells, left, verdict = 0, Fraction(0), UNDECIDED
+    cells, left = 0, Fraction(0)
+    verdict: Term = UNDECIDED
     open_point: tuple[float, ...] = ()
     for value, share in standing_delays(system, delay):
         proof = prove(system_with_delay(system, delay.free, value), rest)

@@ -25,7 +25,7 @@ from apc.compiler.compiled import Group, Model, Parameter, group_count
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.eigen.closing import ClosedLoop
 from apc.eigen.modes import split
-from apc.eigen.peers import PeerClass, states_of
+from apc.eigen.peers import MATRIX, PeerClass, states_of
 from apc.frame.exchange import CommunicationGraph
 from apc.frame.instance import Prepared
 from apc.frame.names import ParameterRef, is_named, parameter_of, times_of
@@ -265,7 +265,7 @@ def evaluator_of_many(
     except ApcError as error:  # an analysis has methods that spare the matrix, a range of values has none
         raise ApcError(
             [
-                replace(mistake, hint=hint) if "--method" in mistake.hint else mistake
+                replace(mistake, hint=hint) if mistake.subject == MATRIX else mistake
                 for mistake in error.mistakes
             ]
         ) from None

@@ -31,6 +31,7 @@ from apc.network.nominal import channel_numbers, unreliable
 from apc.vary.crossing import SingleSegment, SmoothSegment, Verdict
 from apc.vary.evaluator import leading_in_floats, overrides_at, reaches_time
 from apc.vary.line import OPEN, SPAN, one_by_one, spread, verdict_of
+from apc.verdict import NO_PROOF, ProofMethod, StabilityProof
 
 Floats = NDArray[np.float64]
 
@@ -44,11 +45,11 @@ BY_GROWTH = {MEAN_SQUARE: "in mean square", PASSIVE: "with passive hands"}
 
 # What a crossing rests on.
 BOUNDED = {
-    MEAN_SQUARE: "second moments bounded on either side",
-    PASSIVE: "what hands can draw bounded on either side",
+    MEAN_SQUARE: StabilityProof(ProofMethod.BOUNDED_MOMENTS),
+    PASSIVE: StabilityProof(ProofMethod.BOUNDED_HANDS),
 }
-ITERATED = "second moments by iteration in floats, not proved"
-TAGGED = "an estimate, not proved: of second moments that are themselves estimates"
+ITERATED = StabilityProof(ProofMethod.ITERATED_MOMENTS)
+TAGGED = StabilityProof(ProofMethod.ESTIMATED_MOMENTS)
 
 # Values looked at between 0 and 1 of a probability.
 SHARES = 33
@@ -152,7 +153,7 @@ def judge_at(
         return verdict_of(analyze(changed, prepared=prepared))
     if criterion == NOMINAL:
         radius = abs(leading_in_floats(changed, prepared))
-        return Verdict(radius < 1, radius, math.nan, (), "") if math.isfinite(radius) else OPEN
+        return Verdict(radius < 1, radius, math.nan, (), NO_PROOF) if math.isfinite(radius) else OPEN
     # Each imported where it is asked for: most scenes need neither.
     if criterion == PASSIVE:
         from apc.hands.passivity import passive_growth

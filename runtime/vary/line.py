@@ -24,7 +24,6 @@ from apc.compiler.errors import ApcError, SourceLocation
 from apc.eigen.eigenpairs import eigenvalues
 from apc.eigen.modes import split
 from apc.eigen.rigid import rigid_modes_of
-from apc.eigen.spectrum import DRIFTS
 from apc.frame.instance import Prepared
 from apc.frame.names import ParameterRef
 from apc.frame.overrides import Override, apply
@@ -32,6 +31,7 @@ from apc.vary.batch import BatchEvaluator
 from apc.vary.crossing import ESTIMATE, UNSURE, Crossing, SingleSegment, SmoothSegment, Verdict
 from apc.vary.delays import INSIDE, DelaySegment, borders, delay_pieces
 from apc.vary.timing_values import delay_now, system_with_delay
+from apc.verdict import NO_PROOF, ProofMethod, StabilityProof, StabilityVerdict
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -51,9 +51,9 @@ SAMPLES, FEWEST, PIECE_SAMPLES = 6, 17, 3
 BESIDE = Fraction(1, 10**6)
 
 # What is said of a jump, and of one among stretches that were left open; of a change between two counts.
-EVENTS = "events coincide there"
-BETWEEN = "analysed on either side; the verdict between them is left open"
-JUDGED = "both judged"
+EVENTS = StabilityProof(ProofMethod.COINCIDENT_EVENTS)
+BETWEEN = StabilityProof(ProofMethod.OPEN_BETWEEN)
+JUDGED = StabilityProof(ProofMethod.BOTH_COUNTS)
 
 # A spectral radius nearer to 1 than this in floats, in which a double eigenvalue is off by the root of their
 # rounding, is looked at again by an analysis.
@@ -63,7 +63,7 @@ NEAR = 1e-6
 EVERY, FURTHER = 32, 1.25
 
 # Where there is no analysis.
-OPEN = Verdict(None, math.nan, math.inf, (), "")
+OPEN = Verdict(None, math.nan, math.inf, (), NO_PROOF)
 
 
 def judged(system: Model, prepared: Prepared) -> Verdict:
@@ -79,13 +79,13 @@ def judged(system: Model, prepared: Prepared) -> Verdict:
 
 def verdict_of(result: Analysis, *, drifting: bool | None = None) -> Verdict:
     """Return the verdict of an analysis; where the scene drifts, as is said."""
-    stable = result.stable if result.verdict != DRIFTS else drifting
+    stable = drifting if result.verdict is StabilityVerdict.DRIFTS else result.stable
     return Verdict(stable, result.spectral_radius, result.spectral_radius_error, result.modes, result.proof)
 
 
 def sided(stable: bool | None) -> Verdict:
     """Return a verdict of which only the side is known."""
-    return Verdict(stable, 0.5 if stable else 2.0, 0.0, (), "")
+    return Verdict(stable, 0.5 if stable else 2.0, 0.0, (), NO_PROOF)
 
 
 def spread(bottom: float, top: float, scale: float) -> Floats:
@@ -374,5 +374,6 @@ class PeerCountPath(JudgedLine):
                 break
             below, above = (middle, above) if stable == stable_below else (below, middle)
         side, value = ("below", below) if stable_below else ("above", above)
-        proof = JUDGED if above - below == 1 else f"{above - below - 1} between are left open"
+        left_open = above - below - 1
+        proof = StabilityProof(ProofMethod.SOME_COUNTS, left_open=left_open) if left_open else JUDGED
         return Crossing(float(value), 0.0, side, math.nan, "count", proof)

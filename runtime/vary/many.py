@@ -30,11 +30,6 @@ from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.eigen.peers import PeerClass
 from apc.eigen.rigid import what_stands
 from apc.eigen.spectrum import (
-    STABLE,
-    STABLE_MOVING,
-    STABLE_TRANSLATING,
-    STABLE_TURNING,
-    UNSTABLE,
     judge,
 )
 from apc.frame.ages import linear_sites
@@ -49,6 +44,7 @@ from apc.threads import single_threaded
 from apc.vary.batch import BatchEvaluator, batch_evaluator
 from apc.vary.evaluator import EvaluatorKey, generic, reaches_count, reaches_time
 from apc.vary.leading import DrivingPart, leading, parts_of
+from apc.verdict import StabilityVerdict
 
 if TYPE_CHECKING:
     import pandas
@@ -231,7 +227,7 @@ class Analyses(Result):
     @property
     def stable(self) -> Truths:
         """Where it is stable, up to a common motion or without; neither drifts, nor is left open."""
-        return np.isin(self.verdict, [STABLE, STABLE_TRANSLATING, STABLE_TURNING, STABLE_MOVING])
+        return np.isin(self.verdict, [verdict for verdict in StabilityVerdict if verdict.stable])
 
     def to_dataframe(self) -> pandas.DataFrame:
         """Return a pandas table, a row a point: the values first, then the answers."""
@@ -437,7 +433,7 @@ def _decided(
     some = some[into]
     place, radius = rows[some], known.radius[into]
     result.verdict[place] = judge([True], family.rigid, family.drifts)[0]
-    result.verdict[place[radius > 1]] = UNSTABLE
+    result.verdict[place[radius > 1]] = StabilityVerdict.UNSTABLE
     result.spectral_radius[place], result.spectral_radius_error[place] = radius, known.error[into]
     result.rigid_modes[place] = family.rigid
     result.frequency_hz[place], result.damping_ratio[place] = (

@@ -27,7 +27,7 @@ from apc.compiler.timings import part
 from apc.compiler.words import counted
 from apc.eigen.modes import arrange
 from apc.eigen.peers import states_of
-from apc.eigen.spectrum import DRIFTS, finite
+from apc.eigen.spectrum import finite
 from apc.frame.finite_equations import finite_equations
 from apc.frame.instance import Prepared, prepare
 from apc.frame.names import ParameterRef, named_times, parameter_of, times_of, unit_of, value_now
@@ -48,6 +48,7 @@ from apc.vary.growth import (
 from apc.vary.line import DelayPath, MatrixPath, delay_reach
 from apc.vary.sensitivity import not_varied, of_channels
 from apc.vary.timing_values import delay_now
+from apc.verdict import StabilityVerdict
 
 Floats = NDArray[np.float64]
 
@@ -144,7 +145,7 @@ def margins(system: Model, *, prepared: Prepared | None = None, quick: bool = Fa
         rest = [not_looked(system, item, f"{largest:,} states") for item in free if item not in chosen]
         singly = slow or not parameters_suffice(system, at)
         now = analyze(system, prepared=prepared)
-        if not now.stable and now.verdict != DRIFTS:
+        if not now.stable and now.verdict is not StabilityVerdict.DRIFTS:
             return Margins((), NOT_STABLE.format("stable" if now.stable is False else "proved stable"))
         if not any(states):
             return Margins((), "none: nothing moves")

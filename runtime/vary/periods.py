@@ -41,6 +41,7 @@ from apc.vary.timing_values import (
     periods_near,
     system_with_delay,
 )
+from apc.verdict import ProofMethod, StabilityProof
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -119,7 +120,7 @@ class PeriodLine(JudgedLine):
                 high, verdicts[1] = value, at
         decided = [verdict.stable for verdict in verdicts] == [stable_below, not stable_below]
         grows = verdicts[1 if stable_below else 0]
-        proof = "analysed on either side" if decided else ESTIMATE
+        proof = StabilityProof(ProofMethod.ANALYSED_BESIDE) if decided else ESTIMATE
         side = "below" if stable_below else "above"
         return Crossing(
             float((low + high) / 2), float((high - low) / 2), side, grows.frequency_hz, PERIOD, proof

@@ -15,6 +15,7 @@ import numpy as np
 
 import apc
 from apc.threads import single_threaded
+from apc.verdict import ProofMethod
 from tests.bench.by_hand import Floats
 from tests.bench.judge import judged, parser_of
 from tests.bruteforce import Scene, frame_matrices
@@ -119,7 +120,7 @@ def check(scan: Draw, found: apc.Critical) -> str:
     apart = np.abs(points[:, None] - edges[None]).min(axis=1, initial=np.inf)
     points = points[apart > 1.5 * errors.max(initial=0.0)]
     radius = scan.radii(points)
-    sides = [found.verdict.startswith("stable")]
+    sides = [bool(found.verdict and found.verdict.stable)]
     if found.crossings:
         sides = [found.crossings[0].stable_side == "below"]
         sides += [one.stable_side == "above" for one in found.crossings]
@@ -156,7 +157,7 @@ def run(points: int, *, seed: int = 0) -> Tally:
                 tally.wrong.append(f"{scan.name}: {error!r}\n{text}")
                 continue
             tally.crossings += len(found.crossings)
-            tally.estimated += sum(one.proof.startswith("estimated") for one in found.crossings)
+            tally.estimated += sum(one.proof.method is ProofMethod.ESTIMATED for one in found.crossings)
             tally.open += not found.whole
             tally.wrong += [f"{scan.name}: {fault}\n{text}"] if fault else []
     return tally

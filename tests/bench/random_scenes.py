@@ -158,7 +158,7 @@ def _analysed(system: Model, method: str, due: str, look: bool, tally: Tally) ->
     tally.scenes += 1
     tally.undecided += found.stable is None
     tally.proved += bool(found.proof)
-    tally.verdicts[found.verdict.partition(":")[0]] += 1
+    tally.verdicts[str(found.verdict).partition(":")[0]] += 1
     if found.spectral_radius_error:
         off = float(abs(radius - flint.arb(found.spectral_radius)).mid())
         tally.tightest = max(tally.tightest, off / found.spectral_radius_error)

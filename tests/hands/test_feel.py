@@ -240,7 +240,7 @@ def test_the_first_device_is_held_along_its_first_direction_which_is_said(
     name: str, at: str, others: tuple[str, ...]
 ) -> None:
     found = feel(apc.compile(SCENES / f"{name}.yaml"), [1.0], beside=())
-    assert (found.at, found.notes) == (at, others)
+    assert (found.at, tuple(map(str, found.notes))) == (at, others)
 
 
 def test_in_a_plane_a_hand_feels_along_each_axis_what_it_feels_on_a_line() -> None:

@@ -18,7 +18,7 @@ from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.eigen.dissipation import least_real, peak_gain
 from apc.frame.devices import with_hands
-from apc.hands.passivity import STABLE, UNSTABLE, AbsoluteStability, passive_hands
+from apc.hands.passivity import AbsoluteStability, PassivityVerdict, passive_hands
 from tests.topologies import AVERAGE, MESH, ROOT, SCENES, compiled, replaced, wall
 from tests.truths import LIBRARY
 
@@ -164,19 +164,22 @@ def by_critical(system: Model, limit: float) -> None:
     (crossing,) = apc.critical(system, PULL, criterion="passive").crossings
     assert crossing.value == pytest.approx(limit, rel=5e-7)
     assert crossing.error < 3e-9 * limit
-    assert crossing.proof == "what hands can draw bounded on either side"
+    assert str(crossing.proof) == "what hands can draw bounded on either side"
 
 
 def by_certificate(system: Model, limit: float) -> None:
     for value, stable in ((limit - 1e-3, True), (limit + 1e-3, False)):
         at = apc.set_parameters(system, {PULL: f"{value!r} N/m"})
         found = passive_hands(at, certify=True)
-        assert (found.stable, found.proof) == (stable, "proved by floats whose every rounding is bounded")
+        assert (found.stable, str(found.proof)) == (
+            stable,
+            "proved by floats whose every rounding is bounded",
+        )
 
 
 def by_sweep(system: Model, limit: float) -> None:
     found = apc.sweep(system, {PULL: f"{limit - 1e-3},{limit + 1e-3} N/m"}, criterion="passive", jobs=1)
-    assert found.column("verdict").tolist() == [STABLE, UNSTABLE]
+    assert found.column("verdict").tolist() == [PassivityVerdict.STABLE, PassivityVerdict.UNSTABLE]
 
 
 def by_region(system: Model, limit: float) -> None:
@@ -256,7 +259,7 @@ def test_no_damping_helps_where_peers_feel_each_other_otherwise_than_springs_do(
         assert found.worst is not None and found.worst.more is None
         assert "not what springs give" in str(found)
     answer = apc.critical(system, "device.damping", criterion="passive")
-    assert answer.verdict.startswith("unstable whatever its value: apc analyze --hands passive")
+    assert str(answer.verdict).startswith("unstable whatever its value: apc analyze --hands passive")
 
 
 UNEVEN = "a: {count: 1, set: {coordination.stiffness: 50 N/m}}\n  b: {count: 3}"
@@ -373,7 +376,7 @@ def test_what_is_not_judged_is_refused_by_name() -> None:
     with pytest.raises(ApcError, match=r"E933.*cube"):
         apc.passive_hands(compiled(text))
     mesh = passive_hands(compiled(MESH), certify=True)
-    assert mesh.proof.startswith("with its devices clamped it is unstable: proved unstable with ")
+    assert str(mesh.proof).startswith("with its devices clamped it is unstable: proved unstable with ")
 
 
 def test_contacts_that_hands_may_close_are_named() -> None:
@@ -412,7 +415,7 @@ def test_the_command_line(capsys: pytest.CaptureFixture[str]) -> None:
     asked = ("critical contact.stiffness", "--upper", "900 N/m", "--hands")
     assert usual in said(*asked, "StylusArmForward") and usual not in said(*asked, "clamped")
     found = apc.critical(scene, PULL, lower="600 N/m", criterion="passive")
-    assert (found.value, found.verdict) == (None, "unstable at every value scanned")
+    assert (found.value, str(found.verdict)) == (None, "unstable at every value scanned")
 
 
 def test_held_hands_without_a_number_are_asked_for_one_and_the_fix_runs(
@@ -471,7 +474,7 @@ def test_a_critical_value_on_an_end_of_a_cell_is_held() -> None:
 def test_a_wall_of_more_damping_than_its_device_is_never_passive(damping: str) -> None:
     found = apc.critical(textbook(damping), "wall.stiffness", criterion="passive")
     assert (found.value, found.crossings) == (None, ())
-    assert found.verdict == "unstable at every value scanned"
+    assert str(found.verdict) == "unstable at every value scanned"
 
 
 def test_a_wall_that_is_only_touched_has_the_critical_value_of_the_wall_pressed() -> None:

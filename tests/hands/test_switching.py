@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 import apc
-from apc.analysis.switching import OPEN, STABLE
+from apc.analysis.switching import SwitchingVerdict
 from apc.compiler.compiled import Model
 from tests.topologies import SCENES, compiled, replaced, wall
 
@@ -103,10 +103,14 @@ def test_a_wall_may_be_switched_as_far_as_its_closed_form_says(
     # is least at 0 Hz, −(m/b² + (T/2 + delay)/b); times the stiffness that must stay above −1.
     most = 1 / (mass / damping**2 + (TICK / 2 + delay) / damping)
     below, above = (apc.switching(wall(mass, damping, delay, part * most)) for part in (0.999, 1.001))
-    assert below.verdict == STABLE and below.stable
+    assert below.verdict is SwitchingVerdict.STABLE and below.stable
     assert below.reach == pytest.approx(1 / 0.999, rel=1e-9)
     assert above.reach == pytest.approx(1 / 1.001, rel=1e-9)
-    assert above.verdict == OPEN and above.stable is None and "circle criterion fails" in above.reason
+    assert (
+        above.verdict is SwitchingVerdict.OPEN
+        and above.stable is None
+        and "circle criterion fails" in above.reason
+    )
 
 
 @pytest.mark.few(2)
@@ -119,7 +123,7 @@ def test_what_is_proved_never_grows_whatever_switches(count: int, tie: float, da
     assert reach is not None
     stiffness = 0.99 * reach * 100 if not damping else 100.0
     found = apc.switching(scene(count, tie, stiffness, damping))
-    assert found.stable and found.verdict == STABLE
+    assert found.stable and found.verdict is SwitchingVerdict.STABLE
     random = np.random.default_rng(1)
     patterns = [
         *(
@@ -179,7 +183,7 @@ def test_another_way_to_write_a_scene_is_judged_alike(change: tuple[str, str], s
 )
 def test_what_is_not_decided_says_so(change: tuple[str, str], reason: str) -> None:
     found = apc.switching(compiled(replaced(HELD, change)), set={})
-    assert (found.verdict, found.stable) == (OPEN, None) or "drift" in reason
+    assert (found.verdict, found.stable) == (SwitchingVerdict.OPEN, None) or "drift" in reason
     assert found.stable is not True and reason in found.reason
 
 

@@ -106,7 +106,7 @@ def test_a_contact_that_a_push_decides_about_is_linearized_and_says_so(tmp_path:
 def test_a_proof_of_a_linearization_says_of_what(tmp_path: Path) -> None:
     changes = {"f": "k*y + k*y*y*y/L/L"}
     found = analyze(compiled(SCENE, library(tmp_path, _text(changes))), certify=True)
-    assert found.proof.endswith(" bits, of the linearization")
+    assert str(found.proof).endswith(" bits, of the linearization")
 
 
 # What jumps has the same slopes on either side: it is no less linearized for that.

@@ -76,13 +76,13 @@ def test_of_many_peers_it_is_an_estimate_that_says_so(
 )
 def test_a_crossing_claims_no_more_than_its_moments_do(loss: str, proof: str) -> None:
     found = apc.critical(system_of(scene(2, 500.0, loss=loss)), STIFFNESS, lower="1100 N/m", upper="1500 N/m")
-    assert [one.proof for one in found.crossings] == [proof]
+    assert [str(one.proof) for one in found.crossings] == [proof]
 
 
 @pytest.mark.whole
 def test_how_soon_bursts_end_is_scanned_from_where_they_end() -> None:
     found = apc.critical(system_of(scene(2, 500.0, loss="{p: 1 %, r: 10 %}")), "lan.loss.r")
-    assert found.verdict.startswith("stable") and found.crossings == ()
+    assert found.verdict is not None and found.verdict.stable and found.crossings == ()
 
 
 def over_two_links(loss: str, other: str) -> str:

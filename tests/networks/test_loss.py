@@ -205,7 +205,7 @@ def test_a_proof_is_told_where_it_is_asked_for_and_there_is_one(
     text = scene(3, stiffness, loss=loss)
     found = judged(text, certify=True)
     how = f"proved {proved} in mean square, by floats whose every rounding is bounded" if proved else ""
-    assert (found.proof, judged(text).proof) == (how, "")
+    assert (str(found.proof), str(judged(text).proof)) == (how, "")
     assert any(text.startswith("not proved") for text in found.notes) == (not proved)
 
 

@@ -23,6 +23,7 @@ from apc.vary.critical_values import Critical
 from apc.vary.crossing import ESTIMATE, SingleSegment, SmoothSegment, Verdict, search
 from apc.vary.line import one_by_one
 from apc.vary.margins import Margin
+from apc.verdict import NO_PROOF
 from tests.bench import random_scans
 from tests.bruteforce import Scene, as_ball, frame_matrices, frame_matrix
 from tests.topologies import AVERAGE, MESH, ROOT, SCENES, compiled, replaced, wall
@@ -76,7 +77,9 @@ def check(system: Model, found: Critical, values: Sequence[Fraction] = ()) -> No
         sides = [stable_at(system, found, Fraction(one.value) + side * aside) for side in (-1, 1)]
         assert sides == ([True, False] if one.stable_side == "below" else [False, True]), one
     edges = [Fraction(one.value) for one in found.crossings]
-    first = found.crossings[0].stable_side == "below" if edges else found.verdict.startswith("stable")
+    first = (
+        found.crossings[0].stable_side == "below" if edges else bool(found.verdict and found.verdict.stable)
+    )
     for value in values:
         assert stable_at(system, found, value) is (first == (sum(e < value for e in edges) % 2 == 0)), value
 
@@ -194,7 +197,7 @@ def test_the_error_holds_against_the_full_map_in_50_digits() -> None:
     """At value ± error the eigenvalue of all peers' own map lies on either side of the circle."""
     found = apc.critical(compiled(AVERAGE), STIFFNESS)
     assert found.value is not None and found.error is not None and found.error < 1e-12 * found.value
-    assert found.crossings[0].proof.startswith("proved") and found.whole
+    assert str(found.crossings[0].proof).startswith("proved") and found.whole
     assert "no narrower" in str(replace(found, crossings=(replace(found.crossings[0], error=200.0),)))
     mode = np.exp(2j * np.pi * found.crossings[0].frequency_hz * 0.008)
     sizes = []
@@ -236,7 +239,7 @@ def test_a_defective_cluster_is_held_where_its_eigenvalue_alone_crosses() -> Non
         ("[1, 2, 1], [2, 3, 1], [3, 4, 1], [4, 5, 1]", "[1, 2, 1]"),
     )
     chain, single = (apc.critical(compiled(one), STIFFNESS).crossings[0] for one in (text, alone))
-    assert chain.proof.startswith("proved") and single.proof.startswith("proved")
+    assert chain.proof.bits and single.proof.bits
     assert abs(chain.value - single.value) <= chain.error + single.error < 1e-10 * chain.value
 
 
@@ -279,7 +282,7 @@ def test_the_verdict_along_a_scan_is_what_analyses_say(name: str) -> None:
 
 def test_how_many_users_is_answered_as_each_scene_alone_would() -> None:
     found = apc.critical(compiled(MESH), "user.count", lower="2", upper="40")
-    assert {one.proof for one in found.crossings} == {"both judged"}
+    assert {str(one.proof) for one in found.crossings} == {"both judged"}
     ends = [int(one.boundary) for one in found.crossings]
     alone = [apc.analyze(compiled(MESH), set={"user.count": str(count)}).stable for count in range(2, 41)]
     expected = [alone[0] is (sum(end < count for end in ends) % 2 == 0) for count in range(2, 41)]
@@ -388,13 +391,13 @@ def test_the_frequency_is_that_of_the_motion_that_decides() -> None:
 def test_no_crossing_is_an_answer_in_words() -> None:
     found = apc.critical(compiled(AVERAGE), STIFFNESS, upper="900 N/m")
     assert (found.value, found.error, found.stable_side, found.scanned) == (None, None, None, (0.0, 900.0))
-    assert found.verdict == "stable at every value scanned" and found.enters
+    assert str(found.verdict) == "stable at every value scanned" and found.enters
     above = apc.critical(compiled(AVERAGE), STIFFNESS, lower="1200 N/m", upper="2000 N/m")
-    assert above.verdict == "unstable at every value scanned"
+    assert str(above.verdict) == "unstable at every value scanned"
     # A wave impedance of 0 divides by zero: the least value looked at is above it.
     waves = apc.set_parameters(scene("two-users-waves"), {"lan.delay": "72 ms"})
     found = apc.critical(waves, "coordination.impedance", upper="1 N*s/m")
-    assert found.verdict == "stable at every value scanned" and found.scanned[0] > 0
+    assert str(found.verdict) == "stable at every value scanned" and found.scanned[0] > 0
     idle = apc.critical(compiled(AVERAGE), "cube.x")
     assert not idle.enters and idle.value is None
     said = " ".join(str(idle).split())
@@ -492,7 +495,7 @@ class Known(SingleSegment):
     def judge(self, value: Fraction) -> Verdict:
         radius = self.radius(float(value))
         stable = None if abs(radius - 1) <= self.band else radius < 1
-        return Verdict(stable, radius, self.band, (), "")
+        return Verdict(stable, radius, self.band, (), NO_PROOF)
 
     def stretches(self) -> Iterator[SmoothSegment]:
         points = np.array([0.0, 1.0, 10.0, 50.0, 100.0])
