@@ -291,9 +291,10 @@ def _refuse_several_senders(
             and len({dict(piece.taken).get(place) for piece in pieces}) > 1
         ]
         if places:
-            names = ", ".join(names_of(switched, places)) or "an equation"
-            what = f"{names} has a kink for each of the peers that it receives from over {link}"
-            raise at_a_kink(switched.kind.name, what)
+            names = names_of(switched, places)
+            kinks = ", ".join(names) or "an equation"
+            what = f"{kinks} has a kink for each of the peers that it receives from over {link}"
+            raise at_a_kink(switched.kind.name, what, names)
 
 
 def _refuse_hidden_kink(site: SubsystemJacobians, starting: StartClasses, g: int) -> None:
@@ -323,7 +324,7 @@ def _refuse_hidden_kink(site: SubsystemJacobians, starting: StartClasses, g: int
             ]
             gaps.append(float(np.abs(ends[0] - ends[1]).max() / np.abs(ends).max(initial=1e-300)))
         if min(gaps) > HALF_STEEP * max(gaps) and min(gaps) > LEAST_GAP:
-            raise at_a_kink(site.kind.name, "a nonlinear loop has a kink")
+            raise at_a_kink(site.kind.name, "a nonlinear loop has a kink", ())
 
 
 def _decides(site: SubsystemJacobians) -> bool:

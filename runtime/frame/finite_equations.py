@@ -21,7 +21,7 @@ from apc.compiler.source.source import parse_source
 
 SOMEWHERE = SourceLocation("the scene")  # of a mistake in numbers by themselves
 
-_PART = re.compile(r"(?:der\()?(\w+)[.\[]")  # of a variable, or of its derivative
+_PART = re.compile(r"(?:der\()?(\w+)(?:[.\[)]|\Z)")  # of a variable, or of its derivative
 
 # What Python's math module and CasADi's Newton solver say of a point where a function has no value.
 _NO_VALUE = ("math domain error", "rootfinder", "Evaluation failed", "Newton", "cannot convert NaN")
