@@ -200,7 +200,7 @@ def prose_read(tree: ast.AST, names: Mapping[str, object]) -> Iterator[tuple[int
     for node in ast.walk(tree):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
             read = []
-            if node.func.attr in READING and not (node.func.attr == "index" and node.keywords):
+            if node.func.attr in READING:
                 read = [node.func.value]
             elif node.func.attr in MATCHING:
                 read = [part for argument in node.args for part in ast.walk(argument)]
