@@ -76,6 +76,9 @@ NOWHERE = 1e-6
 # A bracket wider than this on each side of the value, relative to it, is narrowed by so many verdicts.
 WIDE, NARROWINGS = 1e-7, 24
 
+# An error above this, relative to the value, remains only where no verdict at that distance decides.
+RESOLUTION = 9.9e-7
+
 # After so many values at which nothing changes, nothing depends on a number whose every value takes long.
 STILL = 4
 
@@ -569,6 +572,34 @@ def _narrowed(
         elif verdict.stable is not rising and not at_left:
             right, above = middle, verdict
         else:  # another crossing
+            break
+    return _within_resolution(stretch, left, right, (below, above), rising=rising)
+
+
+def _within_resolution(
+    stretch: SmoothSegment, left: float, right: float, verdicts: tuple[Verdict, Verdict], *, rising: bool
+) -> tuple[float, float, tuple[Verdict, Verdict]]:
+    """Return a bracket of half at most RESOLUTION of its middle, where verdicts at that distance decide.
+
+    Parameters
+    ----------
+    stretch, left, right, verdicts, rising
+        As for `_narrowed`.
+    """
+    below, above = verdicts
+    for _ in range(NARROWINGS):
+        middle = (left + right) / 2
+        reach = RESOLUTION * abs(middle)
+        if right - left <= 2 * reach:
+            break
+        lower, upper = stretch.judge(Fraction(middle - reach)), stretch.judge(Fraction(middle + reach))
+        from_left = lower.stable is rising
+        from_right = upper.stable is (not rising)
+        if from_left:
+            left, below = middle - reach, lower
+        if from_right:
+            right, above = middle + reach, upper
+        if from_left is from_right:  # narrowed from both sides, or undecided on both
             break
     return left, right, (below, above)
 

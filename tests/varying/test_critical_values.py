@@ -519,6 +519,15 @@ def test_an_end_that_stands_alone_is_no_crossing() -> None:
     assert one.value == pytest.approx(0.1, rel=1e-10)
 
 
+@pytest.mark.parametrize("half", [1e-7, 5e-7, 7e-7, 8e-7, 9e-7, 9.8e-7])
+def test_no_error_is_wider_than_1e_6_where_analyses_that_near_decide(half: float) -> None:
+    """No analysis decides within `half` of the limit, relative to it: all decide at 1e-6 of it."""
+    limit, slope = 33.3, 0.01
+    band = math.expm1(slope * limit * half)
+    (one,) = search(Known(lambda at: math.exp(slope * (at - limit)), band=band)).edges
+    assert abs(one.value - limit) <= one.error <= 1e-6 * one.value
+
+
 @pytest.mark.parametrize(("slope", "band"), [(1e-3, 1e-7), (14 / 33.3, 1e-5), (-14 / 33.3, 1e-5)])
 def test_a_bracket_is_narrowed_to_the_values_that_no_analysis_decides(slope: float, band: float) -> None:
     """The radius is undecided within `band` of 1, so that no bracket is narrower than 2 `band` / `slope`."""
