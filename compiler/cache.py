@@ -1,23 +1,23 @@
-"""Whether a compiled model on disk is still what its texts compile to.
+"""Check whether a compiled model on disk is up to date with its texts.
 
-Takes: the path of a NAME.apc. Gives: `Origin`, what a model was made from, and `origin_of`, `replayable`;
-`packed` and `read_archive`, the file and its parts; `changed`, the first text that is different now;
+Takes: the path of a NAME.apc. Gives: `Origin`, what a model was made from, `origin_of`, `replayable`;
+`Archive`, the parts of a file, `packed`, `read_archive`; `changed`, the first text that differs now;
 `builtin_files`, `program_digest`.
-Guarantees: decided by content alone: no modification time, no algebra imported; a model is handed on unread,
-and only what this user's seal says is this user's counts as such.
+Guarantees: the decision is by content only, without modification times or algebra imports. A model is passed
+on unparsed, and only a valid signature marks it as this user's.
 Does not: compile, or read the model itself (see `store`).
 
-A text has the name by which the topology gives it:
+The name of a text is its reference in the topology:
 
-    scene.yaml         the topology, beside the model
-    ./users.csv        a table it names, from the topology's folder
-    ./parts/           a folder of the user's own components: the names of its files, a line each
-    ./parts/tie.yaml   one of these
+    topology.yaml         the topology, in the model's folder
+    ./users.csv        a table that it names, relative to the topology's folder
+    ./parts/           a folder of the user's components: its file names, one per line
+    ./parts/tie.yaml   a file in this folder
     Mass               a definition of the built-in library
 
-The file is four lines: `apc`, the format and whether the model is as its texts compile ("compiled") or may
-have been changed since ("saved"); the seal of all else and, against damage on the way to somebody else, its
-SHA-256; the origin as JSON; the model.
+The file has four lines: `apc`, the format, and whether the model is as compiled ("compiled") or may have been
+changed since ("saved"); the signature of the rest and its SHA-256 against damage in transfer; the origin as
+JSON; the model.
 """
 
 from __future__ import annotations
@@ -35,21 +35,21 @@ import msgspec
 
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import RefusedError, listing, read_file
-from apc.compiler.seal import is_sealed, seal
+from apc.compiler.signing import is_sealed, seal
 from apc.compiler.source.reading import fault
 
-FORMAT = 15  # of NAME.apc
+FORMAT = 16  # of NAME.apc
 LARGEST = 256 * 2**20  # bytes of the file
 LARGEST_ORIGIN = 64 * 2**20  # bytes of its third line, each of which takes up to ten of memory
 SUFFIX = ".yaml"  # of the files in a folder of components
-HANDS_CHANGE = "hands"  # what stands in the place of a number's name where hands were put to devices
+HANDS_CHANGE = "hands"  # replaces the parameter name if hands were attached to devices
 _RATIONAL = re.compile(r"-?[0-9]{1,4000}(/[1-9][0-9]{,4000})?")
 FOREIGN = "is damaged: it is not what apc compile writes"
 
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """What a model was made from.
+    """The origin of a model: its texts.
 
     `texts` are the topology, whose name is `topology`, and all it needs, in bytes by name; `program` is the
     digest of what compiled them. `changes` were made afterwards, each at once: names of numbers with values
@@ -88,35 +88,35 @@ def packed(origin: Origin, model: bytes, *, compiled: bool) -> bytes:
     try:
         body = msgspec.json.encode(origin) + b"\n" + model
     except UnicodeEncodeError:
-        what = "the name of a file that it is compiled from is not valid UTF-8"
-        raise ApcError(Diagnostic("E601", SourceLocation(origin.topology), what)) from None
+        message = "the name of a file that it is compiled from is not valid UTF-8"
+        raise ApcError(Diagnostic("E601", SourceLocation(origin.topology), message)) from None
     whole = head + b"\n" + body
     mark = f"{seal(whole)} {hashlib.sha256(whole).hexdigest()}"
     return b"\n".join((head, mark.encode(), body))
 
 
 def read_archive(path: Path) -> Archive:
-    """Take a model's file apart.
+    """Split a model's file into its parts.
 
     Raises
     ------
     ApcError
         E602 it can't be read, E603 it is of another format, E604 it is damaged.
     """
-    place = SourceLocation(str(path))
+    location = SourceLocation(str(path))
     try:
         data = read_file(path, LARGEST)
     except RefusedError as refused:
         hint = "apc compile" if refused.why == "missing" else ""
         other = ", not a compiled model" if refused.why in ("folder", "special") else ""
-        raise fault("E602", place, f"{refused.words}{other}", hint=hint) from None
+        raise fault("E602", location, f"{refused.words}{other}", hint=hint) from None
     topology = path.with_suffix(SUFFIX)
     hint = f"apc compile {topology}" if topology.exists() else "the file once more, from whoever made it"
     head, mark, origin, model = (*data.split(b"\n", 3), b"", b"", b"")[:4]
     form = re.fullmatch(rb"apc ([0-9]{1,6}) (compiled|saved)", head)
     if form and int(form[1]) != FORMAT:
-        what = f"has format version {int(form[1])}, this program reads version {FORMAT}"
-        raise fault("E603", place, what, hint=hint)
+        message = f"has format version {int(form[1])}, this program reads version {FORMAT}"
+        raise fault("E603", location, message, hint=hint)
     whole = b"\n".join((head, origin, model))
     sealed, _, checksum = mark.decode("latin-1").partition(" ")
     try:
@@ -130,21 +130,21 @@ def read_archive(path: Path) -> Archive:
         if not all(name == HANDS_CHANGE or _RATIONAL.fullmatch(value) for name, value in numbers):
             raise ValueError
     except (ValueError, RecursionError):  # what is nested too deeply
-        raise fault("E604", place, FOREIGN, hint=hint) from None
+        raise fault("E604", location, FOREIGN, hint=hint) from None
     return Archive(made_from, model, is_sealed(whole, sealed), form[2] == b"compiled")
 
 
 def changed(archive: Archive, folder: Path) -> str:
-    """Return the name of the first text that is different now, in words; empty when none is.
+    """Return the name of the first changed text, in words; empty if none.
 
-    What has no seal may name any file or folder of the machine: of its texts only the topology is looked at.
+    An unsigned file could reference any path of the machine: only its topology is read.
 
     Parameters
     ----------
     archive
         A model's file.
     folder
-        Where its topology is.
+        The folder of its topology.
     """
     for name, text in archive.origin.texts:
         path = builtin_files().get(name)
@@ -154,7 +154,7 @@ def changed(archive: Archive, folder: Path) -> str:
 
 
 def _now(path: Path, name: str) -> bytes | None:
-    """Return a text as it is now, None if it can't be read."""
+    """Return the present content of a text, None if it cannot be read."""
     try:
         if name.endswith("/"):
             return listing(path, SUFFIX)
@@ -164,14 +164,14 @@ def _now(path: Path, name: str) -> bytes | None:
 
 
 def origin_of(topology: Path, read: Mapping[str, bytes]) -> Origin:
-    """Return what a model was made from.
+    """Return the origin of a model.
 
     Parameters
     ----------
     topology
         Its file.
     read
-        What `files.recorded` noted.
+        The files recorded by `files.recorded`.
     """
     names = {str(path): name for name, path in builtin_files().items()} | {str(topology): topology.name}
     texts = {names.get(path) or _name(path, topology.parent): text for path, text in read.items()}
@@ -192,9 +192,9 @@ def replayable(origin: Origin, folder: Path) -> dict[str, bytes]:
     Parameters
     ----------
     origin
-        What the model was made from.
+        The origin of the model.
     folder
-        Where its topology is thought to be.
+        The expected folder of its topology.
     """
     builtin = builtin_files()
     texts = {str(path): path.read_bytes() for path in builtin.values()}
@@ -206,13 +206,13 @@ def replayable(origin: Origin, folder: Path) -> dict[str, bytes]:
 
 @functools.cache
 def builtin_files() -> dict[str, Path]:
-    """Return the built-in library's files by the name of what they define, the file's name in camel case."""
-    # Beside the compiler in a checkout and in an installed package alike.
+    """Return the built-in library's files by the name of their definition, the file name in camel case."""
+    # In the compiler's folder, both in a checkout and in an installed package.
     models = Path(__file__).resolve().parent.parent / "models"
     return {
         "".join(word.capitalize() for word in path.stem.split("-")): path
         for path in sorted(models.rglob("*.yaml"))
-        if "scenes" not in path.relative_to(models).parts
+        if "topologies" not in path.relative_to(models).parts
     }
 
 

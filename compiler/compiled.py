@@ -1,17 +1,19 @@
-"""The compiled model: CasADi functions of one site per kind, and the exchange between sites as structure.
+"""The compiled model: CasADi functions of each peer type, and the communication structure.
 
 Takes: nothing (these are the data types the stage `functions` fills and the runtime reads).
-Gives: `Model` and its parts, but `Origin` (see `cache`);
-`PEERS`, `count_of`, `group_count`, `counts_peers`; `LENGTH`, `ANGLES`.
+Gives: `Model` and its parts: `Clock`, `Graph`, `PairDelay`, `Loss`, `Channel`, `Link`; `Formula`, `Timing`,
+`Parameter`; `State`, `Hold`, `Receive`, `ClockPartition`, `SendPartition`, `ForcePorts`, `Limit`, `Replaced`,
+`PeerType`; `PeerColumn`, `Group`; `Experiment`, `Axis`. The names of counted parameters: `PEERS`, `count_of`,
+`group_count`, `counts_peers`. `LENGTH`, `ANGLES`.
 Guarantees: plain frozen data; numbers in SI; periods, phases and delays exact rationals of a second.
 Does not: evaluate anything, or read or write files (see `store`).
 
-Every function of a kind takes some of these vectors, in this order:
+Every function of a peer type takes some of these vectors, in this order:
 
     x  (n_x,)  continuous states, in the order of `PeerType.states`
-    u  (n_u,)  the values the holds put out at this moment, in the order of `PeerType.holds`
+    u  (n_u,)  present outputs of the holds, in the order of `PeerType.holds`
     m  (n_m,)  for a tick: the partition's remembered outputs from its previous tick
-    r  (n_r,)  for a tick: what the site hears from the others, in the order of `ClockPartition.receives`
+    r  (n_r,)  for a tick: values received from the others, in the order of `ClockPartition.receives`
     p  (n_p,)  parameters, in the order of `PeerType.parameters`
     t  ()      time in seconds
 """
@@ -27,17 +29,17 @@ from numpy.typing import NDArray
 
 from apc.compiler.cache import Origin
 
-# The units of positions: a length; an angle, or what stands for one where a body turns in space.
+# The units of positions: a length; an angle, or a rotation parameter of a body in space.
 LENGTH, ANGLES = "m", ("rad", "1")
 PEERS = "peers"  # the parameter that holds the number of peers
 LARGEST_COUNT = 10**9  # of peers in one group
-MOST_GROUPS = 1000  # of a scene: who hears whom is worked out for each two of them
-MOST_PLACED = 10**6  # peers of a scene on a graph that isn't complete: each has a place in several arrays
-COUNT = "count("  # how those begin that hold how many peers are heard over a link, see `count_of`
+MOST_GROUPS = 1000  # number of peers of a model: the communication graph has an entry per pair
+MOST_PLACED = 10**6  # peers of a model on a graph that isn't complete: each has a place in several arrays
+COUNT = "count("  # prefix of the parameters that count received peers of a link, see `count_of`
 
 
 def count_of(link: str) -> str:
-    """Return the name of the parameter that counts, with their weights, the peers heard over a link."""
+    """Return the name of the parameter that is the weighted count of the peers received over a link."""
     return f"{COUNT}{link})"
 
 
@@ -47,7 +49,7 @@ def group_count(group: str) -> str:
 
 
 def counts_peers(parameter: str) -> bool:
-    """Say whether a parameter is a number of peers: of a group, or what follows from those of groups."""
+    """Return whether a parameter is a number of peers: of a group, or computed from those of groups."""
     return parameter == PEERS or parameter.startswith(COUNT) or parameter.endswith(".count")
 
 
@@ -55,7 +57,7 @@ def counts_peers(parameter: str) -> bool:
 class Clock:
     """Ticks at `phase + k*period`, k = 0, 1, …; `period` and `phase` are names of timings.
 
-    `line` and `column` say where in the topology its period stands, 0 if that isn't known.
+    `line` and `column` are the location of its period in the topology, 0 if unknown.
     """
 
     name: str
@@ -67,11 +69,11 @@ class Clock:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Graph:
-    """Who hears whom: "complete", "ring", "star" (the first peer is the centre), or "arcs".
+    """The communication graph: "complete", "ring", "star" (the first peer is the center), or "arcs".
 
     `arcs` (M, 2) are then (sender, receiver) pairs, peers counted from 0 over the groups in order, and
-    `weights` (M,) what a receiver multiplies that sender's packets by, each standing for the shortest decimal
-    that means it (see `weights`); for the other shapes both are empty.
+    `weights` (M,) the factors of the sender's packets, each representing its shortest decimal (see
+    `weights`); for the other shapes both are empty.
     """
 
     shape: str
@@ -90,11 +92,11 @@ class PairDelay:
 
 @dataclass(frozen=True, slots=True)
 class Loss:
-    """How packets get lost, by netem's `gemodel` (after Gilbert and Elliott): names of four parameters.
+    """The loss model of packets, netem's `gemodel` (after Gilbert and Elliott): names of four parameters.
 
-    In its good state a way from peer to peer loses a packet with the probability `one_minus_k`, in its bad
-    state with `one_minus_h`; after each packet a good one turns bad with the probability `p`, a bad one good
-    with `r`. With r = 1 − p losses are independent.
+    In its good state a directed link loses a packet with the probability `one_minus_k`, in its bad state with
+    `one_minus_h`; after each packet a good one turns bad with the probability `p`, a bad one good with `r`.
+    With r = 1 − p losses are independent.
     """
 
     p: str
@@ -105,14 +107,13 @@ class Loss:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Channel:
-    """What makes a link unreliable; every way from peer to peer on its own.
+    """The channel of an unreliable link; directed links are independent.
 
     `jitter` is the name of a timing, added to the delay times a number drawn from `distribution` ("uniform",
-    "normal" or "pareto"). `trace` (n,) are recorded delays in seconds instead, one a packet, infinite for one
-    that was lost, from the first again after the last. `reorder` says whether the packet sent last wins
-    ("newest") or the one that arrived last ("all"); `on_loss` whether a receiver that misses a packet holds
-    the one before ("hold") or takes what it would itself send at that moment ("zero": no difference, no
-    force).
+    "normal" or "pareto"). `trace` (n,) are recorded delays in seconds instead, one per packet, infinite for a
+    lost one, repeated periodically. `reorder` selects the packet in effect: the one sent last ("newest") or
+    the one arrived last ("all"). `on_loss` is the substitute for a missing packet: the previous one ("hold")
+    or the receiver's own value of that moment ("zero": no difference, no force).
     """
 
     loss: Loss | None
@@ -125,10 +126,10 @@ class Channel:
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """Carries every sender's channels to those who hear it.
+    """A network link: transfers every sender's channels to the receivers.
 
-    `clock` is the name of a clock, `delay` of a timing; `delays` are the pairs of groups with a delay of
-    their own. `channel` is None for a reliable link.
+    `clock` is the name of a clock, `delay` of a timing; `delays` are the pairs of groups with separate
+    delays. `channel` is None for a reliable link.
     """
 
     name: str
@@ -141,7 +142,7 @@ class Link:
 
 @dataclass(frozen=True, slots=True)
 class Formula:
-    """What a number follows from: the `text` of an expression (see `language.evaluation`) and its `names`."""
+    """A formula: the `text` of an expression (see `language.evaluation`) and its `names`."""
 
     text: str
     names: tuple[str, ...]
@@ -163,13 +164,13 @@ class Timing:
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A number of the scene: SI value; `formula` if it follows from other numbers.
+    """A parameter of the model: SI value; `formula` if computed from other parameters.
 
-    `minimum` is the least value allowed; `open_minimum` says that the least value itself is excluded.
+    `minimum` is the least value allowed; `exclusive_minimum` is whether the minimum itself is excluded.
     `exact` is the rational that `value` is the nearest float to, as 5/3; None where `value` was given as a
     float, in the shortest decimal that means it. Times that depend on a parameter are computed from `number`:
-    a tick decides by equality. `display_unit` is the unit in which the scene writes the value, and in which
-    people are shown it, as Modelica's displayUnit; empty where that is `unit`.
+    a tick decides by equality. `display_unit` is the unit of the topology's text and of outputs, as
+    Modelica's displayUnit; empty if it is `unit`.
     """
 
     name: str
@@ -177,9 +178,9 @@ class Parameter:
     value: float
     formula: Formula | None = None
     minimum: float | None = None
-    open_minimum: bool = False
+    exclusive_minimum: bool = False
     maximum: float | None = None
-    about: str = ""
+    description: str = ""
     exact: Fraction | None = None
     display_unit: str = ""
 
@@ -213,16 +214,16 @@ class Hold:
 
 @dataclass(frozen=True, slots=True)
 class Receive:
-    """Row of r: the `operator` over the others that the peer hears over a link; the newest delivered values.
+    """Row of r: the `operator` over the other peers received over a link, with the newest delivered values.
 
-    `age` says what of it is how old these are, in seconds since they were sent: "factor" multiplies each, or
-    it is of ages "alone", or the last row of s of its "edge" is the age. With `before` it is what was heard
-    at the tick before; then there is no edge.
+    `age` is the use of the packet ages in seconds since sending: a "factor" of each value, the ages "alone",
+    or the last row of s of the "edge". With `before` it is the reduction of the previous tick; then there is
+    no edge.
 
     "mean" and "sum" are weighted by the link's graph. Without an `edge` they are of row `channel` of the
     link's `SendPartition`, so that a complete graph of N peers costs N. With an `edge` the operator runs over
-    `edge(x, u, m, s, p, t)`, one evaluation a pair of peers: x, u, m, p, t are the hearing peer's, s (n_c,)
-    the sending peer's channels of the link. "max" and "min" don't look at weights.
+    `edge(x, u, m, s, p, t)`, one evaluation per pair of peers: x, u, m, p, t are the receiving peer's, s
+    (n_c,) the sending peer's channels of the link. "max" and "min" ignore weights.
     """
 
     name: str
@@ -236,12 +237,13 @@ class Receive:
 
 @dataclass(frozen=True, slots=True)
 class ClockPartition:
-    """What a site computes at a tick of one clock.
+    """The tick function of a subsystem for one clock.
 
     `tick(x, u, m, r, p, t) -> y (n_y,)`; `outputs` names the rows of y, `units` their SI units; `memories`
     are the rows of y whose values at the previous tick make up m; `starts` are the parameters holding their
     start values. Where `variants` are given, y is made of several such columns, one below the other, and tick
-    k computes the one numbered variants[k mod their number]: none in what was compiled (see `frame.ages`).
+    k computes the one numbered variants[k mod their number]: none in what was compiled (see
+    `frame.data_age`).
     """
 
     clock: str
@@ -256,7 +258,7 @@ class ClockPartition:
 
 @dataclass(frozen=True, slots=True)
 class SendPartition:
-    """What a site sends over one link at a tick of the link's clock: `send(x, u, p, t) -> s (n_c,)`."""
+    """The values sent over one link at a tick of its clock: `send(x, u, p, t) -> s (n_c,)`."""
 
     link: str
     channels: tuple[str, ...]
@@ -266,7 +268,7 @@ class SendPartition:
 
 @dataclass(frozen=True, slots=True)
 class ForcePorts:
-    """Where held values act on what moves: `port(x, u, p, t) -> (potentials, then flows) (2 n,)`.
+    """The port of held values at continuous states: `port(x, u, p, t) -> (potentials, then flows) (2 n,)`.
 
     `parts` (n,) names the part of each; a flow counts into its part and follows from u and p alone. A part
     does the work −flow · (change of the potential) while nothing switches.
@@ -278,7 +280,7 @@ class ForcePorts:
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """What the size of a variable should stay within: the parameter `limit`, which no function need take.
+    """The limit of a variable's magnitude: the parameter `limit`, possibly unused by functions.
 
     `value(x, u, p, t) -> the variable (1,)`; None for one that is a state.
     """
@@ -291,7 +293,7 @@ class Limit:
 
 @dataclass(frozen=True, slots=True)
 class Replaced:
-    """A part that other equations represent in a linear analysis; `valid` says for which motions."""
+    """The representation of a part in a linear analysis; `valid` describes the motions it applies to."""
 
     part: str
     equations: tuple[str, ...]
@@ -304,10 +306,10 @@ class PeerType:
 
     A float among the values of a parameter is exact, but where `rounded` has it: by the parameter's place in
     `parameters`, the rationals that floats round, each float at most one of them. `hands` are the parts that
-    the scene calls hands, if they answer to how they are moved; `held` the parts that any hand is joined to,
+    the model calls hands, if they answer to how they are moved; `held` the parts that any hand is joined to,
     or without hands those with a connector for hands.
-    `linear` is the kind that represents it in a linear analysis, of the same states and parameters, None
-    where that is the kind itself; `replaced` are the parts in which they differ.
+    `linear` is the peer type that represents it in a linear analysis, of the same states and parameters, None
+    where that is the peer type itself; `replaced` are the parts in which they differ.
     `symbols` are those of published wall conditions with the numbers that play them, empty unless every part
     but hands has some.
     """
@@ -339,7 +341,7 @@ class PeerColumn:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """`count` peers of kind `kind` (an index); `values` overrides parameters, by name, for this group.
+    """`count` peers of type `peer_type` (an index); `values` overrides parameters, by name, for this group.
 
     An override is a `Parameter` of the same name, so that it can have a formula too; `columns` override
     parameters peer by peer.
@@ -347,14 +349,14 @@ class Group:
 
     name: str
     count: int
-    kind: int
+    peer_type: int
     values: tuple[Parameter, ...] = ()
     columns: tuple[PeerColumn, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Experiment:
-    """How long a simulation runs, in seconds (None if not said), and the seed of what is random in it."""
+    """The duration of a simulation, in seconds (None if not given), and the seed of its random numbers."""
 
     duration: Fraction | None = None
     seed: int = 0
@@ -373,22 +375,21 @@ class Axis:
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """A compiled scene. `dropped` lists what the scene named but does not need, with the reason.
+    """A compiled model. `dropped` lists the unused items of the topology, with the reason.
 
-    `followers` are the names of all parameters and timings with a formula, of any group, in an order in which
-    each stands behind what it follows from. `warnings` say what the topology seldom means, and where.
-    `region` are the axes x and y of the study of that name, empty or one if the scene leaves them open.
-    `within` are the delays that are given as a range, in whose middle they are.
-    `tune` is what the study of that name asks, each word with its text, as options take them.
+    `followers` are the names of all parameters and timings with a formula, of any group, in order of
+    dependence. `warnings` are unusual parts of the topology, with their locations. `region` are the axes x
+    and y of the study of that name, with none or one if unspecified. `within` are the delays given as a
+    range; their value is its middle. `tune` are the entries of the study of that name, as option texts.
     """
 
     name: str
-    about: str
+    description: str
     clocks: tuple[Clock, ...]
     links: tuple[Link, ...]
     timings: tuple[Timing, ...]
     parameters: tuple[Parameter, ...]
-    kinds: tuple[PeerType, ...]
+    peer_types: tuple[PeerType, ...]
     groups: tuple[Group, ...]
     dropped: tuple[tuple[str, str], ...]
     origin: Origin
@@ -400,27 +401,27 @@ class Model:
     within: tuple[Axis, ...] = ()
 
     def __repr__(self) -> str:
-        """Return what it is in a line."""
+        """Return a one-line representation."""
         return f"<Model {self.name}: {self.peers} peer{'' if self.peers == 1 else 's'}>"
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows."""
+        """Return the representation for a notebook."""
         from html import escape  # nothing else needs its list of characters
 
         return f"<pre>{escape(str(self))}</pre>"
 
     def __str__(self) -> str:
-        """Return what the model holds, a line a kind of peer."""
-        lines = [f"{self.name}: {self.about}" if self.about else self.name]
-        for index, kind in enumerate(self.kinds):
+        """Return the contents of the model, one line per peer type."""
+        lines = [f"{self.name}: {self.description}" if self.description else self.name]
+        for index, peer_type in enumerate(self.peer_types):
             groups = ", ".join(
-                f"{group.count} × {group.name}" for group in self.groups if group.kind == index
+                f"{group.count} × {group.name}" for group in self.groups if group.peer_type == index
             )
-            states = ", ".join(state.name for state in kind.states)
-            lines.append(f"  {groups}: {len(kind.states)} states ({states})")
+            states = ", ".join(state.name for state in peer_type.states)
+            lines.append(f"  {groups}: {len(peer_type.states)} states ({states})")
         return "\n".join(lines)
 
     @property
     def peers(self) -> int:
-        """The number of peers in the scene."""
+        """The number of peers in the model."""
         return sum(group.count for group in self.groups)

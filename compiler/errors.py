@@ -1,9 +1,10 @@
-"""What a user is told when the input is at fault.
+"""Error messages for invalid input.
 
-Takes: nothing. Gives: `SourceLocation` and `place_in`, `Diagnostic`, `ApcError` and the collector `Mistakes`;
-`visible`.
-Guarantees: mistakes of one file come out together, in file order, each once; no control character is
-told as it is.
+Takes: nothing.
+Gives: `SourceLocation` and `location_in`, `Diagnostic`, `ApcError` and the collector `Mistakes`; `visible`,
+`nearest`.
+Guarantees: the errors of one file are reported together, in file order, each once. Control characters are
+escaped.
 Does not: print, or decide exit codes.
 """
 
@@ -40,9 +41,9 @@ class SourceLocation:
 
 
 def visible(text: str) -> str:
-    """Return a text in which no character acts on a terminal: what isn't printed stands as JSON's `\\u001b`.
+    """Return a text without control characters: unprintable ones are escaped as in JSON, `\\u001b`.
 
-    Line breaks, tabs and spaces stay. So a JSON document stays one.
+    Line breaks, tabs and spaces are kept, so a JSON document stays valid.
     """
     return "".join(
         c
@@ -52,30 +53,30 @@ def visible(text: str) -> str:
     )
 
 
-def place_in(place: SourceLocation, text: str, offset: int) -> SourceLocation:
-    """Return the place of character `offset` of a text that starts at `place`.
+def location_in(location: SourceLocation, text: str, offset: int) -> SourceLocation:
+    """Return the place of character `offset` of a text that starts at `location`.
 
-    A text folded from several lines, or one with escapes, does not stand in the source line as it is: then
-    the start of the text is the best place we know.
+    A text folded from several lines, or one with escapes, differs from the source line: then the start of the
+    text is returned.
     """
-    start = place.column - 1
-    if place.source_line and not place.source_line.startswith(text[:offset], max(start, 0)):
-        return place
-    return place.shifted(offset)
+    start = location.column - 1
+    if location.source_line and not location.source_line.startswith(text[:offset], max(start, 0)):
+        return location
+    return location.shifted(offset)
 
 
 @dataclass(frozen=True, slots=True)
 class Diagnostic:
-    """One fault in the input: what it is about, what was got, what was expected, the line to write.
+    """One error in the input: its subject, the actual and the expected value, the suggested line.
 
-    It reads `PLACE: CODE WHAT wants EXPECTED, got GOT. Write: HINT`; `expected`, `got` and `hint`
+    It reads `LOCATION: CODE WHAT wants EXPECTED, got GOT. Write: HINT`; `expected`, `got` and `hint`
     may be empty, and then their part of the sentence is left out. `subject` is the name of the unit, part or
     number at fault, for decisions: no text has it.
     """
 
     code: str
-    place: SourceLocation
-    what: str
+    location: SourceLocation
+    message: str
     expected: str = ""
     got: str = ""
     hint: str = ""
@@ -83,19 +84,19 @@ class Diagnostic:
 
     def __str__(self) -> str:
         """Return the message with the source line and a caret under the place."""
-        text = f"{self.place}: {self.code} {self.sentence}"
-        line = self.place.source_line.rstrip("\n")
-        if not (self.place.line and line.strip()):
+        text = f"{self.location}: {self.code} {self.sentence}"
+        line = self.location.source_line.rstrip("\n")
+        if not (self.location.line and line.strip()):
             return text
         # A long line is shown around its fault only; a tab or control character would move the caret.
-        start = max(0, min(self.place.column - 1 - SHOWN // 2, len(line) - SHOWN))
+        start = max(0, min(self.location.column - 1 - SHOWN // 2, len(line) - SHOWN))
         shown = "".join(c if c.isprintable() else " " for c in line[start : start + SHOWN])
-        return f"{text}\n    {shown}\n    {' ' * (self.place.column - 1 - start)}^"
+        return f"{text}\n    {shown}\n    {' ' * (self.location.column - 1 - start)}^"
 
     @property
     def sentence(self) -> str:
         """The message without place, code and source line."""
-        text = self.what
+        text = self.message
         if self.expected:
             text += f" wants {self.expected}"
         if self.got:
@@ -104,21 +105,21 @@ class Diagnostic:
             text += "."
         if 0 < len(self.hint) <= LONGEST_HINT:
             text += f" Write: {self.hint}"
-        return _in_one_line(text)
+        return _in_single_line(text)
 
     @property
     def reason(self) -> str:
-        """What is wrong, without what to write in its place."""
+        """The description of the error, without the suggestion."""
         return replace(self, hint="").sentence
 
 
-def _in_one_line(text: str) -> str:
-    """Return a text in one line, whatever it quotes."""
+def _in_single_line(text: str) -> str:
+    """Return a text on one line, also with quoted line breaks."""
     return visible(re.sub(r"\s", " ", text))
 
 
 class ApcError(Exception):
-    """The input is at fault. `mistakes` holds at least one `Diagnostic`, in file order."""
+    """The input is invalid. `mistakes` holds at least one `Diagnostic`, in file order."""
 
     def __init__(self, mistakes: Iterable[Diagnostic] | Diagnostic) -> None:
         result = (mistakes,) if isinstance(mistakes, Diagnostic) else tuple(mistakes)
@@ -136,13 +137,13 @@ class Mistakes:
 
     def __init__(self, names: Iterable[str] = ()) -> None:
         self.names = tuple(names)
-        self._found: dict[Diagnostic, None] = {}
+        self._result: dict[Diagnostic, None] = {}
 
     def add(
         self,
         code: str,
-        place: SourceLocation,
-        what: str,
+        location: SourceLocation,
+        message: str,
         *,
         expected: str = "",
         got: str = "",
@@ -153,17 +154,17 @@ class Mistakes:
 
         Parameters
         ----------
-        code, place, what, expected, got, hint, subject
+        code, location, message, expected, got, hint, subject
             As `Diagnostic` has them.
         """
-        self._found[Diagnostic(code, place, what, expected, got, hint, subject)] = None
+        self._result[Diagnostic(code, location, message, expected, got, hint, subject)] = None
 
     def take(self, error: ApcError) -> None:
         """Record every mistake of an error raised further down."""
-        self._found |= dict.fromkeys(error.mistakes)
+        self._result |= dict.fromkeys(error.mistakes)
 
     def __enter__(self) -> None:
-        """Take what is raised within: `with mistakes:`."""
+        """Collect the errors raised within: `with mistakes:`."""
 
     def __exit__(self, kind: object, error: BaseException | None, _: object) -> bool:
         """Record an `ApcError`, and go on behind the block."""
@@ -172,52 +173,52 @@ class Mistakes:
         return isinstance(error, ApcError)
 
     def __bool__(self) -> bool:
-        return bool(self._found)
+        return bool(self._result)
 
     def pass_on(self, other: Mistakes) -> None:
         """Record all of these with others."""
-        other._found |= self._found
+        other._result |= self._result
 
     @property
-    def found(self) -> tuple[Diagnostic, ...]:
+    def result(self) -> tuple[Diagnostic, ...]:
         """All mistakes in file order."""
         any_name = "|".join(map(re.escape, self.names)) or "(?!)"  # without names, nothing
         named = re.compile(rf"(?<!\w)({any_name})(?!\w)")
         once = {
-            (mistake.place, mistake.code, named.sub("…", mistake.sentence)): mistake
-            for mistake in reversed(self._found)
+            (mistake.location, mistake.code, named.sub("…", mistake.sentence)): mistake
+            for mistake in reversed(self._result)
         }
-        return tuple(sorted(once.values(), key=lambda mistake: (mistake.place, mistake.code)))
+        return tuple(sorted(once.values(), key=lambda mistake: (mistake.location, mistake.code)))
 
     def raise_if_any(self) -> None:
         """Raise `ApcError` with all mistakes, if there is one."""
-        if self._found:
-            raise ApcError(self.found)
+        if self._result:
+            raise ApcError(self.result)
 
 
 FEW_NAMES = 50  # that are compared with a misspelt one in full
 
 
-def nearest(name: str, texts: Iterable[str], *, alike: float = 0.6) -> str:
+def nearest(name: str, texts: Iterable[str], *, similarity: float = 0.6) -> str:
     """Return the known name closest to a misspelt one, or an empty string when none is close.
 
     Parameters
     ----------
     name, texts
-        The name as written, and those there are.
-    alike
-        How alike two names must be, from 0 to 1: what short names share by chance is more.
+        The name as written, and the known names.
+    similarity
+        The smallest similarity of two names, from 0 to 1: short names have more random similarity.
     """
     import difflib  # for a mistake only
 
     name, known = name[:200], list(texts)
     if len(known) > FEW_NAMES:  # difflib takes a tenth of a millisecond a name
-        known.sort(key=lambda text: -_in_place(name, text))
-    close = difflib.get_close_matches(name, known[:FEW_NAMES], n=1, cutoff=alike)
+        known.sort(key=lambda text: -_at_location(name, text))
+    close = difflib.get_close_matches(name, known[:FEW_NAMES], n=1, cutoff=similarity)
     return close[0] if close else ""
 
 
-def _in_place(name: str, text: str) -> int:
-    """Return how many characters two names have in common at the same distance from either end."""
+def _at_location(name: str, text: str) -> int:
+    """Return the number of characters that two names have in common at the same distance from either end."""
     forwards, backwards = zip(name, text, strict=False), zip(name[::-1], text[::-1], strict=False)
-    return sum(one == other for pairs in (forwards, backwards) for one, other in pairs)
+    return sum(item == other for pairs in (forwards, backwards) for item, other in pairs)

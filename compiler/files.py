@@ -1,14 +1,14 @@
-"""What is read from disk and written to it, whoever named the file.
+"""Reading and writing of files on disk, named by any source.
 
 Takes: paths. Gives: `read_file`, `check_file`, `RefusedError`, `files_below`, `listing`, `same_file`;
 `recorded`, `replayed`; `write_file`, `write_bytes`, `write_text`, `write_texts`, `check_target`,
-`unwritable`, `is_special`, `is_stdout`, and for what is written piece by piece `Temporary`, `begin_file`,
-`finish_file`, `drop_file`, `partial_name`; `unlink_link`.
-Guarantees: only a regular file of bounded size is read, by whatever links it is reached, and nothing is
-waited for. What is written is there whole or not at all: a file is replaced by one of its mode and owner
-unless it is read-only, a link stays and its file is written; a device or pipe, or what standard output writes
-to, is written to, never replaced.
-Does not: know a format, or say at which line a file was named.
+`unwritable`, `is_special`, `is_stdout`, and for incremental writing `Temporary`, `begin_file`, `finish_file`,
+`drop_file`, `partial_name`; `unlink_link`.
+Guarantees: only regular files of bounded size are read, also through links, without blocking. Files are
+written completely or not at all. A file is replaced by one of the same mode and owner unless it is read-only;
+for a link its target is written. A device, a pipe, or the target of standard output is written to, never
+replaced.
+Does not: handle formats, or locations of references.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 # Of a folder of a user's components: the largest library we know of has a hundred files, three deep.
 MOST_ENTRIES = 10_000
 MOST_DEPTH = 8
-NO_NAME = OSError, ValueError  # what the system and Python say of a name that can't be one
+NO_NAME = OSError, ValueError  # messages of the system and of Python for impossible names
 STDOUT = 1  # the descriptor of standard output
 KERNELS = ("/proc", "/sys")  # file systems whose files are answers of the kernel
-KERNELS_OWN = "is an answer of the system's kernel"
+KERNELS_LOCAL = "is an answer of the system's kernel"
 
 T = TypeVar("T")
 Why = Literal["missing", "folder", "special", "large", "forbidden", "unreadable"]
@@ -72,12 +72,12 @@ def recorded(texts: dict[str, bytes]) -> AbstractContextManager[None]:
 
 
 def replayed(texts: Mapping[str, bytes]) -> AbstractContextManager[None]:
-    """Read meanwhile what was recorded, by absolute path, instead of any file or folder."""
+    """Replace file access by recorded contents, by absolute path, within the body."""
     return _during(_replay, texts)
 
 
 def _replayed(path: str, texts: Mapping[str, bytes]) -> bytes:
-    """Return what stands for a file or, with a slash at its end, for a folder. Raises RefusedError."""
+    """Return the stored content for a file or, with a slash at its end, for a folder. Raises RefusedError."""
     key = os.path.abspath(path) + "/" * path.endswith("/")  # noqa: PTH100 -- a folder's slash would be lost
     if key not in texts:
         raise RefusedError("missing", "does not exist")
@@ -90,19 +90,19 @@ def _note(path: str, data: bytes) -> None:
 
 
 def read_file(path: Path, most: int) -> bytes:
-    """Return the bytes of a regular file, or what stands for it (see `replayed`).
+    """Return the bytes of a regular file, or its stored content (see `replayed`).
 
     Parameters
     ----------
     path
         The file, or a link to it.
     most
-        How many bytes it may have.
+        Its largest size in bytes.
 
     Raises
     ------
     RefusedError
-        It isn't there, is no regular file, is larger, or can't be read.
+        It does not exist, is not a regular file, is larger, or can't be read.
     """
     texts = _replay.get()
     data = _read(path, most) if texts is None else _replayed(str(path), texts)
@@ -123,14 +123,14 @@ def _read(path: Path, most: int) -> bytes:
 
 
 def check_file(path: Path, most: int) -> None:
-    """Refuse what `read_file` would refuse by what it is, without opening it. Raises RefusedError."""
+    """Refuse a file by its type, as `read_file` does, without opening it."""
     with _refusing():
         _check(path.stat(), most)
 
 
 @contextmanager
 def _refusing() -> Iterator[None]:
-    """Turn what the system says into RefusedError."""
+    """Convert system errors to RefusedError."""
     try:
         yield
     except (FileNotFoundError, NotADirectoryError):
@@ -147,7 +147,7 @@ def _check(result: os.stat_result, most: int) -> None:
     if not stat.S_ISREG(result.st_mode):
         raise RefusedError("special", "is a device, pipe or socket")
     if result.st_dev in _kernels_devices():
-        raise RefusedError("special", KERNELS_OWN)
+        raise RefusedError("special", KERNELS_LOCAL)
     _check_size(result.st_size, most)
 
 
@@ -162,7 +162,7 @@ def _kernels_devices() -> set[int]:
 
 
 def _without_waiting(name: str, flags: int) -> int:
-    """Open a file: what has become a pipe meanwhile would block for ever."""
+    """Open a file without blocking, should it have become a pipe."""
     return os.open(name, flags | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0))
 
 
@@ -197,7 +197,7 @@ def listing(folder: Path, suffix: str) -> bytes:
             if len(below.parts) >= MOST_DEPTH:
                 raise RefusedError("large", f"is more than {MOST_DEPTH} folders deep")
             if Path(name).stat().st_dev in kernels:
-                raise RefusedError("special", KERNELS_OWN)
+                raise RefusedError("special", KERNELS_LOCAL)
             entries += len(folders) + len(files)
             if entries > MOST_ENTRIES:
                 raise RefusedError("large", f"holds more than {MOST_ENTRIES} files and folders")
@@ -253,11 +253,11 @@ def _write_all(writers: Mapping[Path, Callable[[Path], object]]) -> None:
 
 
 @contextmanager
-def _writing(path: Path, *kinds: type[Exception]) -> Iterator[None]:
-    """Turn what is said of a file that is to be written, if of such a kind, into ApcError (E601)."""
+def _writing(path: Path, *peer_types: type[Exception]) -> Iterator[None]:
+    """Convert an error on an output file to ApcError (E601), if of such a type."""
     try:
         yield
-    except kinds as error:
+    except peer_types as error:
         raise unwritable(path, error) from error
 
 
@@ -306,15 +306,15 @@ class Temporary:
 
 
 def begin_file(path: Path) -> Temporary:
-    """Make the empty temporary file of a path: beside what it leads to, so that a rename puts it there.
+    """Create the empty temporary file of a path in the folder of its target, for a later rename.
 
     Raises
     ------
     OSError
-        It can't be made: the folder isn't there or allows no new files, a folder is in the way, or a file
-        that is read-only.
+        It cannot be created: the folder does not exist or allows no new files, or the target is a folder or a
+        read-only file.
     ValueError
-        The name can't be one.
+        The name is impossible.
     """
     target = _target(path)
     if target.is_dir():
@@ -378,10 +378,10 @@ def finish_file(temporary: Temporary, path: Path) -> None:
             raise
         return
     os.replace(temporary.name.name, target.name, src_dir_fd=temporary.folder, dst_dir_fd=temporary.folder)
-    found = os.stat(target.name, dir_fd=temporary.folder, follow_symlinks=False)
+    result = os.stat(target.name, dir_fd=temporary.folder, follow_symlinks=False)
     # Another run of the same user may have written the same file since.
-    regular = stat.S_ISREG(found.st_mode)
-    if found.st_uid != os.fstat(temporary.descriptor).st_uid or not regular:
+    regular = stat.S_ISREG(result.st_mode)
+    if result.st_uid != os.fstat(temporary.descriptor).st_uid or not regular:
         if not regular:
             with suppress(OSError):  # what came in its place leads elsewhere
                 os.unlink(target.name, dir_fd=temporary.folder)
@@ -392,12 +392,12 @@ def finish_file(temporary: Temporary, path: Path) -> None:
 def _is_ours(temporary: Temporary, name: str) -> bool:
     """Return whether a name in the folder is that of the temporary file, and no link."""
     try:
-        found = os.stat(
+        result = os.stat(
             name if temporary.folder is not None else temporary.name,
             dir_fd=temporary.folder,
             follow_symlinks=False,
         )
-        return os.path.samestat(found, os.fstat(temporary.descriptor))
+        return os.path.samestat(result, os.fstat(temporary.descriptor))
     except OSError:  # it is gone, or closed
         return False
 
@@ -409,7 +409,7 @@ def _close(temporary: Temporary) -> None:
 
 
 def partial_name(path: Path) -> Path:
-    """Return where a part of what was to be written goes: a file that is there whole is not given for it."""
+    """Return the path of a partial output, distinct from an existing complete file."""
     target = _target(path)
     new = is_special(path) or not target.is_file()
     return path if new else target.with_name(f"{target.stem}.partial{target.suffix}")
@@ -437,7 +437,7 @@ def drop_file(temporary: Temporary) -> None:
 
 
 def _target(path: Path) -> Path:
-    """Return what a path leads to, whether or not it is there."""
+    """Return the target of a path, existing or not."""
     try:
         if not path.is_symlink() or is_special(path):
             return path
@@ -456,7 +456,7 @@ def _target(path: Path) -> Path:
 
 
 def is_special(path: Path) -> bool:
-    """Return whether a path leads to what is written to in place: a device, a pipe, our standard output."""
+    """Return whether a path's target is written in place: a device, a pipe, our standard output."""
     with suppress(OSError, ValueError):
         mode = path.stat().st_mode
         return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)) or is_stdout(path)
@@ -471,7 +471,7 @@ def is_stdout(path: Path) -> bool:
 
 
 def _drain(path: Path) -> int:
-    """Open what is there, and make nothing; standard output goes on where it is."""
+    """Open an existing file without creating one; standard output continues at its position."""
     if not is_stdout(path):
         return os.open(path, os.O_WRONLY | getattr(os, "O_CLOEXEC", 0))
     sys.stdout.flush()

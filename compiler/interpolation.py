@@ -37,33 +37,33 @@ class Interpolation:
         return np.pad(np.diff(self.numbers) / np.diff(self.times), 1)
 
     def value(self, at: Any, number: Callable[[float], Any] = float) -> Any:
-        """Return what the table says at a number of some kind, which a float is turned into by `number`."""
-        place = bisect.bisect_right(self.times, float(at))
-        low, start = (number(float(values[max(place - 1, 0)])) for values in (self.numbers, self.times))
-        return low + self.slope(at, number) * (at - start) if 0 < place < len(self.times) else low
+        """Return the value of the table at a number of some type; `number` converts floats to it."""
+        index = bisect.bisect_right(self.times, float(at))
+        low, start = (number(float(values[max(index - 1, 0)])) for values in (self.numbers, self.times))
+        return low + self.slope(at, number) * (at - start) if 0 < index < len(self.times) else low
 
     def slope(self, at: Any, number: Callable[[float], Any] = float) -> Any:
-        """Return how fast that changes with it."""
-        place = bisect.bisect_right(self.times, float(at))
-        if place in (0, len(self.times)):
+        """Return the derivative of that value."""
+        index = bisect.bisect_right(self.times, float(at))
+        if index in (0, len(self.times)):
             return number(0.0)
         columns = self.times, self.numbers
         (start, end), (low, high) = (
-            map(number, column[place - 1 : place + 1].tolist()) for column in columns
+            map(number, column[index - 1 : index + 1].tolist()) for column in columns
         )
         return (high - low) / (end - start)
 
     def values(self, at: Any) -> Any:
-        """Return what the table says at floats, or at complex steps from them."""
+        """Return the values of the table at floats, or at complex steps from them."""
         result = np.interp(np.real(at), self.times, self.numbers)
         return result + 1j * self.slopes(at) * np.imag(at) if np.iscomplexobj(at) else result
 
     def slopes(self, at: Any) -> Any:
-        """Return how fast that changes with them."""
+        """Return the derivatives of those values."""
         return self.rates[np.searchsorted(self.times, np.real(at), side="right")]
 
     def positions(self) -> Interpolation:
-        """Return the table that says how many rows have passed: whole at each row, and nowhere else."""
+        """Return the table of the number of passed rows: an integer at each row, and nowhere else."""
         gaps = np.diff(self.times)[[0, -1]]
         times = np.concatenate([self.times[:1] - gaps[:1], self.times, self.times[-1:] + gaps[1:]])
         count = len(self.times)
@@ -74,8 +74,8 @@ def function_of(table: Interpolation) -> Any:
     """Return a table as the CasADi function of one number, which stays a call wherever it is used."""
     at = casadi.MX.sym("at")
     rows = casadi.MX(casadi.DM(np.array([table.times, table.numbers])))
-    place = casadi.low(casadi.DM(table.times), at, {"lookup_mode": "binary"})
-    start, end, low, high = (rows[i, place + k] for i in (0, 1) for k in (0, 1))
+    location = casadi.low(casadi.DM(table.times), at, {"lookup_mode": "binary"})
+    start, end, low, high = (rows[i, location + k] for i in (0, 1) for k in (0, 1))
     within = casadi.fmin(casadi.fmax(at, table.times[0]), table.times[-1])
     value = low + (high - low) / (end - start) * (within - start)
     return casadi.Function(TABLE, [at], [value], {"never_inline": True})
@@ -94,10 +94,10 @@ def table_of(function: Any) -> Interpolation:
 
 
 def jacobian(values: Any, symbols: Any) -> Any:
-    """Return the Jacobian of a column over symbols, where no table that hangs on none of them is left.
+    """Return the Jacobian of a column over symbols, where tables that depend on none of them are constant.
 
-    From the inputs to the values CasADi asks every call for its derivative, by 0 too, and does not know that
-    this is 0; from the values to the inputs it asks those alone that it needs.
+    In forward mode CasADi evaluates the derivative of every call, also in direction 0; in reverse mode only
+    the required ones.
     """
     tabled = isinstance(values, casadi.SX) and casadi.Function(
         "every", casadi.symvar(values), [values]

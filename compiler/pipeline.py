@@ -1,31 +1,31 @@
-"""The stages one after another: a topology file to a compiled model, or to any stage before it.
+"""The compiler stages in sequence: a topology file to a compiled model, or to any earlier stage.
 
-Takes: a path. Gives: the value of the last stage asked for, or every one on the way; `check_definition`.
-Guarantees: each stage sees only the value of the one before.
-Does not: save anything.
+Takes: a path. Gives: `compile_topology`, the model; `compile_again`, from stored texts; `run_stages`,
+`each_stage`, `stages_of`, the values of single stages; `check_definition`.
+Guarantees: each stage uses only the value of the previous one.
+Does not: save files.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from apc.compiler.cache import Origin, origin_of, replayable
 from apc.compiler.compiled import Model
 from apc.compiler.components.component_library import Library, definition_of
-from apc.compiler.equations.clocks import ClockedSystem, check_alone, partition
+from apc.compiler.equations.causalization import SortedSystem, sort
+from apc.compiler.equations.clocks import ClockedSystem, check_single, partition
 from apc.compiler.equations.flatten import FlatSystem, flatten
-from apc.compiler.equations.structure import SortedSystem, sort
 from apc.compiler.errors import ApcError, Mistakes, SourceLocation
 from apc.compiler.files import recorded, replayed
 from apc.compiler.functions.functions import build_functions
-from apc.compiler.scene.scene import Topology, build_scene, library_folders
 from apc.compiler.source.source import Source, read_source
 from apc.compiler.timings import part
+from apc.compiler.topology.topology import Topology, build_topology, library_folders
 
-Stage = Literal["source", "scene", "flat", "clocked", "sorted", "compiled"]
-STAGES: tuple[Stage, ...] = get_args(Stage)
+Stage = Literal["source", "topology", "flat", "clocked", "sorted", "compiled"]
 StageValue = Source | Topology | FlatSystem | ClockedSystem | SortedSystem | Model
 
 
@@ -37,26 +37,26 @@ def compile_topology(path: Path) -> Model:
 
 
 def compile_again(origin: Origin, folder: Path) -> Model:
-    """Compile the texts that a model was made from; no file of theirs is read.
+    """Compile the texts of a model's origin; no file is read.
 
     Parameters
     ----------
     origin
         The texts.
     folder
-        Where they are said to stand in messages.
+        Their location in messages.
 
     Raises
     ------
     ApcError
-        Their mistakes.
+        Their errors.
     """
     with replayed(replayable(origin, folder)):
         return compile_topology(folder / origin.topology)
 
 
 def check_definition(path: Path) -> str:
-    """Read a file that defines a component or connector, with what stands beside it; say what it is.
+    """Read a file with a component or connector, and its folder; return its name and kind.
 
     Returns
     -------
@@ -65,32 +65,32 @@ def check_definition(path: Path) -> str:
     Raises
     ------
     ApcError
-        The mistakes of the definition.
+        The errors of the definition.
     """
     source = read_source(path)
-    kind, name = definition_of(source)
-    if not kind:
+    peer_type, name = definition_of(source)
+    if not peer_type:
         return ""
-    beside: list[ApcError] = []
-    library = Library((path.parent,), beside)
+    alongside: list[ApcError] = []
+    library = Library((path.parent,), alongside)
     mistakes = Mistakes()
     with mistakes:
-        if kind == "connector":
+        if peer_type == "connector":
             library.connector(name)
         elif component := library.component(name):
-            check_alone(component, SourceLocation(str(path)), mistakes)
+            check_single(component, SourceLocation(str(path)), mistakes)
     # Its own mistakes first.
-    result = [*mistakes.found, *(mistake for error in beside for mistake in error.mistakes)]
+    result = [*mistakes.result, *(mistake for error in alongside for mistake in error.mistakes)]
     if result:
         raise ApcError(result)
-    return f"{name}, a {kind}"
+    return f"{name}, a {peer_type}"
 
 
-def linear_system(scene: Topology) -> SortedSystem | None:
-    """Return the equations of linear analyses, None where no component has equations of its own for them."""
-    if all(part.component.linearized is None for part in scene.parts):
+def linear_system(topology: Topology) -> SortedSystem | None:
+    """Return the equations of linear analyses, None if no component has separate ones."""
+    if all(part.component.linearized is None for part in topology.parts):
         return None
-    return sort(partition(flatten(scene, linear=True)))
+    return sort(partition(flatten(topology, linear=True)))
 
 
 def run_stages(path: Path, *, until: Stage) -> StageValue:
@@ -99,7 +99,7 @@ def run_stages(path: Path, *, until: Stage) -> StageValue:
 
 
 def each_stage(path: Path) -> Iterator[tuple[Stage, StageValue]]:
-    """Run the stages one by one, yielding each one's name and value as soon as it is done."""
+    """Run the stages in sequence, yielding each one's name and value when done."""
     texts: dict[str, bytes] = {}
     with part("source"), recorded(texts):
         source = read_source(path)
@@ -107,24 +107,24 @@ def each_stage(path: Path) -> Iterator[tuple[Stage, StageValue]]:
 
 
 def stages_of(source: Source, texts: dict[str, bytes] | None = None) -> Iterator[tuple[Stage, StageValue]]:
-    """Run the stages one by one on a source that has a path.
+    """Run the stages in sequence on a source with a path.
 
     Parameters
     ----------
     source
         The topology.
     texts
-        What was read for it by path, if that is what stands there; gets what else is read.
+        The files read for it, by path; further files read are added.
     """
     assert source.path is not None
     path, texts = source.path, {} if texts is None else texts
     steps: dict[Stage, Callable[[Any], StageValue]] = {
-        "scene": lambda source: build_scene(source, Library(library_folders(source))),
+        "topology": lambda source: build_topology(source, Library(library_folders(source))),
         "flat": flatten,
         "clocked": partition,
         "sorted": sort,
         "compiled": lambda ordered: build_functions(
-            ordered, origin_of(path, texts), linear=linear_system(ordered.scene)
+            ordered, origin_of(path, texts), linear=linear_system(ordered.topology)
         ),
     }
     value: StageValue = source

@@ -1,6 +1,8 @@
 """NAME.apc: the compiled model on disk.
 
-Takes: `Model`. Gives: a file or bytes, and the same system back.
+Takes: `Model`.
+Gives: `save`, `opened`: to and from a file; `encoded`, `decoded`: to and from bytes; `model_of`, the bytes of
+a model alone.
 Guarantees: written whole or not at all; equal models give equal bytes. Functions are in CasADi's own
 serialization, which can hold commands to call: only what this user's apc wrote may be read here.
 Does not: ask who wrote a file, or whether the topology has changed since (see `cache`).
@@ -47,7 +49,7 @@ def encoded(system: Model) -> bytes:
 
 def decoded(model: bytes) -> Model:
     """Return the model of bytes that `encoded` gave."""
-    return msgspec.msgpack.decode(model, type=Model, dec_hook=_typed)
+    return msgspec.msgpack.decode(model, type=Model, dec_hook=_typed_fields)
 
 
 def _plain(value: Any) -> Any:
@@ -61,10 +63,10 @@ def _plain(value: Any) -> Any:
     raise NotImplementedError(type(value))
 
 
-def _typed(wanted: Any, value: Any) -> Any:
-    if wanted is Fraction:
+def _typed_fields(requested: Any, value: Any) -> Any:
+    if requested is Fraction:
         return Fraction(value)
-    if wanted is casadi.Function:
+    if requested is casadi.Function:
         return casadi.Function.deserialize(value)
-    kind, shape, numbers = value
-    return np.frombuffer(numbers, kind).reshape(shape)
+    peer_type, shape, numbers = value
+    return np.frombuffer(numbers, peer_type).reshape(shape)

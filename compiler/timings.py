@@ -1,4 +1,4 @@
-"""How long the parts of a command take, for whoever asks with --timings.
+"""Execution times of the parts of a command, for --timings.
 
 Takes: the name of a part, around its code.
 Gives: `part`, `record`, `recording`.
@@ -15,42 +15,42 @@ from contextlib import contextmanager
 # What is in no part: modules are imported where they are first needed, between the parts.
 REST = "imports, rest"
 
-_taken: dict[str, float] | None = None  # seconds by part, in the order they were first entered
+_used: dict[str, float] | None = None  # seconds by part, in the order they were first entered
 _within: list[float] = []  # of each part that is open, the seconds of the parts inside it
 
 
 def recording() -> bool:
-    """Say whether parts are measured now."""
-    return _taken is not None
+    """Return whether parts are being measured."""
+    return _used is not None
 
 
 @contextmanager
 def part(name: str) -> Iterator[None]:
-    """Count the body's time for a part of the command; as often as it is entered, for the same part."""
-    if _taken is None:
+    """Measure the body's time for a part of the command; repeated entries are summed."""
+    if _used is None:
         yield
         return
-    _taken.setdefault(name, 0.0)
+    _used.setdefault(name, 0.0)
     _within.append(0.0)
     start = time.perf_counter()
     try:
         yield
     finally:
         whole = time.perf_counter() - start
-        _taken[name] += whole - _within.pop()
+        _used[name] += whole - _within.pop()
         if _within:
             _within[-1] += whole
 
 
 @contextmanager
 def record() -> Iterator[dict[str, float]]:
-    """Measure the parts of the body; give their seconds, and of what is in none of them."""
-    global _taken
+    """Measure the parts of the body; yield their seconds, with the rest."""
+    global _used
     result: dict[str, float] = {}
-    _taken = result
+    _used = result
     try:
         with part(REST):
             yield result
     finally:
-        _taken = None
+        _used = None
         result[REST] = result.pop(REST)  # last

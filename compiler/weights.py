@@ -1,12 +1,12 @@
-"""What peers weigh one another by, exactly: the decimals of the file, and what each peer hears in all.
+"""Exact graph weights: the decimals of the file, and each peer's sum of weights.
 
-Takes: weights as floats, each standing for the shortest decimal that means it.
+Takes: weights as floats, each representing its shortest decimal.
 Gives: `exact_weight`, `sum_weights`.
-Guarantees: sums are exact, so that 0.1 and 0.2 are 0.3, and 0.1, 0.2 and −0.3 are nothing.
-Does not: know a graph (see `scene.graphs`).
+Guarantees: sums are exact, so that 0.1 and 0.2 are 0.3, and 0.1, 0.2 and −0.3 are zero.
+Does not: handle graphs (see `topology.graphs`).
 
-A peer that weighs others by 0.1 and 0.2 and itself by what doubles make of their sum would be held to the
-ground by a rounding: whether peers can move together is decided by equality.
+Neutral modes are decided by equality. If a peer's weights of others are 0.1 and 0.2, a rounded sum as its own
+weight would act as a spring to ground.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ def exact_weight(weight: float) -> Fraction:
 
 
 def sum_weights(receivers: NDArray[np.int64], weights: NDArray[np.float64], peers: int) -> NDArray[Any]:
-    """Return what each of so many peers hears in all (N,), each a `Fraction`.
+    """Return the sum of weights of each peer (N,), as `Fraction`.
 
     Parameters
     ----------
     receivers, weights
-        Who hears (M,), from 0, and the weight (M,) of each it hears.
+        The receiver (M,), zero-based, and the weight (M,) of each arc.
     peers
-        How many there are.
+        The number of peers.
     """
-    different, place = np.unique(weights, return_inverse=True)
+    different, index = np.unique(weights, return_inverse=True)
     exact = [exact_weight(weight) for weight in different.tolist()]
     denominator = math.lcm(*(weight.denominator for weight in exact))
     whole = np.array([int(weight * denominator) for weight in exact], dtype=object)
     totals = np.zeros(peers, dtype=object)
-    np.add.at(totals, receivers, whole[place])
+    np.add.at(totals, receivers, whole[index])
     rational = functools.cache(lambda total: Fraction(total, denominator))
     return np.array([rational(total) for total in totals], dtype=object)

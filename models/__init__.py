@@ -1,1 +1,1 @@
-"""The component library and the example scenes: YAML only, no code."""
+"""The component library and the example topologies: YAML only, no code."""

@@ -1,16 +1,16 @@
-"""apc: networked haptic cooperation, described in YAML, compiled, and judged.
+"""apc: networked haptic cooperation, described in YAML, compiled, and analyzed.
 
 >>> model = apc.compile("three-users-average.yaml")
 >>> apc.analyze(model).verdict
 'stable up to a common translation'
 
-Each function does what the command of its name does; results are frozen and print well.
+Each function corresponds to the command of the same name; results are frozen.
 
-compiler (YAML to CasADi), then a folder a subject: frame (one peer over one frame of time) → network (packets
-that get lost or come late) → eigen (all peers) and large (very many) → analysis → vary (many values of some
-parameters) → sweeps, simulation, regions → benchmark → present (text, JSON, tables and pictures of every
-result) → cli. Each imports only what comes before it: a result names what shows it, and that is found when it
-is asked for.
+The compiler (YAML to CasADi) is `compiler`. Then one folder per subject: `frame` (one peer over one frame) →
+`network` (lost and late packets) → `eigen` (all peers) and `large_scale` (very many peers) → `analysis` →
+`parameter_studies` → `sweeps`, `simulation`, `regions` → `benchmark` → `output` (text, JSON, tables and
+pictures of every result) → `cli`. Each imports only folders before it. A result names its output functions,
+which are imported when needed.
 """
 
 import functools
@@ -33,7 +33,7 @@ def __dir__() -> list[str]:
 
 @functools.cache
 def _attached() -> Any:
-    """Look the public names up when one is first used: a command uses none, and imports what it needs."""
+    """Import public names on first use: commands do not use them, and import only their own modules."""
     import lazy_loader
 
     return lazy_loader.attach_stub(__name__, __file__)

@@ -1,10 +1,13 @@
 # The public names, each with its home, once: a type checker reads them here, and `__init__.py` looks them up.
 from .analysis.analysis import Analysis as Analysis
-from .analysis.box_proof import RobustStability as RobustStability
+from .analysis.arbitrary_switching import ArbitrarySwitching as ArbitrarySwitching
 from .analysis.contact_modes import ContactModes as ContactModes
-from .analysis.conventions import EventOrder as EventOrder
-from .analysis.paper import PaperMethod as PaperMethod
-from .analysis.switching import ArbitrarySwitching as ArbitrarySwitching
+from .analysis.event_order import EventOrder as EventOrder
+from .analysis.paper_method import PaperMethod as PaperMethod
+from .analysis.robust_stability import RobustStability as RobustStability
+from .api import (
+    absolute_stability as absolute_stability,
+)
 from .api import (
     analyze as analyze,
 )
@@ -12,10 +15,10 @@ from .api import (
     analyze_many as analyze_many,
 )
 from .api import (
-    bench as bench,
+    arbitrary_switching as arbitrary_switching,
 )
 from .api import (
-    buzz as buzz,
+    bench as bench,
 )
 from .api import (
     compare as compare,
@@ -27,25 +30,19 @@ from .api import (
     contact_modes as contact_modes,
 )
 from .api import (
-    conventions as conventions,
-)
-from .api import (
     critical as critical,
 )
 from .api import (
-    describe_network as describe_network,
+    event_order as event_order,
 )
 from .api import (
     export as export,
 )
 from .api import (
-    feel as feel,
+    fit_link as fit_link,
 )
 from .api import (
-    front as front,
-)
-from .api import (
-    judge_network as judge_network,
+    limit_cycle as limit_cycle,
 )
 from .api import (
     load as load,
@@ -54,22 +51,25 @@ from .api import (
     margins as margins,
 )
 from .api import (
-    paper_route as paper_route,
+    mean_square_stability as mean_square_stability,
+)
+from .api import (
+    paper_method as paper_method,
 )
 from .api import (
     parameters as parameters,
 )
 from .api import (
-    passive_hands as passive_hands,
-)
-from .api import (
-    prove_box as prove_box,
+    pareto_front as pareto_front,
 )
 from .api import (
     region as region,
 )
 from .api import (
     report as report,
+)
+from .api import (
+    robust_stability as robust_stability,
 )
 from .api import (
     save as save,
@@ -93,7 +93,7 @@ from .api import (
     sweep as sweep,
 )
 from .api import (
-    switching as switching,
+    transparency as transparency,
 )
 from .api import (
     tune as tune,
@@ -105,22 +105,22 @@ from .benchmark.speed_and_error import Bench as Bench
 from .comparison.comparison import SchemeComparison as SchemeComparison
 from .compiler.compiled import Model as Model
 from .compiler.errors import ApcError as ApcError
-from .frame.settable import Parameters as Parameters
-from .hands.frequency_response import Transparency as Transparency
-from .hands.passivity import AbsoluteStability as AbsoluteStability
-from .moments.network_verdict import MeanSquareStability as MeanSquareStability
-from .network.recorded import LinkFit as LinkFit
+from .frame.parameter_listing import Parameters as Parameters
+from .haptics.absolute_stability import AbsoluteStability as AbsoluteStability
+from .haptics.frequency_response import Transparency as Transparency
+from .mean_square.mean_square_stability import MeanSquareStability as MeanSquareStability
+from .network.link_fit import LinkFit as LinkFit
+from .parameter_studies.batch_analysis import Analyses as Analyses
+from .parameter_studies.critical_values import Critical as Critical
+from .parameter_studies.margins import Margins as Margins
+from .parameter_studies.sensitivity import Sensitivities as Sensitivities
 from .regions.stable_region import Region as Region
 from .reports.contents import Report as Report
-from .simulation.buzz import LimitCycle as LimitCycle
+from .simulation.limit_cycle import LimitCycle as LimitCycle
 from .simulation.trajectory import Trajectory as Trajectory
 from .sweeps.resumable_sweep import Sweep as Sweep
-from .tuning.front import Design as Design
-from .tuning.front import ParetoFront as ParetoFront
+from .tuning.pareto_front import Design as Design
+from .tuning.pareto_front import ParetoFront as ParetoFront
 from .tuning.tuner import Tuning as Tuning
-from .vary.critical_values import Critical as Critical
-from .vary.many import Analyses as Analyses
-from .vary.margins import Margins as Margins
-from .vary.sensitivity import Sensitivities as Sensitivities
 
 __version__: str

@@ -1,6 +1,6 @@
-"""The command line's way in and out: `apc …` or `python -m apc …`, and the exit codes.
+"""The entry point of the command line: `apc …` or `python -m apc …`, and the exit codes.
 
-0 done (an unstable scene is an answer), 1 the input is at fault, 2 usage, 3 a bug of ours.
+0 done (also with the result "unstable"), 1 invalid input, 2 usage error, 3 internal error.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ def main() -> None:
 
 
 def _end(code: int) -> None:
-    """End the process as it stands: its memory ends with it, and Python would take all apart before.
+    """End the process immediately, without the interpreter's cleanup of objects.
 
-    Whoever is still at work is waited for, and whoever measures is told, as ever.
+    Threads are joined, and profilers notified, as at a normal exit.
     """
     if threading.active_count() > 1 or sys.getprofile() or sys.gettrace():
         sys.exit(code)
@@ -102,9 +102,9 @@ def run(arguments: list[str]) -> int:
 
 
 def _fitting(text: str) -> str:
-    """Return a text whose lines fit the terminal; into a pipe or file each stays one line.
+    """Return a text wrapped to the terminal; for a pipe or file each line is unchanged.
 
-    What stands further in, a line of the source with its caret, stays as it is.
+    Indented lines, such as source lines with a caret, are unchanged.
     """
     if not sys.stderr.isatty():
         return text
@@ -127,7 +127,7 @@ def _silence_stdout() -> None:
 
 
 def _bug(arguments: list[str]) -> int:
-    """Say where the report of a bug of ours is."""
+    """Print the location of the report of an internal error."""
     import click
 
     where = _report(arguments)

@@ -1,6 +1,7 @@
 """The public functions: plain, with frozen results.
 
-Takes: paths, compiled models, settings. Gives: compiled models and analyses.
+Takes: paths, compiled models, settings.
+Gives: compiled models and analyses; `show`, `schema`.
 Guarantees: what a command does, the function of its name does.
 Does not: print.
 """
@@ -19,34 +20,34 @@ from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 
 if TYPE_CHECKING:
     from apc.analysis.analysis import Analysis
-    from apc.analysis.box_proof import RobustStability
+    from apc.analysis.arbitrary_switching import ArbitrarySwitching
     from apc.analysis.contact_modes import ContactModes
-    from apc.analysis.conventions import EventOrder
+    from apc.analysis.event_order import EventOrder
     from apc.analysis.methods import Method
-    from apc.analysis.paper import PaperMethod
-    from apc.analysis.switching import ArbitrarySwitching
+    from apc.analysis.paper_method import PaperMethod
+    from apc.analysis.robust_stability import RobustStability
     from apc.benchmark.speed_and_error import Bench
     from apc.comparison.comparison import SchemeComparison
-    from apc.frame.settable import Parameters
-    from apc.hands.frequency_response import Transparency
-    from apc.hands.passivity import AbsoluteStability
-    from apc.moments.network_verdict import MeanSquareStability
-    from apc.network.recorded import LinkFit
+    from apc.frame.parameter_listing import Parameters
+    from apc.haptics.absolute_stability import AbsoluteStability
+    from apc.haptics.frequency_response import Transparency
+    from apc.mean_square.mean_square_stability import MeanSquareStability
+    from apc.network.link_fit import LinkFit
+    from apc.parameter_studies.batch_analysis import Analyses
+    from apc.parameter_studies.critical_values import Critical
+    from apc.parameter_studies.margins import Margins
+    from apc.parameter_studies.sensitivity import Sensitivities
     from apc.regions.stable_region import Region
     from apc.reports.contents import Report
     from apc.result import Result
-    from apc.simulation.buzz import LimitCycle
+    from apc.simulation.limit_cycle import LimitCycle
     from apc.simulation.trajectory import Trajectory
     from apc.sweeps.resumable_sweep import Sweep
-    from apc.tuning.demands import TuningSpec
-    from apc.tuning.front import ParetoFront
+    from apc.tuning.pareto_front import ParetoFront
+    from apc.tuning.specification import TuningSpec
     from apc.tuning.tuner import Tuning
-    from apc.vary.critical_values import Critical
-    from apc.vary.many import Analyses
-    from apc.vary.margins import Margins
-    from apc.vary.sensitivity import Sensitivities
 
-Scene = Model | str | Path
+TopologySource = Model | str | Path
 Values = Mapping[str, str | float]  # by the name of a parameter, quantities or numbers in SI
 Format = Literal["text", "json", "dot", "mermaid", "svg"]
 Criterion = Literal["mean-square", "nominal", "passive"]
@@ -69,7 +70,7 @@ def compile(path: str | Path) -> Model:
     Raises
     ------
     ApcError
-        The file is at fault; holds every mistake found.
+        The file is invalid; holds every mistake found.
     """
     from apc.compiler.pipeline import compile_topology
     from apc.frame.start_checks import check_values
@@ -94,7 +95,7 @@ def load(path: str | Path) -> Model:
 
 
 @checked
-def with_hands(model: Scene, hands: str) -> Model:
+def with_hands(model: TopologySource, hands: str) -> Model:
     """Return the model with hands at all devices.
 
     Parameters
@@ -109,15 +110,15 @@ def with_hands(model: Scene, hands: str) -> Model:
     ------
     ApcError
         No such hands, a peer without a device, or with a hand already. E930 "passive", which are all
-        hands there are: `passive_hands`, `critical` and `region` judge them.
+        hands there are: `absolute_stability`, `critical` and `region` judge them.
     """
     from apc.frame import devices
 
     changed = devices.with_hands(_model(model, None), hands)
     if hands == devices.PASSIVE:
-        what = "passive hands are all that draw no energy, and a model has one hand a device"
+        message = "passive hands are all that draw no energy, and a model has one hand a device"
         raise ApcError(
-            Diagnostic("E930", SourceLocation("with_hands"), what, hint="apc.passive_hands(model)")
+            Diagnostic("E930", SourceLocation("with_hands"), message, hint="apc.absolute_stability(model)")
         )
     return changed
 
@@ -129,7 +130,7 @@ def set_parameters(model: Model, values: Mapping[str, str | float]) -> Model:
     Parameters
     ----------
     model
-        The compiled model; it stays as it is.
+        The compiled model; it is not changed.
     values
         Quantities by name, or numbers in SI: `{"contact.stiffness": "800 N/m", "lan.delay": 0.016}`.
 
@@ -147,10 +148,10 @@ def set_parameters(model: Model, values: Mapping[str, str | float]) -> Model:
 
 
 def _quantity(system: Model, name: str, value: str | float) -> str:
-    """Return a value of a parameter as it is written: a number without a unit is in SI."""
+    """Return a parameter value as text; a number without a unit is in SI."""
     if isinstance(value, str):
         return value
-    from apc.frame.names import find, unit_of
+    from apc.frame.parameter_names import find, unit_of
 
     if not isinstance(value, Real) or isinstance(value, bool):
         raise ApcError(
@@ -161,31 +162,31 @@ def _quantity(system: Model, name: str, value: str | float) -> str:
 
 
 def _range(system: Model, name: str, value: str | Sequence[str | float]) -> str:
-    """Return a range of a parameter as it is written, of a text or of its two ends."""
+    """Return a parameter range as text, from a text or its two ends."""
     return value if isinstance(value, str) else ":".join(_quantity(system, name, end) for end in value)
 
 
 @checked
 def analyze(
-    model: Scene,
+    model: TopologySource,
     *,
-    set: Values | None = None,
+    params: Values | None = None,
     method: Method = "auto",
     certify: bool = False,
 ) -> Analysis:
-    """Say whether a scene is stable, by how much, and in which modes.
+    """Analyze the stability of a model: verdict, spectral radius, and modes.
 
     Parameters
     ----------
     model
         A compiled model, or the path of a topology or compiled model.
-    set
+    params
         Parameter values to change first, as in `set_parameters`.
     method
-        "auto": what serves the scene; "modes": a few systems of a site's size, at a cost that does not grow
-        with the number of equal peers; "dense": every peer in one system, the check on the others;
-        "determinant": the zeros of a small determinant, for peers that all differ and for long delays;
-        "paper": the lifted matrices of Rakhsha and Constantinescu, eqs. (18) to (20).
+        "auto": the method suited to the model; "modes": a few systems of one peer's size, at a cost that
+        does not grow with the number of equal peers; "dense": every peer in one system, the check on the
+        others; "determinant": the zeros of a small determinant, for peers that all differ and for long
+        delays; "paper": the lifted matrices of Rakhsha and Constantinescu, eqs. (18) to (20).
     certify
         Prove the verdict in ball arithmetic.
 
@@ -197,25 +198,25 @@ def analyze(
     Raises
     ------
     ApcError
-        The input is at fault, or the method can't serve the scene.
+        The input is invalid, or the method does not support the model.
     """
-    from apc.answer import judge
+    from apc.analysis_report import analysis_report
 
-    return judge(_model(model, set), method=method, certify=certify)
+    return analysis_report(_model(model, params), method=method, certify=certify)
 
 
 @checked
 def analyze_many(
-    model: Scene,
+    model: TopologySource,
     values: Mapping[str, Any],
     *,
-    set: Values | None = None,
+    params: Values | None = None,
 ) -> Analyses:
-    """Say the same of many values of some parameters at once, a hundred times as fast as one by one.
+    """Analyze a model at many parameter values at once, a hundred times as fast as one by one.
 
     Parameters
     ----------
-    model, set
+    model, params
         As for `analyze`.
     values
         By parameter an array of its values, numbers in SI or quantities: {"contact.stiffness": [500, 1000],
@@ -225,291 +226,297 @@ def analyze_many(
     -------
     Analyses
         Arrays of that shape: `.verdict`, `.stable`, `.spectral_radius` with its bound
-        `.spectral_radius_error`, `.frequency_hz` and `.damping_ratio` of the leading mode; `.to_dataframe()`.
+        `.spectral_radius_error`, `.frequency_hz` and `.damping_ratio` of the dominant mode;
+        `.to_dataframe()`.
 
     Raises
     ------
     ApcError
-        The input is at fault; of a single point, its `.message` says so.
+        The input is invalid; the error of a single point is in its `.message`.
     """
-    from apc.vary import many
+    from apc.parameter_studies import batch_analysis
 
-    return many.analyze_many(_model(model, set), values)
+    return batch_analysis.analyze_many(_model(model, params), values)
 
 
 @checked
 def critical(
-    model: Scene,
+    model: TopologySource,
     parameter: str,
     *,
-    set: Values | None = None,
+    params: Values | None = None,
     lower: str | float | None = None,
     upper: str | float | None = None,
     criterion: Criterion | None = None,
 ) -> Critical:
-    """Find the values of a parameter or delay at which a scene becomes stable or unstable.
+    """Find the values of a parameter or delay at which a model becomes stable or unstable.
 
     Parameters
     ----------
-    model, set
+    model, params
         As for `analyze`.
     parameter
         Its name, such as "coordination.stiffness" or "lan.delay".
     lower, upper
-        Quantities between which to look, such as "5000 N/m", or numbers in SI.
+        The ends of the search range, such as "5000 N/m", or numbers in SI.
     criterion
-        "mean-square": stable means that second moments die out over the network as it is, the default where
-        a link loses or delays packets; "nominal": that motions die out if every packet is on time; "passive":
-        that they do so with every passive hand at every device.
+        "mean-square": second moments decay over the lossy network, the default if a link loses or delays
+        packets; "nominal": motions decay if every packet is on time; "passive": they decay with every passive
+        hand at every device.
 
     Raises
     ------
     ApcError
-        The input is at fault.
+        The input is invalid.
     """
-    from apc.vary import critical_values
+    from apc.parameter_studies import critical_values
 
-    system = _model(model, set)
+    system = _model(model, params)
     low, high = (None if item is None else _quantity(system, parameter, item) for item in (lower, upper))
     return critical_values.critical(system, parameter, lower=low, upper=high, criterion=criterion)
 
 
 @checked
 def compare(
-    models: Scene | Sequence[Scene],
+    models: TopologySource | Sequence[TopologySource],
     *,
-    set: Values | None = None,
+    params: Values | None = None,
     over: Sequence[str] = (),
     criterion: Criterion | None = None,
     at: str = "",
 ) -> SchemeComparison:
-    """Put schemes side by side: verdicts, largest stable stiffness, delay, loss, what is felt, what it costs.
+    """Compare schemes: verdicts, largest stable stiffness, delay and loss, transparency, cost.
 
     Parameters
     ----------
     models
-        What `analyze` takes, mostly several.
-    set
+        Models as for `analyze`, usually several.
+    params
         As for `analyze`, of all of them.
     over
-        Which stiffness, delay or loss is looked at, where a model has several; each takes those it has.
+        The varied stiffness, delay and loss, if a model has several; each uses those it has.
     criterion
         As for `critical`.
     at
-        The device whose hand feels, as for `feel`.
+        The device of the transparency analysis, as for `transparency`.
 
     Returns
     -------
     SchemeComparison
-        Its `.schemes`, each with the results of `analyze`, `critical` and `feel` that it is made of;
+        Its `.schemes`, each with the results of `analyze`, `critical` and `transparency` of the model;
         `.to_dataframe()`, `.plot()`.
 
     Raises
     ------
     ApcError
-        The input is at fault.
+        The input is invalid.
     """
     from apc.comparison import comparison
 
-    scenes = _several(models, "compare")
-    return comparison.compare([_model(scene, set) for scene in scenes], over=over, criterion=criterion, at=at)
+    topologies = _several(models, "compare")
+    return comparison.compare(
+        [_model(topology, params) for topology in topologies], over=over, criterion=criterion, at=at
+    )
 
 
 @checked
-def passive_hands(model: Scene, *, set: Values | None = None) -> AbsoluteStability:
-    """Say whether a scene is stable with every passive hand at every device, and how much damping that takes.
+def absolute_stability(model: TopologySource, *, params: Values | None = None) -> AbsoluteStability:
+    """Decide stability with every passive hand at every device, and the damping required for it.
 
     Parameters
     ----------
-    model, set
+    model, params
         As for `analyze`.
 
     Raises
     ------
     ApcError
-        A peer has no device, or a hand already; a device is touched otherwise than by samples and holds.
+        A peer has no device, or a hand already; a device is coupled other than by samples and holds.
     """
-    from apc.hands import passivity
+    from apc.haptics import absolute_stability
 
-    return passivity.passive_hands(_model(model, set))
+    return absolute_stability.absolute_stability(_model(model, params))
 
 
 @checked
-def feel(
-    model: Scene,
+def transparency(
+    model: TopologySource,
     frequencies: Sequence[float] | float,
     *,
-    set: Values | None = None,
+    params: Values | None = None,
     at: str = "",
     between: str = "",
     unstable: bool = False,
 ) -> Transparency:
-    """Say what a hand feels at its device, and what of a push arrives at another.
+    """Compute the impedance at a device and the transmission of a force to another device.
 
     Parameters
     ----------
-    model, set
+    model, params
         As for `analyze`.
     frequencies
         (k,), in Hz, at most half the rate of the fastest clock.
     at, between
-        The device that is pushed, such as "left[1].device", and another: the first peer's and the next one's.
+        The driven device, such as "left[1].device", and another; by default the first peer's and the next
+        one's.
     unstable
-        Whether of an unstable scene, which has no response in time, that of its map is wanted.
+        Whether to return the response of the frame map for an unstable model, which has no steady state.
 
     Returns
     -------
     Transparency
         Impedance, transmitted admittance and error between copies, complex (k,), in SI, with a bound; mass,
-        damping and stiffness of slow motions; H∞ norms; H2 norms, an rms at the ticks: motion between ticks
-        is not included.
+        low-frequency damping and stiffness; H∞ norms; H2 norms, an rms at the ticks: motion between ticks is
+        not included.
 
     Raises
     ------
     ApcError
-        The input is at fault.
+        The input is invalid.
     """
-    from apc.hands import frequency_response
+    from apc.haptics import frequency_response
 
     listed = [frequencies] if isinstance(frequencies, int | float) else frequencies
-    return frequency_response.feel(_model(model, set), listed, at=at, between=between, unstable=unstable)
+    return frequency_response.transparency(
+        _model(model, params), listed, at=at, between=between, unstable=unstable
+    )
 
 
 @checked
-def describe_network(recording: str | Path, *, interval: str | None = None) -> LinkFit:
-    """Say what a recorded network amounts to, as a link's own keys.
+def fit_link(recording: str | Path, *, interval: str | None = None) -> LinkFit:
+    """Compute the statistics of a recorded network as keys of a link.
 
     Parameters
     ----------
     recording
         A file that ping or `irtt client -o` wrote, or a CSV table with a column `delay [ms]`.
     interval
-        A time such as "8 ms" between two packets, where the file doesn't say.
+        A time such as "8 ms" between two packets, if the file does not contain it.
 
     Returns
     -------
     LinkFit
-        The share lost with its interval, bursts, delays, the nearest law of a jitter; printed, the link's
-        entry.
+        The share lost with its interval, bursts, delays, the nearest jitter distribution; the printed form is
+        the link's entry.
 
     Raises
     ------
     ApcError
         The file is none of these.
     """
-    from apc.network import recorded
+    from apc.network import link_fit
     from apc.option_value import option_value
 
-    between = None if interval is None else option_value("interval=", interval, what="a time", unit="s")
-    return recorded.describe(recording, None if between is None else float(between))
+    between = None if interval is None else option_value("interval=", interval, subject="a time", unit="s")
+    return link_fit.fit_recording(recording, None if between is None else float(between))
 
 
 @checked
-def judge_network(
-    model: Scene, *, set: Values | None = None, certify: bool = False
+def mean_square_stability(
+    model: TopologySource, *, params: Values | None = None, certify: bool = False
 ) -> MeanSquareStability | None:
-    """Say what becomes of a scene over the network that it has, lost and late packets included.
+    """Analyze mean-square stability over the network, with lost and late packets.
 
     Parameters
     ----------
-    model, set, certify
+    model, params, certify
         As for `analyze`.
 
     Returns
     -------
     MeanSquareStability or None
-        Verdict in mean square and the growth of second moments a frame with its error; None where every
-        packet takes its nominal delay.
+        Verdict in mean square and the growth of second moments per frame with its error; None if every packet
+        takes its nominal delay.
 
     Raises
     ------
     ApcError
-        The input is at fault.
+        The input is invalid.
     """
-    from apc.moments import network_verdict
+    from apc.mean_square import mean_square_stability
 
-    return network_verdict.judge_network(_model(model, set), certify=certify)
+    return mean_square_stability.mean_square_stability(_model(model, params), certify=certify)
 
 
 @checked
-def margins(model: Scene, *, set: Values | None = None) -> Margins:
-    """Say how far each coupler's stiffness and damping and each delay may grow, all else as it is.
+def margins(model: TopologySource, *, params: Values | None = None) -> Margins:
+    """Compute the stability margin of each coupler's stiffness and damping and of each delay, one at a time.
 
     Parameters
     ----------
-    model, set
+    model, params
         As for `analyze`.
     """
-    from apc.vary import margins as growth
+    from apc.parameter_studies import margins as growth
 
-    return growth.margins(_model(model, set))
+    return growth.margins(_model(model, params))
 
 
 @checked
-def sensitivities(model: Scene, *, set: Values | None = None) -> Sensitivities:
+def sensitivities(model: TopologySource, *, params: Values | None = None) -> Sensitivities:
     """Differentiate the spectral radius with respect to every parameter.
 
     Parameters
     ----------
-    model, set
+    model, params
         As for `analyze`.
     """
-    from apc.vary import sensitivity
+    from apc.parameter_studies import sensitivity
 
-    return sensitivity.sensitivities(_model(model, set))
+    return sensitivity.sensitivities(_model(model, params))
 
 
 @checked
-def conventions(model: Scene, *, set: Values | None = None) -> EventOrder:
+def event_order(model: TopologySource, *, params: Values | None = None) -> EventOrder:
     """Repeat the analysis under every order of coincident events and both readings of the start.
 
     Parameters
     ----------
-    model, set
+    model, params
         As for `analyze`.
     """
-    from apc.analysis import conventions as orders
+    from apc.analysis import event_order as orders
 
-    return orders.conventions(_model(model, set))
+    return orders.event_order(_model(model, params))
 
 
 @checked
-def contact_modes(model: Scene, *, set: Values | None = None) -> ContactModes:
-    """Analyse a scene whose couplers push and never pull in each of their modes.
+def contact_modes(model: TopologySource, *, params: Values | None = None) -> ContactModes:
+    """Analyse a model whose couplers push and never pull in each of their modes.
 
     Parameters
     ----------
-    model, set
-        As for `analyze`.
-    """
-    from apc.analysis import contact_modes as switched
-
-    return switched.contact_modes(_model(model, set))
-
-
-@checked
-def switching(model: Scene, *, set: Values | None = None) -> ArbitrarySwitching:
-    """Say whether a scene is proved stable however its contacts open and close, or as they do by themselves.
-
-    Parameters
-    ----------
-    model, set
+    model, params
         As for `analyze`.
     """
     from apc.analysis import contact_modes as switched
-    from apc.analysis import switching as at_will
 
-    system = _model(model, set)
-    return at_will.switching(system, switched.contact_modes(system))
+    return switched.contact_modes(_model(model, params))
 
 
 @checked
-def buzz(model: Scene, *, set: Values | None = None) -> LimitCycle:
-    """Predict the buzz of a scene's one-sided contacts, and play it beside.
+def arbitrary_switching(model: TopologySource, *, params: Values | None = None) -> ArbitrarySwitching:
+    """Prove stability under arbitrary switching of contacts, or under their state-dependent switching.
 
     Parameters
     ----------
-    model, set
+    model, params
+        As for `analyze`.
+    """
+    from apc.analysis import arbitrary_switching as at_will
+    from apc.analysis import contact_modes as switched
+
+    system = _model(model, params)
+    return at_will.arbitrary_switching(system, switched.contact_modes(system))
+
+
+@checked
+def limit_cycle(model: TopologySource, *, params: Values | None = None) -> LimitCycle:
+    """Predict the limit cycle of a model's one-sided contacts, and simulate it.
+
+    Parameters
+    ----------
+    model, params
         As for `analyze`.
 
     Raises
@@ -517,89 +524,89 @@ def buzz(model: Scene, *, set: Values | None = None) -> LimitCycle:
     ApcError
         E864 no contact that pushes from tick to tick and never pulls.
     """
-    from apc.simulation import buzz as cycles
+    from apc.simulation import limit_cycle as cycles
 
-    return cycles.buzz(_model(model, set))
+    return cycles.limit_cycle(_model(model, params))
 
 
 @checked
-def prove_box(
-    model: Scene,
+def robust_stability(
+    model: TopologySource,
     box: Mapping[str, str | Sequence[str | float]],
     *,
     cells: int | None = None,
-    set: Values | None = None,
+    params: Values | None = None,
 ) -> RobustStability:
-    """Prove that a scene is stable for every value of some parameters within their ranges.
+    """Prove stability for all values of some parameters within their ranges.
 
     Parameters
     ----------
-    model, set
+    model, params
         As for `analyze`.
     box
         Ranges by parameter, such as {"contact.stiffness": "±1%"}, "900 N/m:1100 N/m" or, in SI, (900, 1100).
     cells
-        How many cells are looked at at most; without it, as many as take some seconds.
+        The largest number of cells; by default as many as take some seconds.
     """
-    from apc.analysis.box import parse_range
-    from apc.answer import proved_box
+    from apc.analysis.parametric_frames import parse_range
+    from apc.analysis_report import robust_stability
 
-    system = _model(model, set)
+    system = _model(model, params)
     ranges = [parse_range(system, f"{name}={_range(system, name, value)}") for name, value in box.items()]
-    return proved_box(system, ranges, cells=cells)
+    return robust_stability(system, ranges, cells=cells)
 
 
 @checked
-def parameters(model: Scene) -> Parameters:
-    """List what may be set of a scene: its names, values, units and limits.
+def parameters(model: TopologySource) -> Parameters:
+    """List the settable parameters of a model: names, values, units and limits.
 
     Parameters
     ----------
     model
         A compiled model, or the path of a topology or compiled model.
     """
-    from apc.frame import settable
+    from apc.frame import parameter_listing
 
-    return settable.parameters(_model(model, None))
+    return parameter_listing.parameters(_model(model, None))
 
 
 @checked
-def paper_route(model: Scene, *, set: Values | None = None) -> PaperMethod:
+def paper_method(model: TopologySource, *, params: Values | None = None) -> PaperMethod:
     """Return the lifted matrices of Rakhsha and Constantinescu, eqs. (18) to (20), rows and columns named.
 
     Parameters
     ----------
-    model, set
+    model, params
         As for `analyze`.
 
     Raises
     ------
     ApcError
-        E861 the scene has not the form these matrices need.
+        E861 the model has not the form these matrices need.
     """
-    from apc.analysis import paper
+    from apc.analysis import paper_method
 
-    return paper.paper_route(_model(model, set))
+    return paper_method.paper_method(_model(model, params))
 
 
 @checked
 def region(
-    model: Scene,
+    model: TopologySource,
     *,
     x: str | tuple[str, str | float, str | float] | None = None,
     y: str | tuple[str, str | float, str | float] | None = None,
     criterion: Criterion | None = None,
-    set: Values | None = None,
+    params: Values | None = None,
 ) -> Region:
     """Find the boundary of the stable region of two parameters, as curves with their errors.
 
     Parameters
     ----------
-    model, set
+    model, params
         As for `analyze`.
     x, y
         A parameter and its range, such as "contact.stiffness=10 N/m:3000 N/m" or, in SI,
-        ("contact.stiffness", 10, 3000); those of the scene's `studies: region:` if not given.
+        ("contact.stiffness", 10, 3000); those of the model's `studies: region:` if not given.
     criterion
         As for `critical`.
 
@@ -611,12 +618,12 @@ def region(
     Raises
     ------
     ApcError
-        The input is at fault.
+        The input is invalid.
     """
     from apc.regions import stable_region
     from apc.regions.axes import parse_axes
 
-    system = _model(model, set)
+    system = _model(model, params)
     first, second = (
         axis if axis is None or isinstance(axis, str) else f"{axis[0]}={_range(system, axis[0], axis[1:])}"
         for axis in (x, y)
@@ -626,82 +633,83 @@ def region(
 
 @checked
 def tune(
-    model: Scene,
+    model: TopologySource,
     free: Mapping[str, str | Sequence[str | float]] | None = None,
     *,
     maximize: str = "",
     minimize: str = "",
-    subject: Sequence[str] = (),
+    constraint: Sequence[str] = (),
     over: Mapping[str, str | Sequence[str | float]] | None = None,
     criterion: Criterion | None = None,
     seconds: float | None = None,
-    set: Values | None = None,
+    params: Values | None = None,
 ) -> Tuning:
-    """Find the gains that do best in all that they have to bear, and prove that they bear it.
+    """Find the optimal gains under a specification, and prove that they satisfy it.
 
     Parameters
     ----------
-    model, set
+    model, params
         As for `analyze`.
     free
         Ranges of the gains by name: {"coordination.stiffness": "10 N/m:5000 N/m"} or, in SI, (10, 5000).
     maximize, minimize
-        One of them: a gain, what hands feel ("feel.error at 1 Hz", "feel.damping", "feel.error_h2",
-        "feel.error_hinf"), or a weighted sum of these in SI; "spectral_radius" and "settling_time" may be
-        small, too.
-    subject
-        Demands beside stability, such as "decay=60 dB in 2 s".
+        One of the two: a gain, a transparency metric ("coordination_error at 1 Hz", "damping",
+        "coordination_error_h2", "coordination_error_hinf"), or a weighted sum of these in SI;
+        "spectral_radius" and "settling_time" are for `minimize` only.
+    constraint
+        Demands in addition to stability, such as "decay=60 dB in 2 s".
     over
-        What has to be borne: {"user.count": "2:10", "device.mass": "±20%", "lan.delay": "8 ms:20 ms"}.
+        The ranges of the scenarios: {"user.count": "2:10", "device.mass": "±20%", "lan.delay": "8 ms:20 ms"}.
     criterion
-        As for `critical`; over unreliable links stable means so in mean square.
-        What is left out of these is as the scene's `studies: tune:` says.
+        As for `critical`; over unreliable links the default is mean-square. Omitted arguments are those of
+        the topology's `studies: tune:`.
     seconds
-        How long to go on at most.
+        The time limit.
 
     Returns
     -------
     Tuning
-        Its `.gains`, whether they are `.proved`, and what binds.
+        Its `.gains`, whether they are `.proved`, and the active constraints.
 
     Raises
     ------
     ApcError
-        The input is at fault.
+        The input is invalid.
     """
     from apc.tuning import tuner
 
-    system, demands = _demands(model, set, free, over, criterion, maximize, minimize, subject)
-    return tuner.tune(system, demands, seconds=float("inf") if seconds is None else seconds)
+    system, tuning_spec = _tuning_spec(model, params, free, over, criterion, maximize, minimize, constraint)
+    return tuner.tune(system, tuning_spec, seconds=float("inf") if seconds is None else seconds)
 
 
 @checked
-def front(
-    model: Scene,
+def pareto_front(
+    model: TopologySource,
     free: Mapping[str, str | Sequence[str | float]],
-    against: str,
+    tradeoff: str,
     *,
     maximize: str = "",
     minimize: str = "",
-    subject: Sequence[str] = (),
+    constraint: Sequence[str] = (),
     over: Mapping[str, str | Sequence[str | float]] | None = None,
     criterion: Criterion | None = None,
     points: int = 20,
     seconds: float | None = None,
-    set: Values | None = None,
+    params: Values | None = None,
 ) -> ParetoFront:
-    """Weigh an aim against what a hand feels: the best of the one for each of several bounds on the other.
+    """Compute the Pareto front of an objective and a transparency metric.
 
     Parameters
     ----------
-    model, free, maximize, minimize, subject, over, criterion, set
+    model, free, maximize, minimize, constraint, over, criterion, params
         As for `tune`.
-    against
-        What is felt: "feel.impedance at 5 Hz", or transmitted, error, damping, error_h2, error_hinf.
+    tradeoff
+        The transparency metric: "impedance at 5 Hz", or transmitted, error, damping, error_h2,
+        error_hinf.
     points
-        How many bounds, from the least that is felt to what the best of the aim is felt like.
+        The number of bounds, from the smallest metric to that at the best objective.
     seconds
-        How long to go on at most, with all of them.
+        The time limit for all of them.
 
     Returns
     -------
@@ -711,52 +719,52 @@ def front(
     Raises
     ------
     ApcError
-        The input is at fault.
+        The input is invalid.
     """
-    from apc.tuning.demands import read_against
-    from apc.tuning.front import front as pareto
+    from apc.tuning.pareto_front import pareto_front as pareto
+    from apc.tuning.specification import read_tradeoff
 
-    system, demands = _demands(model, set, free, over, criterion, maximize, minimize, subject)
+    system, tuning_spec = _tuning_spec(model, params, free, over, criterion, maximize, minimize, constraint)
     until = float("inf") if seconds is None else seconds
-    return pareto(system, demands, read_against(against), points=points, seconds=until)
+    return pareto(system, tuning_spec, read_tradeoff(tradeoff), points=points, seconds=until)
 
 
-def _demands(
-    model: Scene,
+def _tuning_spec(
+    model: TopologySource,
     values: Values | None,
     free: Mapping[str, Any] | None,
     over: Mapping[str, Any] | None,
     criterion: Criterion | None,
     maximize: str,
     minimize: str,
-    subject: Sequence[str],
+    constraint: Sequence[str],
 ) -> tuple[Model, TuningSpec]:
-    """Return a scene as its study or a criterion has its devices held, and what is asked of gains."""
-    from apc.tuning.demands import held_as_studied, read_demands
+    """Return a model with hands as in its study or the criterion, and the tuning specification."""
+    from apc.tuning.specification import gripped_as_studied, read_tuning_spec
 
     means: str | None = criterion
     system = _model(model, values)
     if criterion is None:
-        system, means = held_as_studied(system)
-    ranges, borne = (
-        [f"{name}={_range(system, name, value)}" for name, value in (asked or {}).items()]
-        for asked in (free, over)
+        system, means = gripped_as_studied(system)
+    ranges, required = (
+        [f"{name}={_range(system, name, value)}" for name, value in (requested or {}).items()]
+        for requested in (free, over)
     )
-    demands = read_demands(
+    tuning_spec = read_tuning_spec(
         system,
         ranges,
         maximize=maximize,
         minimize=minimize,
-        subject=subject,
-        over=borne,
+        constraint=constraint,
+        over=required,
         criterion=means,
     )
-    return system, demands
+    return system, tuning_spec
 
 
 @checked
 def sweep(
-    model: Scene,
+    model: TopologySource,
     over: Mapping[str, str | Sequence[str | float]],
     *,
     of: str = "analyze",
@@ -764,23 +772,23 @@ def sweep(
     out: str | Path | None = None,
     jobs: int | None = None,
     cluster: str | None = None,
-    set: Values | None = None,
+    params: Values | None = None,
 ) -> Sweep:
     """Compute a result at every combination of some parameters' values.
 
     Parameters
     ----------
-    model, set
+    model, params
         As for `analyze`.
     over
-        Values by parameter: "500 N/m:1500 N/m:11" (lower end, upper end, how many), or a list of quantities
-        or of numbers in SI.
+        Values by parameter: "500 N/m:1500 N/m:11" (lower end, upper end, number of values), or a list of
+        quantities or of numbers in SI.
     of
         "analyze", or "critical:PARAMETER".
     criterion
         As for `critical`.
     out
-        A .parquet or .csv file; finished parts are kept beside it, and the same call takes up where it ended.
+        A .parquet or .csv file; finished parts are stored next to it, and the same call resumes after them.
     jobs
         Processes; the number of cores if not given.
     cluster
@@ -789,7 +797,7 @@ def sweep(
     from apc.sweeps import resumable_sweep
 
     path = None if out is None else Path(out)
-    system = _model(model, set)
+    system = _model(model, params)
     _check_out(model, system, path)
     values = {
         name: text if isinstance(text, str) else [_quantity(system, name, value) for value in text]
@@ -800,36 +808,38 @@ def sweep(
     )
 
 
-def _several(scenes: Scene | Iterable[Scene], function: str) -> list[Scene]:
-    """Return the scenes that a function is given, of which one needs no list; refuse none."""
-    if isinstance(scenes, Model | str | Path):
-        return [scenes]
-    if listed := list(scenes):
+def _several(topologies: TopologySource | Iterable[TopologySource], function: str) -> list[TopologySource]:
+    """Return the models that a function is given, of which one needs no list; refuse none."""
+    if isinstance(topologies, Model | str | Path):
+        return [topologies]
+    if listed := list(topologies):
         return listed
     hint = f'apc.{function}(["average.yaml", "mesh.yaml"])'
-    raise ApcError(Diagnostic("E610", SourceLocation(function), "no scene is given", hint=hint))
+    raise ApcError(Diagnostic("E610", SourceLocation(function), "no topology is given", hint=hint))
 
 
-def _path(scene: Scene, function: str) -> Path:
-    """Return the path of a topology; refuse a compiled model, beside which it stands."""
+def _path(topology: TopologySource, function: str) -> Path:
+    """Return the path of a topology; refuse a compiled model, next to which it is expected."""
     from apc.inputs import refuse_model
 
-    path = Path(scene.origin.topology).with_suffix(".apc") if isinstance(scene, Model) else Path(scene)
+    path = (
+        Path(topology.origin.topology).with_suffix(".apc") if isinstance(topology, Model) else Path(topology)
+    )
     refuse_model(path, function)
     return path
 
 
-def _model(model: Scene, set: Values | None) -> Model:
+def _model(model: TopologySource, params: Values | None) -> Model:
     """Return a compiled model, with the parameters set."""
     if not isinstance(model, Model):
         from apc.inputs import load_or_compile
 
         model = load_or_compile(Path(model))
-    return set_parameters(model, set) if set else model
+    return set_parameters(model, params) if params else model
 
 
-def _check_out(model: Scene, system: Model, path: Path | None) -> None:
-    """Refuse to write over what the model was read from."""
+def _check_out(model: TopologySource, system: Model, path: Path | None) -> None:
+    """Refuse to overwrite the input of the model."""
     if path is not None and not isinstance(model, Model):
         from apc.inputs import check_outputs
 
@@ -838,41 +848,41 @@ def _check_out(model: Scene, system: Model, path: Path | None) -> None:
 
 @checked
 def simulate(
-    model: Scene,
+    model: TopologySource,
     *,
     duration: str | float | None = None,
-    set: Values | None = None,
+    params: Values | None = None,
     signals: Sequence[str] = (),
     jit: bool = True,
     seed: int | None = None,
     method: str | None = None,
-    strike: str | None = None,
+    impulse: str | None = None,
     trace_of: Literal["worst"] | None = None,
     error: bool = False,
 ) -> Trajectory:
-    """Play a scene in time.
+    """Play a model in time.
 
     Parameters
     ----------
     model
         A compiled model, or the path of a topology or compiled model.
     duration
-        How long, such as "2 s" or 2; that of the scene's experiment if not given.
-    set
+        The duration, such as "2 s" or 2; by default that of the model's experiment.
+    params
         Parameter values to change first, as in `set_parameters`.
     signals
         Patterns of the signals to keep, such as "cube.x" or "left[2].*"; all if there is none.
     jit
         Whether to compile to machine code where there is a C compiler.
     seed
-        Of the packets that get lost or come late; that of the scene's experiment if not given.
+        Of the packets that get lost or come late; that of the model's experiment if not given.
     method
         "exact", "rk4:STEP", "semi-implicit:STEP" or "cvodes:RTOL", such as "rk4:0.1 ms"; exact where linear
         and by CVODES elsewhere if not given.
-    strike
-        A peer that is struck as the scene begins, such as "user[1]": its device starts at 0.1 m/s.
+    impulse
+        A peer that is struck as the model begins, such as "user[1]": its device starts at 0.1 m/s.
     trace_of
-        "worst": lose packets by the periodic pattern that `analyze` finds to shake the scene.
+        "worst": lose packets by the periodic pattern that `analyze` finds to shake the model.
     error
         Whether to estimate the error, by a second run.
 
@@ -884,22 +894,22 @@ def simulate(
     Raises
     ------
     ApcError
-        The input is at fault.
+        The input is invalid.
     """
     from apc.simulation import trajectory
     from apc.simulation.settings import DEFAULT, parse_method
 
-    system = _model(model, set)
-    if strike is not None:
-        from apc.simulation import strike as push
+    system = _model(model, params)
+    if impulse is not None:
+        from apc.simulation import initial_velocity as push
 
-        system, _ = push.strike(system, strike)
+        system, _ = push.initial_velocity(system, impulse)
         if duration is None and system.experiment.duration is None:
             duration = float(push.WATCHED)
     if trace_of is not None:
-        from apc.moments.worst import trace_of_worst
+        from apc.mean_square.dropout_bounds import worst_trace
 
-        system = trace_of_worst(system)
+        system = worst_trace(system)
     length = duration if duration is None or isinstance(duration, str) else f"{float(duration)!r} s"
     return trajectory.simulate(
         system,
@@ -914,18 +924,18 @@ def simulate(
 
 @checked
 def bench(
-    model: Scene,
+    model: TopologySource,
     *,
-    set: Values | None = None,
+    params: Values | None = None,
     rounds: int | None = None,
 ) -> Bench:
-    """Measure every method of analysis and of simulation on a scene: time against true error.
+    """Measure every method of analysis and of simulation on a model: time against true error.
 
     Parameters
     ----------
     model
         A compiled model, or the path of a topology file.
-    set
+    params
         Parameters to change first, as `{"contact.stiffness": "800 N/m"}`.
     rounds
         Runs of each method, fewer of slow ones; 15 if not given.
@@ -933,71 +943,71 @@ def bench(
     Raises
     ------
     ApcError
-        The scene can't be analysed at all.
+        The model can't be analysed at all.
     """
     from apc.benchmark import speed_and_error
 
     return speed_and_error.bench(
-        _model(model, set), rounds=speed_and_error.ROUNDS if rounds is None else rounds
+        _model(model, params), rounds=speed_and_error.ROUNDS if rounds is None else rounds
     )
 
 
 @checked
 def export(
-    model: Scene,
+    model: TopologySource,
     to: str | None = None,
     out: str | Path | None = None,
     *,
-    set: Values | None = None,
-    cut: str = "",
-    free: Sequence[str] = (),
+    params: Values | None = None,
+    open_at: str = "",
+    symbolic: Sequence[str] = (),
     peer: str = "",
     device: str = "",
     method: str = "",
 ) -> Result:
-    """Hand a scene over to other tools.
+    """Export a model to other tools.
 
     Parameters
     ----------
-    model, set
+    model, params
         As for `analyze`.
     to
-        "control", "mat" or "npz": a state space; "modelica": a model; "c": one peer in C99; "fmu": a scene
-        or a peer for co-simulation. The suffix of `out` says it if not given.
+        "control", "mat" or "npz": a state space; "modelica": a model; "c": one peer in C99; "fmu": a model or
+        a peer for co-simulation. The default follows from the suffix of `out`.
     out
         The file to write; nothing is written if not given.
-    cut
+    open_at
         The link or coupler to cut the loop open at.
-    free
-        Parameters that stay free: `.function` is a `casadi.Function` of them that gives A, B, C and D.
+    symbolic
+        Parameters that stay free: `.function` is a `casadi.Function` of them that returns A, B, C and D.
     peer
-        Of "c" and "fmu": the peer, such as "left[1]". An FMU is of all peers if not given.
+        For "c" and "fmu": the peer, such as "left[1]". By default an FMU includes all peers.
     device
-        Of "c": the masses that move outside the peer's computer, "none" if none does; those that a hand holds
-        or that others are not told of if not given.
+        For "c": the masses outside the peer's computer, "none" if none; by default those that are hand-held
+        or not sent to others.
     method
-        Of "c" and "fmu": how states move between ticks, as for `simulate`; such as "rk4:0.1 ms" where they
-        are not linear.
+        For "c" and "fmu": the integration method between ticks, as for `simulate`, such as "rk4:0.1 ms" for
+        nonlinear equations.
 
     Returns
     -------
     Result
-        What was made, and written if asked: of a state space its matrices with the names and units of states,
-        inputs and outputs, and `.to_control()`; of a model its `.text`.
+        The export: for a state space its matrices with the names and units of states, inputs and outputs, and
+        `.to_control()`; for a Modelica model its `.text`.
 
     Raises
     ------
     ApcError
-        The input is at fault, or the scene can't be handed over so.
+        The input is invalid, or the format does not support the model.
     """
     from apc.exports import formats
 
     path = None if out is None else Path(out)
     chosen = formats.format_of(to, path, option="=")
-    system = _model(model, set)
+    system = _model(model, params)
     _check_out(model, system, path)
-    asked = formats.ExportRequest(cut, tuple(free), peer, device, method)
-    return formats.export(system, chosen, asked, path)
+    requested = formats.ExportRequest(open_at, tuple(symbolic), peer, device, method)
+    return formats.export(system, chosen, requested, path)
 
 
 @checked
@@ -1005,40 +1015,40 @@ def report(
     files: str | Path | Sequence[str | Path],
     out: str | Path | None = None,
     *,
-    set: Values | None = None,
+    params: Values | None = None,
 ) -> Report:
-    """Gather all that is known of scenes, for one page.
+    """Create a report on topologies: all analyses on one page.
 
     Parameters
     ----------
     files
-        Topologies, YAML files; several stand side by side.
+        Topologies, YAML files; several are compared.
     out
         The page to write, `.html` or `.pdf`; nothing is written if not given.
-    set
+    params
         As for `analyze`, of all of them.
 
     Returns
     -------
     Report
-        Its `.scenes`, each with sections of tables, which are those of the other functions.
+        Its `.topologies`, each with sections of tables, which are those of the other functions.
 
     Raises
     ------
     ApcError
-        The input is at fault, or the page can't be written.
+        The input is invalid, or the page cannot be written.
     """
     from apc.inputs import check_topology_outputs
-    from apc.present.report_output import check_report_path, save_report
+    from apc.output.report_output import check_report_path, save_report
     from apc.reports import contents
 
-    paths = [_path(scene, "report") for scene in _several(files, "report")]
+    paths = [_path(topology, "report") for topology in _several(files, "report")]
     for path in paths:
         if out is not None:
             check_topology_outputs(path, {"out=": Path(out)})
     if out is not None:
         check_report_path(Path(out))
-    result = contents.report(paths, [f"{name}={value}" for name, value in (set or {}).items()])
+    result = contents.report(paths, [f"{name}={value}" for name, value in (params or {}).items()])
     if out is not None:
         save_report(result, Path(out))
     return result
@@ -1046,23 +1056,23 @@ def report(
 
 @checked
 def show(path: str | Path, *, format: Format = "text") -> str:
-    """Tell what a scene is made of: its graph, its equations, and what happens in one frame.
+    """Return a description of a topology: its graph, its equations, and the events of one frame.
 
     Parameters
     ----------
     path
         The topology, a YAML file.
     format
-        "text" for a person; "json", the same as one document; "dot" and "mermaid", the graph in the
-        languages of Graphviz and Mermaid; "svg", the graph as a picture.
+        "text"; "json", the same as one document; "dot" and "mermaid", the graph in the languages of Graphviz
+        and Mermaid; "svg", the graph as a picture.
 
     Raises
     ------
     ApcError
-        The file is at fault, or is a compiled model: its topology is meant.
+        The file is invalid, or is a compiled model instead of a topology.
     """
     from apc.compiler.view import diagram, listing
-    from apc.present.forms import json_text
+    from apc.output.formatting import json_text
 
     path = _path(path, "show")
     match format:
@@ -1075,8 +1085,8 @@ def show(path: str | Path, *, format: Format = "text") -> str:
         case "mermaid":
             return diagram.draw_mermaid(listing.diagram_of(path))
         case "svg":
-            from apc.present.graph import graph_picture
-            from apc.present.pictures import svg_text
+            from apc.output.graph import graph_picture
+            from apc.output.pictures import svg_text
 
             return svg_text(graph_picture(listing.diagram_of(path)))
 

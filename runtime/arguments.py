@@ -1,9 +1,9 @@
-"""What is given to a public function, checked against its annotations before anything is done.
+"""Run-time checks of arguments of public functions against their annotations.
 
 Takes: a function whose parameters are annotated.
 Gives: `checked`.
-Guarantees: of a wrong type a TypeError says which argument it is, what it wants and what it got.
-Does not: judge texts, or the keys and plain values of mappings: what reads them raises ApcError.
+Guarantees: a wrong type raises a TypeError with the argument's name, the expected and the actual type.
+Does not: check texts, or keys and plain values of mappings: their readers raise ApcError.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from apc.compiler.compiled import Model
 P = ParamSpec("P")
 T = TypeVar("T")
 
-# What stands for a type that is written: a number of NumPy is one, a path may be any that the system takes;
-# where a compiled model is given for a path, the function itself says what it needs.
+# Types accepted for an annotated type: NumPy numbers for numbers, any path-like object for a path; for a
+# compiled model instead of a path the function itself raises the error.
 WIDER: Mapping[Any, tuple[type, ...]] = {
     int: (Integral,),
     float: (Real,),
@@ -33,12 +33,12 @@ WIDER: Mapping[Any, tuple[type, ...]] = {
 
 
 def checked(function: Callable[P, T]) -> Callable[P, T]:
-    """Return the function, which raises a TypeError that says what is wrong of an argument of a wrong type.
+    """Return the function with checks: an argument of a wrong type raises a TypeError.
 
     Parameters
     ----------
     function
-        Its annotations name what its own module knows; of another module's `Literal` any text will do.
+        Its annotations are resolved in its module; for a `Literal` of another module any text is accepted.
     """
     signature = inspect.signature(function)
 
@@ -62,13 +62,13 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
 @functools.cache
 def _hints(function: Callable[..., Any]) -> Mapping[str, Any]:
     """Return the types of a function's parameters."""
-    names = {name: kind for name, kind in function.__annotations__.items() if name != "return"}
+    names = {name: peer_type for name, peer_type in function.__annotations__.items() if name != "return"}
     holder = type("Holder", (), {"__annotations__": names})
     return get_type_hints(holder, globalns=function.__globals__, localns={"Method": str})
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Say whether a value is of a type, or stands for one: see `WIDER`."""
+    """Return whether a value has a type, or an accepted one: see `WIDER`."""
     origin, inner = get_origin(hint), get_args(hint)
     if hint is Any:
         return True

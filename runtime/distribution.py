@@ -1,4 +1,4 @@
-"""What the program is called where Python installs it from, and the line that installs more of it.
+"""The distribution name of the program, and the command that installs optional libraries.
 
 Takes: nothing. Gives: `DISTRIBUTION`, `program_version`, `versions`, `install_line`.
 Guarantees: one place names the distribution, which is not called `apc` as the package and the command are:

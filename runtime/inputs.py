@@ -1,9 +1,11 @@
-"""Which file a command means, and whether a compiled model still matches what it was made from.
+"""The input file of a command, and whether a compiled model is up to date.
 
-Takes: paths. Gives: the topology or compiled model to work on; `check_outputs`.
-Guarantees: a compiled model is used only while its topology, every text the topology names and the program
-are those it was made from, by their content; a model that has no topology beside it speaks for itself; what a
-topology says is never taken from a model that somebody else wrote; nothing is written where a command reads.
+Takes: paths. Gives: `find_input`, the topology or compiled model that a path means; `open_topology`,
+`load_or_compile`, `load_fresh`, `compiled_already`; `refuse_model`, `check_model_name`, `check_outputs`,
+`check_topology_outputs`.
+Guarantees: a compiled model is used only if its topology, all referenced files and the program are unchanged
+in content. A model without a topology in its folder is used alone. A topology is never replaced by a model
+that another user wrote. No output overwrites an input.
 Does not: compile.
 """
 
@@ -28,7 +30,7 @@ from apc.compiler.files import (
     same_file,
 )
 from apc.compiler.timings import part
-from apc.opening import opened
+from apc.model_loading import loaded_model
 from apc.suffixes import written
 
 if TYPE_CHECKING:
@@ -44,7 +46,7 @@ def find_input(file: str | None = None, *, compiled_too: bool) -> Path:
     Parameters
     ----------
     file
-        What is named, if anything is.
+        The named path, if any.
     compiled_too
         Whether a compiled model serves.
 
@@ -62,18 +64,18 @@ def find_input(file: str | None = None, *, compiled_too: bool) -> Path:
     candidates = [*topologies, *orphans]
     if len(candidates) == 1:
         return candidates[0]
-    place = SourceLocation("this folder")
+    location = SourceLocation("this folder")
     if not candidates:
-        what = "holds no topology" + (" and no compiled model" if compiled_too else "")
+        message = "holds no topology" + (" and no compiled model" if compiled_too else "")
         raise ApcError(
-            Diagnostic("E610", place, what, hint="apc new  (it writes a topology.yaml to start from)")
+            Diagnostic("E610", location, message, hint="apc new  (it writes a topology.yaml to start from)")
         )
     listed = ", ".join(str(path) for path in candidates[:10]) + (", …" if len(candidates) > 10 else "")
     raise ApcError(
         Diagnostic(
             "E611",
-            place,
-            f"holds {len(candidates)} scenes: {listed}",
+            location,
+            f"holds {len(candidates)} topologies: {listed}",
             hint=f"apc … {_as_word(candidates[0])}",
         )
     )
@@ -85,7 +87,7 @@ def _is_topology(path: Path) -> bool:
     try:
         return _TOPOLOGY.search(read_file(path, MAX_BYTES)) is not None
     except RefusedError as refused:
-        return refused.why == "large"  # which is told of when it is read
+        return refused.why == "large"  # reported when it is read
 
 
 def load_fresh(path: Path) -> Model:
@@ -95,26 +97,26 @@ def load_fresh(path: Path) -> Model:
     # `Path.is_file` raises for a name that is too long, which no file has.
     now = changed(archive, path.parent) if os.path.isfile(topology) else ""  # noqa: PTH113 -- see above
     if now:
-        what = f"is stale: {now} has changed since it was compiled"
-        raise ApcError(Diagnostic("E605", SourceLocation(str(path)), what, hint=f"apc compile {topology}"))
-    return opened(archive, path.parent)
+        message = f"is stale: {now} has changed since it was compiled"
+        raise ApcError(Diagnostic("E605", SourceLocation(str(path)), message, hint=f"apc compile {topology}"))
+    return loaded_model(archive, path.parent)
 
 
 def load_or_compile(path: Path) -> Model:
     """Return the compiled model of a file.
 
-    A compiled model is read. A topology is compiled in memory and checks itself, unless the model beside it
-    is what compiling it now would give.
+    A compiled model is read. A topology is compiled in memory and checked, unless the model in its folder is
+    up to date.
 
     Raises
     ------
     ApcError
-        The file is at fault.
+        The file is invalid.
     """
     if path.suffix == ".apc":
         return load_fresh(path)
     if (archive := compiled_already(path)) is not None:
-        return opened(archive, path.parent)
+        return loaded_model(archive, path.parent)
     from apc.compiler.pipeline import compile_topology
     from apc.frame.start_checks import check_values
 
@@ -124,7 +126,7 @@ def load_or_compile(path: Path) -> Model:
 
 
 @part("read")
-def open_scene(
+def open_topology(
     file: str | None,
     settings: Sequence[str],
     outputs: Mapping[str, Path | None] | None = None,
@@ -133,22 +135,22 @@ def open_scene(
     varied: Iterable[str] = (),
     notify: Callable[[str], None] | None = None,
 ) -> Model:
-    """Return the compiled model that a command means.
+    """Return the compiled model for a command.
 
     Parameters
     ----------
     file
-        A topology or compiled model; the only one of the working folder if not given.
+        A topology or compiled model; by default the only one of the working folder.
     settings
         Parameters to change, each `NAME=QUANTITY`.
     outputs
-        What the command will write, by the option that says so: see `check_outputs`.
+        The output files of the command, by option: see `check_outputs`.
     hands
-        How hands are to be taken, see `devices.with_hands`.
+        The treatment of hands, see `devices.with_hands`.
     varied
-        The parameters that the command varies, each a text that begins with a name.
+        The varied parameters of the command, each a text that begins with a name.
     notify
-        Is told what a setting for all groups takes the place of.
+        Called with a note if a setting for all groups replaces group values.
 
     Raises
     ------
@@ -166,14 +168,14 @@ def open_scene(
         refuse_numberless(hands, (*settings, *varied))
     if not settings:
         return system
-    from apc.frame.names import OVERRIDE, notes_for_all_groups
     from apc.frame.overrides import apply, parse_override
+    from apc.frame.parameter_names import OVERRIDE, notes_for_all_groups
 
     overrides = [parse_override(system, text) for text in settings]
-    for place, override in enumerate(overrides):
-        if any(override.free == other.free for other in overrides[:place]):
-            what, hint = f"{override.free.label} is set twice", f'--set "{settings[place]}"'
-            raise ApcError(Diagnostic("E621", OVERRIDE, what, hint=hint))
+    for index, override in enumerate(overrides):
+        if any(override.free == other.free for other in overrides[:index]):
+            message, hint = f"{override.free.label} is set twice", f'--set "{settings[index]}"'
+            raise ApcError(Diagnostic("E621", OVERRIDE, message, hint=hint))
     if notify is not None:
         for note in notes_for_all_groups(system, [override.free for override in overrides]):
             notify(note)
@@ -181,11 +183,11 @@ def open_scene(
 
 
 def refuse_model(path: Path, command: str) -> None:
-    """Refuse a compiled model (E615) where a command tells of equations and texts as they were written."""
+    """Refuse a compiled model (E615) if a command needs the original equations and texts."""
     if path.suffix == ".apc":
-        what = "is a compiled model, and this reads the topology that it was made from"
+        message = "is a compiled model, and this reads the topology that it was made from"
         hint = f"apc {command} {path.with_suffix('.yaml')}"
-        raise ApcError(Diagnostic("E615", SourceLocation(str(path)), what, hint=hint))
+        raise ApcError(Diagnostic("E615", SourceLocation(str(path)), message, hint=hint))
 
 
 def check_model_name(topology: Path) -> None:
@@ -198,21 +200,23 @@ def check_model_name(topology: Path) -> None:
         packed the folder put there, or a link to what is no compiled model.
     """
     if not topology.name:
-        return  # "." or "/": a folder, which whoever reads it says
+        return  # "." or "/": a folder; its reader reports the error
     model = topology.with_suffix(".apc")
     try:
         check_file(model, LARGEST)
     except RefusedError as refused:
         if refused.why == "special":
             raise _not_written(model, f"it {refused.words}") from None
-    # `Path.is_symlink` raises for a name that is too long, which whoever reads the topology says.
+    # `Path.is_symlink` raises for an overlong name; the reader of the topology reports it.
     if os.path.islink(model) and Path(os.path.realpath(model)).suffix != model.suffix:  # noqa: PTH114 -- see above
         raise _not_written(model, "it is a link to what is no compiled model")
     for suffix in YAML_SUFFIXES:
         other = topology.parent / f"{topology.stem}{suffix}"
         if other.name != topology.name and not same_file(other, topology) and _is_topology(other):
-            what = f"and {other.name} would both be compiled to {topology.stem}.apc"
-            raise ApcError(Diagnostic("E617", SourceLocation(str(topology)), what, hint=_renaming(topology)))
+            message = f"and {other.name} would both be compiled to {topology.stem}.apc"
+            raise ApcError(
+                Diagnostic("E617", SourceLocation(str(topology)), message, hint=_renaming(topology))
+            )
 
 
 def _not_written(model: Path, why: str) -> ApcError:
@@ -237,56 +241,56 @@ def check_topology_outputs(path: Path, outputs: Mapping[str, Path | None]) -> No
         check_target(output)
     if any(output.exists() for output in given):
         from apc.compiler.pipeline import run_stages
-        from apc.compiler.scene.scene import Topology, library_folders
         from apc.compiler.source.source import read_source
+        from apc.compiler.topology.topology import Topology, library_folders
 
-        scene = run_stages(path, until="scene")
-        assert isinstance(scene, Topology)
+        topology = run_stages(path, until="topology")
+        assert isinstance(topology, Topology)
         folders = (str(folder.resolve()) for folder in library_folders(read_source(path)))
-        check_outputs(path, (*scene.texts, *folders), outputs)
+        check_outputs(path, (*topology.texts, *folders), outputs)
 
 
 def check_outputs(path: Path, texts: Iterable[str], outputs: Mapping[str, Path | None]) -> None:
-    """Refuse to write to a file that the command reads, or to one file twice.
+    """Refuse to write to an input file of the command, or to one file twice.
 
     Parameters
     ----------
     path
         The topology or compiled model.
     texts
-        What it names, from its folder: files, and folders of components.
+        Its references, relative to its folder: files, and folders of components.
     outputs
-        What will be written, by the option that says so (see `check_suffix`); None is nothing.
+        The output files by option (see `suffixes.check_suffix`); None for no output.
 
     Raises
     ------
     ApcError
         E601 one of them can't be written; E616 one is read, or given twice.
     """
-    own = (path, path.parent / f"{path.stem}.yaml", path.parent / f"{path.stem}.apc")
-    named = [*own, *(path.parent / text for text in texts)]
+    local = (path, path.parent / f"{path.stem}.yaml", path.parent / f"{path.stem}.apc")
+    named = [*local, *(path.parent / text for text in texts)]
 
     def read(file: Path) -> bool:
-        # `Path.is_file` raises for a name that is too long, which whoever writes it says.
+        # `Path.is_file` raises for an overlong name; the writer reports it.
         is_file = os.path.isfile(file)  # noqa: PTH113 -- see above
         return is_file and any(same_file(file, path) or _is_below(file, path) for path in named)
 
     given = [(option, output) for option, output in outputs.items() if output is not None]
-    for place, (option, output) in enumerate(given):
+    for index, (option, output) in enumerate(given):
         check_target(output)
         hint = written(option, output.with_name(f"{output.stem}-result{output.suffix}"))
-        for other, before in given[:place]:
+        for other, before in given[:index]:
             if is_special(output):
                 continue  # a device or pipe takes what both write
             if output.absolute() == before.absolute() or same_file(output, before):
-                what = f"is given to {other} and to {option}: the second would replace the first"
-                raise ApcError(Diagnostic("E616", SourceLocation(str(output)), what, hint=hint))
-        # Beside rows stands what made them, see `present.recording`; beside C its header, see `exports.code`.
-        beside = (f"{output.name}.json", f"{output.stem}.h", f"{output.stem}_test.c")
-        for file in (output, partial_name(output), *(output.with_name(name) for name in beside)):
+                message = f"is given to {other} and to {option}: the second would replace the first"
+                raise ApcError(Diagnostic("E616", SourceLocation(str(output)), message, hint=hint))
+        # Rows have a provenance file, see `output.recording`; C code has a header, see `exports.code`.
+        alongside = (f"{output.name}.json", f"{output.stem}.h", f"{output.stem}_test.c")
+        for file in (output, partial_name(output), *(output.with_name(name) for name in alongside)):
             if read(file):
-                what = f"is read by this command: {option.removesuffix('=')} would replace it"
-                raise ApcError(Diagnostic("E616", SourceLocation(str(file)), what, hint=hint))
+                message = f"is read by this command: {option.removesuffix('=')} would replace it"
+                raise ApcError(Diagnostic("E616", SourceLocation(str(file)), message, hint=hint))
 
 
 def _is_below(file: Path, folder: Path) -> bool:
@@ -295,9 +299,9 @@ def _is_below(file: Path, folder: Path) -> bool:
 
 
 def compiled_already(topology: Path) -> Archive | None:
-    """Return the compiled model beside a topology if it is what compiling it now would give.
+    """Return the compiled model in a topology's folder if it is up to date.
 
-    That it is, only this user's own seal says: anybody can write what a file says of itself.
+    Only the user's signature proves that: the data in the file could be forged.
     """
     try:
         archive = read_archive(topology.with_suffix(".apc"))

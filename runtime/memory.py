@@ -1,29 +1,29 @@
-"""The memory there is, and what does not fit into it: refused before it is taken.
+"""The available memory; allocations that exceed it are refused in advance.
 
-Takes: how many bytes something needs. Gives: `refuse_beyond`, `free_memory`, `size_text`; what keeps a
-command within it, `hold_to_memory`, `is_lack`, `lacking`.
-Guarantees: what is refused says what it needs, what there is, and what to write instead.
-Does not: measure what is taken.
+Takes: a number of bytes. Gives: `refuse_beyond`, `free_memory`, `size_text`; the process limit,
+`hold_to_memory`, `is_lack`, `lacking`.
+Guarantees: a refusal states required and available memory, and a remedy.
+Does not: measure the memory in use.
 
-What commands take beside the 60 to 120 MB of the program, at most and within a factor of two:
+Memory of commands in addition to the 60 to 120 MB of the program, at most and within a factor of two:
 
-| what | bytes | told by |
+| what | bytes | defined in |
 |---|---|---|
-| `analyze`: systems of n states, their margins | 500 n² at work, 200 n² kept of each | `analysis.plan` |
-| `analyze`: k unlike peers, a determinant of s rows and r heard | (200 k + 6,000) s r | `analysis.plan` |
-| `analyze`: k different peers of n states | 100 n² k | `large.populations` |
-| `feel`: n states together, frequencies in blocks | 30 MB, or 150 n² if that is more | `hands.response` |
-| `simulate`: numbers of a frame of all peers | 64 each | `simulation.simulation` |
-| the same: a way of an unreliable link; a packet on it | 200; 100 | `network.timetable` |
-| `simulate` in Python, `--plot`: rows × signals | 16 each | `simulation.trajectory` |
-| `simulate --out`: a signal; a number of a block | 2,000 (Parquet 24,000); 150 | `present.recording` |
-| the same: a number of all rows | MAT 32; Parquet 500 a signal and block | `present.recording` |
-| `simulate --runs`: a run | 300 each | `simulation.ensemble` |
-| `export`: a state space of n states and inputs | 40 n² | `exports.lifted` |
-| `sweep`: points × columns, of a file's two blocks of rows at most | 32 each | `sweeps.resumable_sweep` |
+| `analyze`: systems of n states, their margins | 500 n² at work, 200 n² kept of each |
+`analysis.method_selection` | | `analyze`: k unlike peers, a determinant of s sent and r received values |
+(200 k + 6,000) s r | `analysis.method_selection` | | `analyze`: k different peers of n states | 100 n² k |
+`large_scale.heterogeneous_peers` | | `transparency`: n states together, frequencies in blocks | 30 MB, or 150
+n² if that is more | `haptics.modal_response` | | `simulate`: numbers of a frame of all peers | 64 each |
+`simulation.simulation` | | the same: a directed link of an unreliable link; a packet on it | 200; 100 |
+`network.packet_schedule` | | `simulate` in Python, `--plot`: rows × signals | 16 each |
+`simulation.trajectory` | | `simulate --out`: a signal; a number of a block | 2,000 (Parquet 24,000); 150 |
+`output.recording` | | the same: a number of all rows | MAT 32; Parquet 500 a signal and block |
+`output.recording` | | `simulate --runs`: a run | 300 each | `simulation.monte_carlo` | | `export`: a state
+space of n states and inputs | 40 n² | `exports.lifted` | | `sweep`: points × columns, of a file's two blocks
+of rows at most | 32 each | `sweeps.resumable_sweep` |
 
-Other things have bounds of their own: states of a matrix, packets, ticks of a frame, points of a sweep.
-What can't be known beforehand, as what a sparse factorization fills in, ends at a limit of the process.
+Separate limits exist for: states of a matrix, packets, ticks of a frame, points of a sweep. Unpredictable
+needs, such as the fill-in of a sparse factorization, are stopped by a limit of the process.
 """
 
 from __future__ import annotations
@@ -37,24 +37,24 @@ from pathlib import Path
 
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 
-SMALL = 2**26  # bytes: as much as the program takes by itself; whoever has no more can't run it
+SMALL = 2**26  # bytes: the program itself needs as much
 
 CGROUPS = Path("/sys/fs/cgroup")
 PROCESS = Path("/proc/self")
 MACHINE = Path("/proc/meminfo")
 
 
-def refuse_beyond(needed: float, code: str, place: SourceLocation, what: str, hint: str) -> None:
+def refuse_beyond(needed: float, code: str, location: SourceLocation, subject: str, hint: str) -> None:
     """Refuse what needs more memory than there is.
 
     Parameters
     ----------
     needed
         Bytes.
-    code, place, hint
+    code, location, hint
         Of the message.
-    what
-        What needs it, in the plural.
+    subject
+        The objects that need it, in the plural.
 
     Raises
     ------
@@ -62,8 +62,8 @@ def refuse_beyond(needed: float, code: str, place: SourceLocation, what: str, hi
         The code given.
     """
     if needed > SMALL and needed > (free := free_memory()):
-        text = f"{what} take about {size_text(needed)} of memory, and {size_text(free)} are free"
-        raise ApcError(Diagnostic(code, place, text, hint=hint))
+        text = f"{subject} take about {size_text(needed)} of memory, and {size_text(free)} are free"
+        raise ApcError(Diagnostic(code, location, text, hint=hint))
 
 
 def size_text(size: float) -> str:
@@ -73,15 +73,15 @@ def size_text(size: float) -> str:
 
 
 def free_memory() -> float:
-    """Return how many bytes this process may still take: of the machine, its control groups, its limits.
+    """Return the number of bytes still available to this process: machine, control groups, limits.
 
-    Infinite where nothing tells.
+    Infinite if unknown.
     """
     return max(0.0, min([_of_machine(), *_of_groups(), *_of_limits()]))
 
 
 def hold_to_memory() -> None:
-    """Limit this process to the memory there is: one that takes more is told so instead of being killed."""
+    """Limit this process to the available memory, so that excess raises an error instead of a kill."""
     if sys.platform != "linux":  # elsewhere the limit holds for nothing, or for too much
         return
     import resource
@@ -95,14 +95,17 @@ def hold_to_memory() -> None:
 
 def lacking(command: str) -> Diagnostic:
     """Return the message of a command that ran out of memory."""
-    what = "ran out of memory"
+    message = "ran out of memory"
     return Diagnostic(
-        "E820", SourceLocation(command), what, hint="fewer peers that differ, fewer states, or a shorter time"
+        "E820",
+        SourceLocation(command),
+        message,
+        hint="fewer peers that differ, fewer states, or a shorter time",
     )
 
 
 def is_lack(error: BaseException) -> bool:
-    """Say whether an error is that there was no memory left."""
+    """Return whether an error is a lack of memory."""
     return isinstance(error, MemoryError) or "bad_alloc" in str(error)
 
 
@@ -115,7 +118,7 @@ def _of_machine() -> float:
 
 
 def _of_groups() -> Iterator[float]:
-    """Yield what the control groups of this process leave it, those of version 2 and of version 1."""
+    """Yield the memory available in the control groups of this process, of version 2 and of version 1."""
     try:
         listed = (PROCESS / "cgroup").read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -128,11 +131,11 @@ def _of_groups() -> Iterator[float]:
         names = ("memory.max", "memory.current") if not controllers else _FIRST
         for folder in (top / path.lstrip("/"), *(top / path.lstrip("/")).parents):
             with suppress(OSError, ValueError):  # "max" is no number, the root has none
-                most, taken = (int((folder / name).read_text(encoding="utf-8")) for name in names)
+                most, used = (int((folder / name).read_text(encoding="utf-8")) for name in names)
                 # Of what files take there, the part not in use is given back when it is asked for.
                 with suppress(OSError, StopIteration):
-                    taken -= _number(folder / "memory.stat", "inactive_file", unit=1)
-                yield most - taken
+                    used -= _number(folder / "memory.stat", "inactive_file", unit=1)
+                yield most - used
             if folder == top:
                 break
 
@@ -141,7 +144,7 @@ _FIRST = "memory.limit_in_bytes", "memory.usage_in_bytes"
 
 
 def _of_limits() -> Iterator[float]:
-    """Yield what the limits of this process leave it."""
+    """Yield the memory available within the limits of this process."""
     with suppress(ImportError, OSError, StopIteration):
         import resource
 

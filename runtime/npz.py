@@ -1,6 +1,7 @@
 """Arrays from a file in NumPy's format NPZ, whoever wrote it.
 
-Takes: the bytes of a file, the arrays that may be in it. Gives: `read_arrays`.
+Takes: the bytes of a file, the arrays that may be in it.
+Gives: `read_arrays`; `DamageError`.
 Guarantees: nothing is unpickled, or unpacked before its names and sizes are known to be those asked for; an
 array has the type and the number of dimensions asked for.
 Does not: open files (see `files.read_file`), or know what the numbers mean.
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 
 class DamageError(ValueError):
-    """What is wrong with a file, for a person."""
+    """The description of an invalid file, for the user."""
 
 
 def read_arrays(data: bytes, expected: Mapping[str, tuple[str, int]], most: int) -> dict[str, NDArray[Any]]:
@@ -30,14 +31,14 @@ def read_arrays(data: bytes, expected: Mapping[str, tuple[str, int]], most: int)
     data
         The file.
     expected
-        What may be in it: by a pattern of names, the type, as "<f8", and the number of dimensions.
+        The allowed contents: by a pattern of names, the type, as "<f8", and the number of dimensions.
     most
-        How many bytes all of it may unpack to.
+        The largest unpacked size in bytes.
 
     Raises
     ------
     DamageError
-        What is wrong with it, in words.
+        The error text.
     """
     try:
         archive = NpzFile(io.BytesIO(data), allow_pickle=False)

@@ -1,8 +1,8 @@
 """Quantities given to an option of the command line.
 
 Takes: an option's name and its text. Gives: `option_value`, `option_values`, `with_last_unit`.
-Guarantees: what is wrong is told at the option, with the words to write there.
-Does not: know any option.
+Guarantees: errors are located at the option, with a valid text.
+Does not: define options.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from fractions import Fraction
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 
 
-def option_value(option: str, text: str, *, what: str, unit: str) -> Fraction:
+def option_value(option: str, text: str, *, subject: str, unit: str) -> Fraction:
     """Read the quantity given to an option, in SI.
 
     Parameters
     ----------
     option
-        The option as it is written, such as "--duration".
+        The option as written, such as "--duration".
     text
-        What was given.
-    what
-        What it is a quantity of, for messages.
+        The given text.
+    subject
+        The name of the quantity, for messages.
     unit
         A unit that fits.
 
@@ -38,7 +38,7 @@ def option_value(option: str, text: str, *, what: str, unit: str) -> Fraction:
     from apc.compiler.language.units import quantity
 
     try:
-        return Fraction(quantity(text, SourceLocation(option), what=what, unit=unit, before="").value)
+        return Fraction(quantity(text, SourceLocation(option), subject=subject, unit=unit, before="").value)
     except ApcError as error:
         raise ApcError(
             replace(mistake, hint=f'{option} "{mistake.hint}"' if mistake.hint else "")
@@ -56,38 +56,44 @@ def with_last_unit(texts: Sequence[str]) -> list[str]:
 
 
 def option_values(
-    label: str, unit: str, texts: Sequence[str], place: SourceLocation, *, between: str = ":", rest: str = ""
+    label: str,
+    unit: str,
+    texts: Sequence[str],
+    location: SourceLocation,
+    *,
+    between: str = ":",
+    rest: str = "",
 ) -> tuple[Fraction, ...]:
     """Read quantities in SI; one without a unit takes that of the last.
 
     Parameters
     ----------
     label, unit
-        What they are values of, and a unit that fits.
+        The name of the quantity, and a valid unit.
     texts
-        As they were given.
-    place
-        Where.
+        The given texts.
+    location
+        The location.
     between, rest
-        What stands between two of them, and what behind the last, for the words to write.
+        The separator, and the text after the last, for the suggested fix.
 
     Raises
     ------
     ApcError
-        Those of `units.quantity`, with what is to be written in the place of all.
+        Those of `units.quantity`, with a suggested replacement of all.
     """
     from apc.compiler.language.units import quantity
 
     if unit != "1" and all(_NUMBER.fullmatch(text) for text in texts):
         hint = f"{label}={between.join(f'{text.strip()} {unit}' for text in texts)}{rest}"
         got = f"{between.join(texts)} (no unit)"
-        raise ApcError(Diagnostic("E204", place, label, unit, got[:80], hint))
+        raise ApcError(Diagnostic("E204", location, label, unit, got[:80], hint))
     values: list[Fraction] = []
     mistakes: list[Diagnostic] = []
     right: list[str] = []  # what is to be written of each
     for text in with_last_unit(texts):
         try:
-            read = quantity(text, place, what=label, unit=unit, before="", one_fix=True)
+            read = quantity(text, location, subject=label, unit=unit, before="", one_fix=True)
             values.append(Fraction(read.value))
             right.append(text)
         except ApcError as error:

@@ -31,16 +31,16 @@ def need(module: str, extra: str) -> Any:
         raise missing(f"{module} is not installed", install_line(extra)) from error
 
 
-def missing(what: str, hint: str) -> ApcError:
-    """Return the mistake (E875) that a library or program isn't there; `hint` says what to do."""
-    return ApcError(Diagnostic("E875", SourceLocation("apc"), what, hint=hint))
+def missing(message: str, hint: str) -> ApcError:
+    """Return the error (E875) for a missing library or program; `hint` is the remedy."""
+    return ApcError(Diagnostic("E875", SourceLocation("apc"), message, hint=hint))
 
 
 @contextmanager
 def _at_home(module: str) -> Iterator[None]:
     """Import a module in apc's own folder: matplotlib takes a file of the working folder for its settings.
 
-    These name a program to run, among others. In a program of the user's own that is for the user to say.
+    Such settings can name a program to run. In the user's own program this is the user's decision.
     """
     if module in sys.modules or "apc.cli" not in sys.modules:
         yield

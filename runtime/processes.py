@@ -1,13 +1,12 @@
-"""Work shared out: to processes of this machine, or done by this one; its results as they come.
+"""Parallel work: in processes of this machine, or in this one; results in order of completion.
 
-Takes: a function of what all tasks share and of a task; tasks.
+Takes: a function of shared data and of a task; tasks.
 Gives: `Workers`, `this_process`, `local_processes`, `cores`; `Patience`, `results`; `model_bytes`,
-`model_of_bytes`.
-Guarantees: every process starts afresh (spawned, never forked), imports nothing from the working folder that
-the first one would not, computes with one thread, and ends with the one that started it, whatever ends that
-one; an interrupt from the keyboard reaches the first process alone; one that is lost is told, one that is
-silent is told of.
-Does not: keep results, or decide which tasks are wanted.
+`model_of_bytes`; `digest_of`.
+Guarantees: every process is spawned, never forked, and imports nothing from the working folder that the
+parent would not. It computes with one thread and ends with the parent, for whatever reason. A keyboard
+interrupt reaches the parent only. A crashed or unresponsive process is reported.
+Does not: store results, or select tasks.
 """
 
 from __future__ import annotations
@@ -34,9 +33,9 @@ Shared = TypeVar("Shared")
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-SAFE_PATH = "PYTHONSAFEPATH"  # what makes Python leave the working folder out of its path
+SAFE_PATH = "PYTHONSAFEPATH"  # makes Python exclude the working folder from its path
 
-# Seconds without a result after which that is told, and again after twice as many.
+# Seconds without a result after which a note is printed; doubled after each note.
 SILENCE = 60.0
 
 
@@ -55,14 +54,14 @@ class Workers(Generic[Task, Result]):
 
 @dataclass(frozen=True, slots=True)
 class Patience:
-    """What to do while no result comes: `notify` hears of it; after `limit` seconds the work ends."""
+    """Handling of missing results: `notify` is called; after `limit` seconds the work ends."""
 
     limit: float | None = None
     notify: Callable[[str], None] = lambda _: None
 
 
 def cores() -> int:
-    """Return how many cores this process may use."""
+    """Return the number of cores available to this process."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -83,19 +82,19 @@ def this_process(compute: Callable[[Shared, Task], Result], shared: Shared) -> W
 def local_processes(
     compute: Callable[[Shared, Task], Result], shared: Shared, jobs: int, lost: Diagnostic
 ) -> Iterator[Workers[Task, Result]]:
-    """Start `jobs` processes, and end them on leaving, at once, whatever they are doing.
+    """Start `jobs` processes, and end them immediately on exit.
 
     Parameters
     ----------
     compute
         A function of a module, which every process imports.
     shared
-        What is handed to every process once, when it begins: sent with every task, a large model would cost
-        more than the task.
+        Data sent to every process once, at its start: a large model sent with every task would cost more than
+        the task.
     jobs
-        How many processes.
+        The number of processes.
     lost
-        What to tell when one of them ends without a word.
+        The message for an unexpected end of one of them.
     """
     context = multiprocessing.get_context("spawn")
     # Nothing is ever sent through it: the other end closes when this process closes it, or dies.
@@ -121,23 +120,23 @@ def local_processes(
 
 
 def results(
-    workers: Workers[Task, Result], tasks: Iterable[Task], patience: Patience, place: SourceLocation
+    workers: Workers[Task, Result], tasks: Iterable[Task], patience: Patience, location: SourceLocation
 ) -> Iterator[Result]:
     """Yield each result as it comes; never more tasks are handed out than keep the workers busy.
 
     Parameters
     ----------
     workers, tasks
-        Who does what.
+        The workers and their tasks.
     patience
-        How long to wait for the next.
-    place
-        Whose work it is, for messages.
+        The handling of missing results.
+    location
+        The location for messages.
 
     Raises
     ------
     ApcError
-        E889 nothing came for too long; what the workers' `trouble` says.
+        E889 no result for too long; the error in the workers' `trouble`.
     """
     silent = 0.0  # seconds since the last result
     left = iter(tasks)
@@ -156,7 +155,7 @@ def results(
             finished, running = wait(running, pause, return_when=FIRST_COMPLETED)
             silent = 0.0 if finished else silent + pause
             if silent:
-                _tell_silence(silent, patience, place)
+                _tell_silence(silent, patience, location)
             for future in finished:
                 yield future.result()
     except ApcError:
@@ -168,18 +167,18 @@ def results(
         raise trouble from error
 
 
-def _tell_silence(seconds: float, patience: Patience, place: SourceLocation) -> None:
-    """Say that nothing came for a while. Raises ApcError E889 if that is too long."""
-    what = f"no result from the processes that compute for {seconds:g} s"
+def _tell_silence(seconds: float, patience: Patience, location: SourceLocation) -> None:
+    """Report that no result came for a while. Raises ApcError E889 if that is too long."""
+    message = f"no result from the processes that compute for {seconds:g} s"
     if patience.limit is not None and seconds >= patience.limit:
-        what += ": they are stuck, or a part takes longer"
-        raise ApcError(Diagnostic("E889", place, what, hint=f'--patience "{2 * seconds:g} s"'))
-    patience.notify(f"{what}; still waiting")
+        message += ": they are stuck, or a part takes longer"
+        raise ApcError(Diagnostic("E889", location, message, hint=f'--patience "{2 * seconds:g} s"'))
+    patience.notify(f"{message}; still waiting")
 
 
 @contextmanager
 def _safe_path() -> Iterator[None]:
-    """Have what is started import the standard library's `struct`, not a struct.py of the working folder.
+    """Ensure that child processes import `struct` of the standard library, not of the working folder.
 
     A process is spawned as `python -c`, which puts the working folder before everything else. It gets this
     one's path once it runs.
@@ -208,7 +207,7 @@ def _interrupts_ignored() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-# What a process computes, and what its tasks share: set once when it begins.
+# The function of a process, and the data common to its tasks: set once at its start.
 _mine: list[tuple[Callable[[Any, Any], Any], Any]] = []
 
 

@@ -3,7 +3,7 @@
 Takes: nothing. Gives: `Result`, `PlotStyle`.
 Guarantees: data know the name of what shows them and nothing of it: it is imported when it is asked for. In a
 notebook a result is its text and its picture, elsewhere a line.
-Does not: show anything itself (see `present`).
+Does not: show anything itself (see `output`).
 """
 
 from __future__ import annotations
@@ -16,10 +16,9 @@ from apc.optional import need
 
 
 class PlotStyle(TypedDict, total=False):
-    """How a picture looks: `size` (width, height) in inches, `labels`, `style`.
+    """The style of a picture: `size` (width, height) in inches, `labels`, `style`.
 
-    `labels` are other words for some that stand in it; `style` is a style sheet of matplotlib, several, or
-    its settings by name.
+    `labels` replaces texts in it; `style` is a style sheet of matplotlib, several, or its settings by name.
     """
 
     size: tuple[float, float]
@@ -28,10 +27,11 @@ class PlotStyle(TypedDict, total=False):
 
 
 class Result:
-    """What is found, abstract. `shown_by` names its module of `apc.present`, and it there: "vary:critical".
+    """A result, abstract.
 
-    That module has a function for each form of it: `critical_text`, which yields its lines,
-    `critical_picture`. Its document is its fields (`forms.record`), unless there is a `critical_document`.
+    The module in `shown_by` has a function for each form of output, such as `critical_text`, which yields
+    lines, and `critical_picture`. Its document is its fields (`formatting.record`), unless there is a
+    `critical_document`.
     """
 
     __slots__ = ()
@@ -44,13 +44,13 @@ class Result:
             cls.__repr__ = Result.__repr__  # type: ignore[method-assign]
 
     def __repr__(self) -> str:
-        """Return what it is in a line: its kind, and how its text begins."""
+        """Return a one-line representation: the type, and the start of the text."""
         first = next((line.strip() for line in str(self).splitlines() if line.strip()), "")
         return f"<{type(self).__name__} {first}>"
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, str]:
-        """Return what a notebook shows: the text, and as HTML the text with its picture."""
-        html: str = import_module("apc.present.pictures").html_of(self)
+        """Return the representations for a notebook: the text, and as HTML the text with its picture."""
+        html: str = import_module("apc.output.pictures").html_of(self)
         return {"text/plain": str(self), "text/html": html}
 
     def __str__(self) -> str:
@@ -62,16 +62,16 @@ class Result:
         document: dict[str, Any] = self._shown("document")
         return document
 
-    def _drawn(self, *arguments: Any, look: PlotStyle) -> Any:
-        """Return the picture, a matplotlib Figure or Axes, that looks as it is wanted to."""
-        written, labels = need("matplotlib.text", "plot").Text, look.get("labels", {})
-        with need("matplotlib.style", "plot").context(look.get("style", [])):
-            drawn = self._shown("picture", *arguments)
-        if "size" in look:
-            drawn.figure.set_size_inches(*look["size"])
-        for text in drawn.figure.findobj(written):
+    def _plotted(self, *arguments: Any, style: PlotStyle) -> Any:
+        """Return the picture, a matplotlib Figure or Axes, in the given style."""
+        written, labels = need("matplotlib.text", "plot").Text, style.get("labels", {})
+        with need("matplotlib.style", "plot").context(style.get("style", [])):
+            plotted = self._shown("picture", *arguments)
+        if "size" in style:
+            plotted.figure.set_size_inches(*style["size"])
+        for text in plotted.figure.findobj(written):
             text.set_text(labels.get(text.get_text(), text.get_text()))
-        return drawn
+        return plotted
 
     def _shown(self, form: str, *arguments: Any) -> Any:
         """Return the result in another form, as its module has it.
@@ -79,8 +79,8 @@ class Result:
         Without one its document is made of its fields, and a table of its `rows`: see `pictures.table_of`.
         """
         module, _, name = self.shown_by.partition(":")
-        forms: Any = import_module(f"apc.present.{module}")
+        forms: Any = import_module(f"apc.output.{module}")
         if hasattr(forms, f"{name}_{form}"):
             return getattr(forms, f"{name}_{form}")(self, *arguments)
-        other, called = {"document": ("forms", "record"), "table": ("pictures", "table_of")}[form]
-        return getattr(import_module(f"apc.present.{other}"), called)(self)
+        other, called = {"document": ("formatting", "record"), "table": ("pictures", "table_of")}[form]
+        return getattr(import_module(f"apc.output.{other}"), called)(self)

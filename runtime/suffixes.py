@@ -1,4 +1,4 @@
-"""Which file names a command can write to.
+"""The file suffixes that a command can write.
 
 Takes: the path given to an option, and the suffixes it may have. Gives: `check_suffix`, `written`.
 Guarantees: a file of an unknown suffix is never written as something else.
@@ -21,16 +21,16 @@ DASH = Path("-")
 
 
 def check_suffix(path: Path, known: Iterable[str], option: str) -> str:
-    """Return the suffix that says the format of what is written to a path.
+    """Return the suffix that determines the format of an output file.
 
     Parameters
     ----------
     path
         A file, or a device or pipe: without a suffix, such as /dev/stdout, it takes the first of `TEXTS`.
     known
-        The suffixes there are, the first of which is proposed.
+        The valid suffixes, the first of which is suggested.
     option
-        What says the path: `--out` on the command line, `out=` in Python.
+        The option of the path: `--out` on the command line, `out=` in Python.
 
     Raises
     ------
@@ -43,16 +43,20 @@ def check_suffix(path: Path, known: Iterable[str], option: str) -> str:
         return suffix
     if not suffix and is_special(path) and (texts := [text for text in TEXTS if text in names]):
         return texts[0]
-    wanted = names[0] if len(names) == 1 else f"one of {', '.join(names)}"
-    what, proposed = f"the suffix of {option.removesuffix('=')}", Path(path.name or "result")
+    requested = names[0] if len(names) == 1 else f"one of {', '.join(names)}"
+    message, proposed = f"the suffix of {option.removesuffix('=')}", Path(path.name or "result")
     if path == DASH:  # whoever writes it wants standard output, which takes text
         as_text = any(text in names for text in TEXTS)
         instead = Path("/dev/stdout") if as_text else Path("result").with_suffix(names[0])
         raise ApcError(
-            Diagnostic("E878", SourceLocation(str(path)), what, wanted, "none", written(option, instead))
+            Diagnostic(
+                "E878", SourceLocation(str(path)), message, requested, "none", written(option, instead)
+            )
         )
     hint = written(option, path.parent / proposed.with_suffix(names[0]))
-    raise ApcError(Diagnostic("E878", SourceLocation(str(path)), what, wanted, path.suffix or "none", hint))
+    raise ApcError(
+        Diagnostic("E878", SourceLocation(str(path)), message, requested, path.suffix or "none", hint)
+    )
 
 
 def written(option: str, path: Path) -> str:

@@ -1,13 +1,13 @@
-"""Tables of named columns as files, written as their rows come: CSV or Parquet, by the suffix.
+"""Table files with named columns, written block by block: CSV or Parquet, by suffix.
 
 Takes: columns, and rows block by block.
 Gives: `TableColumn`, `Row`, `Tabled`, `TableWriter` and `WRITERS` of the formats; `check_table_path`,
 `write_table`, `read_table`, `blocks_of`, `keep_room`.
-Guarantees: a block is in the file whole or not at all; before a block is written, room is kept on the disk
-for it and for the file's end, so that on a full disk the blocks before it can still be finished. The same
-rows give the same bytes; numbers keep every digit; an empty cell is empty, never NaN; at most a block of rows
-is held at a time.
-Does not: compute, or say what a table is of.
+Guarantees: a block is in the file completely or not at all. Before a block is written, disk space is reserved
+for it and for the end of the file, so that on a full disk the file can be finished with the earlier blocks.
+Output is reproducible to the byte; numbers keep every digit; an empty cell is empty, never NaN; at most one
+block of rows is in memory.
+Does not: compute, or define columns.
 """
 
 from __future__ import annotations
@@ -45,8 +45,9 @@ COPIED = 2**20  # bytes at a time
 # Room for what is written besides numbers, in bytes; upper bounds, which the tests hold against the files.
 LETTER = 4  # of a text, in the encoding that takes most (UTF-32, in NPZ)
 ENDS = 2**14  # headers and directories, of any format
-# Of Parquet: a column in the schema (measured 76, and 3 a letter of its name, which stands there twice, once
-# in base 64); of each block its note in the footer (measured 104, and the name) and its page headers (98).
+# Overhead of Parquet: a column in the schema (measured 76, and 3 per letter of its name, which occurs twice,
+# once in base 64); for each block its entry in the footer (measured 104, and the name) and its page headers
+# (98).
 COLUMN, NOTE, HEADERS = 256, 256, 256
 # A block of Parquet is at most a dictionary of all its values and a place in it for each (PLAIN_DICTIONARY,
 # places of at most 18 bits), or the values themselves; Snappy adds at most a sixth to either.
@@ -55,7 +56,7 @@ SWOLLEN = 2
 
 @dataclass(frozen=True, slots=True)
 class TableColumn:
-    """A column of a table: `kind` says what its cells are, if they are anything at all."""
+    """A column of a table: `kind` is the type of its cells that are not empty."""
 
     name: str
     unit: str = ""
@@ -67,25 +68,25 @@ class TableColumn:
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
 
-# What a table is made of: its columns, its rows, and what a file says of how it was made.
+# The parts of a table: its columns, its rows, and its provenance.
 Tabled = tuple[list[TableColumn], Iterator[Row], dict[str, Any]]
 
 
 class TableWriter(ABC):
-    """One format, abstract. `about` is the name and the text of what made the table.
+    """One format, abstract. `description` is the name and the text of the provenance.
 
-    `whole_rows` are in the file for good. `rows` raises OSError when there is no room: of these rows none is
-    in the file then, and `finish` still ends it after those before. `plain` says that the format has no place
-    for `about`.
+    `whole_rows` is the number of rows that are safely in the file. `rows` raises OSError without disk space:
+    then none of these rows is in the file, and `finish` still ends it after the earlier ones. `plain` is
+    whether the format cannot contain `description`.
     """
 
     plain: ClassVar[bool] = False
 
-    def __init__(self, path: Path, columns: Sequence[TableColumn], about: tuple[str, str]) -> None:
-        self.path, self.columns, self.about = path, columns, about
+    def __init__(self, path: Path, columns: Sequence[TableColumn], description: tuple[str, str]) -> None:
+        self.path, self.columns, self.description = path, columns, description
         self.file: BinaryIO = path.open("w+b")
         self.whole_rows = 0
-        self._kept = 0
+        self._stored = 0
 
     def rows(self, cells: Sequence[Any]) -> None:
         """Write some rows, given as columns: arrays, their NaN empty cells, or sequences of cells."""
@@ -95,22 +96,22 @@ class TableWriter(ABC):
 
     @abstractmethod
     def write(self, cells: Sequence[Any], count: int) -> None:
-        """Keep room for so many rows, then write them."""
+        """Reserve space for a block of rows, then write it."""
 
     @abstractmethod
     def finish(self) -> None:
-        """Write what comes last, and close the file."""
+        """Write the end of the file, and close it."""
 
     def close(self) -> None:
-        """Close the file as it is."""
+        """Close the file without changes."""
         with contextlib.suppress(OSError):  # what is still in its buffer, on a full disk
             self.file.close()
 
     def keep(self, size: int) -> None:
-        """Make sure that the file can grow to so many bytes. Raises OSError if it can't."""
-        if size > self._kept:
-            keep_room(self.file, self._kept, size)
-            self._kept = size
+        """Ensure that the file can grow to a number of bytes. Raises OSError otherwise."""
+        if size > self._stored:
+            keep_room(self.file, self._stored, size)
+            self._stored = size
 
     def cut(self) -> None:
         """Give back the room that the file does not need, and close it."""
@@ -123,12 +124,12 @@ def keep_room(file: BinaryIO, begin: int, end: int) -> None:
     if hasattr(os, "posix_fallocate"):
         os.posix_fallocate(file.fileno(), begin, end - begin)
         return
-    place = file.tell()
+    index = file.tell()
     file.seek(begin)
     for at in range(begin, end, COPIED):
         file.write(bytes(min(COPIED, end - at)))
     file.flush()
-    file.seek(place)
+    file.seek(index)
 
 
 class Csv(TableWriter):
@@ -136,14 +137,14 @@ class Csv(TableWriter):
 
     plain = True
 
-    def __init__(self, path: Path, columns: Sequence[TableColumn], about: tuple[str, str]) -> None:
-        super().__init__(path, columns, about)
+    def __init__(self, path: Path, columns: Sequence[TableColumn], description: tuple[str, str]) -> None:
+        super().__init__(path, columns, description)
         self.file.write(_lines([[column.heading for column in columns]]))
         self.file.flush()
         self.whole = self.file.tell()
 
     def write(self, cells: Sequence[Any], count: int) -> None:
-        """Keep room for so many rows, then write them."""
+        """Reserve space for a block of rows, then write it."""
         columns = [_listed(cell) if isinstance(cell, np.ndarray) else cell for cell in cells]
         text = _lines(zip(*columns, strict=True))
         self.keep(self.whole + len(text))
@@ -170,15 +171,15 @@ def _listed(numbers: NDArray[Any]) -> list[Cell]:
 
 def _lines(rows: Iterable[Sequence[Cell]]) -> bytes:
     buffer = io.StringIO(newline="")
-    csv.writer(buffer, lineterminator="\n").writerows(rows)  # a float as `repr` says it, None as nothing
+    csv.writer(buffer, lineterminator="\n").writerows(rows)  # a float by `repr`, None as an empty cell
     return buffer.getvalue().encode()
 
 
 class Parquet(TableWriter):
-    """A row group a block; columns are named like headings, `about` is in the schema's metadata."""
+    """A row group a block; columns are named like headings, `description` is in the schema's metadata."""
 
-    def __init__(self, path: Path, columns: Sequence[TableColumn], about: tuple[str, str]) -> None:
-        super().__init__(path, columns, about)
+    def __init__(self, path: Path, columns: Sequence[TableColumn], description: tuple[str, str]) -> None:
+        super().__init__(path, columns, description)
         self.arrow = need("pyarrow", "data")
         parquet = need("pyarrow.parquet", "data")
         types = {"number": self.arrow.float64(), "count": self.arrow.int64(), "text": self.arrow.string()}
@@ -186,15 +187,15 @@ class Parquet(TableWriter):
         fields = [
             self.arrow.field(name, types[column.kind]) for name, column in zip(names, columns, strict=True)
         ]
-        self.schema = self.arrow.schema(fields, metadata=dict([about]))
+        self.schema = self.arrow.schema(fields, metadata=dict([description]))
         self.table_writer = parquet.ParquetWriter(self.file, self.schema)
         letters = len("".join(names).encode())
         self.note = NOTE * len(names) + letters  # of each block, in the footer
-        self.end = ENDS + COLUMN * len(names) + LETTER * (letters + len(about[1].encode()))
+        self.end = ENDS + COLUMN * len(names) + LETTER * (letters + len(description[1].encode()))
         self.written = True
 
     def write(self, cells: Sequence[Any], count: int) -> None:
-        """Keep room for so many rows, then write them."""
+        """Reserve space for a block of rows, then write it."""
         if not self.written:
             raise OSError(0, "half a row group can't be written on")
         types = [item.type for item in self.schema]
@@ -215,7 +216,7 @@ class Parquet(TableWriter):
         self.cut()
 
     def close(self) -> None:
-        """Close the file as it is."""
+        """Close the file without changes."""
         with contextlib.suppress(OSError):
             self.table_writer.close()  # or it would try to when it is forgotten
         super().close()
@@ -229,35 +230,38 @@ SUFFIXES = tuple(WRITERS)
 
 
 def check_table_path(path: Path, option: str) -> None:
-    """Raise ApcError if no table can be written where an option says.
+    """Raise ApcError if no table can be written at an option's path.
 
-    E878 the suffix, E887 a library that is missing, E601 the place.
+    E878 the suffix, E887 a missing library, E601 the path.
     """
     if check_suffix(path, SUFFIXES, option) == ".parquet":
         try:
             importlib.import_module("pyarrow.parquet")
         except ImportError:
-            what = "is a Parquet file, which needs pyarrow; without it, the name can end in .csv"
+            message = "is a Parquet file, which needs pyarrow; without it, the name can end in .csv"
             hint = install_line("data")
-            raise ApcError(Diagnostic("E887", SourceLocation(str(path)), what, hint=hint)) from None
+            raise ApcError(Diagnostic("E887", SourceLocation(str(path)), message, hint=hint)) from None
     check_target(path)
 
 
 def write_table(
-    path: Path, columns: Sequence[TableColumn], blocks: Iterable[Sequence[Any]], about: Mapping[str, Any]
+    path: Path,
+    columns: Sequence[TableColumn],
+    blocks: Iterable[Sequence[Any]],
+    description: Mapping[str, Any],
 ) -> None:
     """Write a table.
 
     Parameters
     ----------
     path
-        The file; its suffix says the format, see `check_suffix`.
+        The file; its suffix determines the format, see `check_suffix`.
     columns
-        What its columns are.
+        Its columns.
     blocks
-        Some rows at a time, read once, as columns: see `TableWriter.rows`, `blocks_of`.
-    about
-        What made the table; kept in a Parquet file, left out of a CSV file, which stays plain.
+        Blocks of rows, read once, as columns: see `TableWriter.rows`, `blocks_of`.
+    description
+        The provenance of the table; stored in a Parquet file, omitted from a CSV file.
 
     Raises
     ------
@@ -265,7 +269,7 @@ def write_table(
         E601 the file can't be written.
     """
     suffix = check_suffix(path, SUFFIXES, "out=")
-    made = json.dumps(about, ensure_ascii=False, sort_keys=True)
+    made = json.dumps(description, ensure_ascii=False, sort_keys=True)
 
     def write(temporary: Path) -> None:
         writer = WRITERS[suffix](temporary, columns, (METADATA, made))
@@ -289,12 +293,12 @@ def read_table(path: Path, columns: Sequence[TableColumn]) -> tuple[NDArray[Any]
         with path.open(encoding="utf-8", newline="") as file:
             lines = csv.reader(file)
             heading = next(lines)
-            places = [heading.index(column.heading) for column in columns]
-            rows = [[row[place] for place in places] for row in lines]
+            indices = [heading.index(column.heading) for column in columns]
+            rows = [[row[index] for index in indices] for row in lines]
         read = {"number": float, "count": int, "text": str}
         cells = [
-            [read[column.kind](row[place]) if row[place] or column.kind == "text" else None for row in rows]
-            for place, column in enumerate(columns)
+            [read[column.kind](row[index]) if row[index] or column.kind == "text" else None for row in rows]
+            for index, column in enumerate(columns)
         ]
     return tuple(
         np.array(cell, dtype=np.float64 if column.kind == "number" else object)

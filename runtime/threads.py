@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController  # type: ignore[import-untyped] # it ships no types
 
-# What says how many threads a pool has: OpenMP's for all, OpenBLAS's and MKL's own before it.
+# environment variables for the number of threads
 POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -26,9 +26,9 @@ POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 def single_threaded() -> Iterator[None]:
     """Run the body with every BLAS and OpenMP pool limited to one thread.
 
-    A site's matrices are too small to share: measured on a loaded machine, an unpinned loop over
-    21×21 matrices varied 17-fold in time, because each product waited for threads it did not need. Where
-    the environment says one thread already, the pools are not even looked for.
+    A subsystem's matrices are too small to share: measured on a loaded machine, an unpinned loop over 21×21
+    matrices varied 17-fold in time, because each product waited for threads it did not need. If the
+    environment already specifies one thread, the pools are not searched.
     """
     if _pinned():
         yield
@@ -43,7 +43,7 @@ def single_threaded() -> Iterator[None]:
 
 
 def load_pool(module: str) -> Any:
-    """Import what brings a pool of its own, as SciPy's linear algebra: `single_threaded` limits it too."""
+    """Import a library with a thread pool, as SciPy's linear algebra, for `single_threaded` to limit it."""
     new = module not in sys.modules
     module_type = importlib.import_module(module)
     if new and _entered:  # the outermost keeps the limit until all have left
@@ -52,7 +52,7 @@ def load_pool(module: str) -> Any:
 
 
 def _limit(limits: ExitStack) -> None:
-    """Give every pool one thread until the limits are left; the controller's own way takes far longer."""
+    """Give every pool one thread until the limits end; the controller's method takes far longer."""
     for pool in _pools(len(sys.modules)).lib_controllers:
         threads = pool.get_num_threads()
         if threads != 1:
@@ -64,7 +64,7 @@ _entered: list[ExitStack] = []  # what `single_threaded` is in now, outermost fi
 
 
 def start_single_threaded() -> None:
-    """Ask for one thread of the libraries that are about to be loaded, unless the environment says other.
+    """Set one thread for the libraries to be loaded, unless the environment specifies otherwise.
 
     For a process that does nothing else: threads that are never made save a short command 20 to 40 ms. With
     NumPy loaded already it is too late, and nothing is done.
@@ -75,9 +75,9 @@ def start_single_threaded() -> None:
 
 @lru_cache(maxsize=1)
 def _pinned() -> bool:
-    """Say whether every pool got one thread from the environment when it was loaded.
+    """Return whether every pool had one thread from the environment when it was loaded.
 
-    OpenBLAS looks at its own variable first, and MKL at its own; both, and OpenMP, at OMP_NUM_THREADS.
+    OpenBLAS and MKL first use their specific variables; both, and OpenMP, use OMP_NUM_THREADS.
     """
     limits = (os.environ.get(name, "1") for name in POOLS)
     return "OMP_NUM_THREADS" in os.environ and all(value == "1" for value in limits)

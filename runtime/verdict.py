@@ -4,7 +4,7 @@ Takes: nothing.
 Gives: `Term`, `Sentence`; `StabilityVerdict`, `BoxVerdict`; `ProofMethod`, `ProofOutcome`, `ProofScope`,
 `StabilityProof`, `NO_PROOF`; `LimitationCode`, `Limitation`, `Note`, `code_of`.
 Guarantees: a decision reads a member, a number or a code; the text is made here, and for output only.
-Does not: decide (see `eigen.spectrum`), or know how wide a line is (see `present`).
+Does not: decide (see `eigen.spectrum`), or know how wide a line is (see `output`).
 """
 
 from __future__ import annotations
@@ -112,22 +112,22 @@ class StabilityProof(Sentence):
     """How a verdict, or a value at which it changes, is known; false where there is no proof to report.
 
     `bits` is the precision of ball arithmetic, 0 without it. `outcome` is None of a value at which the
-    verdict changes. `left_open` is how many numbers of peers between the two are undecided.
+    verdict changes. `undecided` is how many numbers of peers between the two are undecided.
     """
 
     method: ProofMethod = ProofMethod.NONE
     bits: int = 0
     outcome: ProofOutcome | None = None
     scope: tuple[ProofScope, ...] = ()
-    left_open: int = 0
+    undecided: int = 0
 
     def __bool__(self) -> bool:
         return self.method is not ProofMethod.NONE
 
     def __str__(self) -> str:
         """Return the proof as a text, "" without one."""
-        if self.left_open:
-            return f"{self.left_open} between are left open"
+        if self.undecided:
+            return f"{self.undecided} between are left open"
         text = str(self.method)
         if self.method is ProofMethod.BALLS:
             at = "at" if self.outcome is ProofOutcome.UNDECIDED else "with"
@@ -168,8 +168,10 @@ _TEXTS = {
     LimitationCode.NOT_PROVED: "{}: not proved, as {}",
     LimitationCode.NO_BALLS: "not proved, as method {} has no matrix of balls",
     LimitationCode.ONE_DIRECTION: "along one direction; along others: {}",
-    LimitationCode.UNSTABLE_MAP: "of the map: the scene is unstable",
-    LimitationCode.SLOWER_MOTION: ("of slow motions nothing is told: something of the scene is slower still"),
+    LimitationCode.UNSTABLE_MAP: "of the map: the topology is unstable",
+    LimitationCode.SLOWER_MOTION: (
+        "of slow motions nothing is told: something of the topology is slower still"
+    ),
     LimitationCode.COUPLED_COPIES: (
         "largest gains leave out how far the copies of peers that differ move apart together"
     ),

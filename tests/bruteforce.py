@@ -1,9 +1,9 @@
 """N full peers, event by event, by hand: the check on everything in the runtime, and none of its code.
 
-The scene is the one of `sites.paper`: point masses under zero-order-held forces, in closed form. The matrix
-of one frame comes column by column, each the frame that starts from one unit vector. Numbers are floats or
-FLINT's (`frame_matrix(…, number=as_ball)`, at the working precision set by the caller) or anything with
-arithmetic and an `exp`.
+The topology is the one of `subsystems.paper`: point masses under zero-order-held forces, in closed form. The
+matrix of one frame comes column by column, each the frame that starts from one unit vector. Numbers are
+floats or FLINT's (`frame_matrix(…, number=as_ball)`, at the working precision set by the caller) or anything
+with arithmetic and an `exp`.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 
 
 @dataclass(frozen=True)
-class Scene:
-    """Everything about the scene, times in exact seconds; `users` overrides values a user.
+class TopologySource:
+    """Everything about the topology, times in exact seconds; `users` overrides values a user.
 
     `comp` is the delay of every computed force, `contact_comp` another one of the contact's. A number may be
-    an array as well, of as many scenes at once.
+    an array as well, of as many topologies at once.
 
     `weights` are those of (sender, receiver) pairs, all others are not heard; None is 1 for every pair.
     `late` are delays of pairs other than `comm`. With `pairs`, the stiffness between (receiver, sender), F_T
@@ -60,7 +60,7 @@ class Scene:
         """The delay of the contact's force."""
         return self.comp if self.contact_comp is None else self.contact_comp
 
-    def hears(self, receiver: int) -> list[tuple[int, float]]:
+    def receives(self, receiver: int) -> list[tuple[int, float]]:
         """Return whom a peer hears, with weights."""
         others = (sender for sender in range(self.peers) if sender != receiver)
         if self.weights is None:
@@ -89,38 +89,38 @@ def as_ball(value: Any) -> flint.arb:
 
 
 def frame_matrix(
-    scene: Scene, *, number: Callable[[Any], Any] = float, exp: Any = math.exp
+    topology: TopologySource, *, number: Callable[[Any], Any] = float, exp: Any = math.exp
 ) -> list[list[Any]]:
     """Return the one-frame matrix of all peers, as rows.
 
     The state is every peer's (x, v, x_O, v_O), then its last computed forces, newest first, then its last
     packets, newest first: as many as any delay can ask for, so some entries may matter to nobody.
     """
-    n, frame, force_depth, packet_depth = _shape(scene)
+    n, frame, force_depth, packet_depth = _shape(topology)
     columns = []
     for column in range(n):
         state = [number(1 if row == column else 0) for row in range(n)]
-        columns.append(_one_frame(scene, state, frame, force_depth, packet_depth, number, exp))
+        columns.append(_one_frame(topology, state, frame, force_depth, packet_depth, number, exp))
     return [[columns[c][r] for c in range(n)] for r in range(n)]
 
 
-def ways_of(scene: Scene) -> list[tuple[int, int]]:
+def ways_of(topology: TopologySource) -> list[tuple[int, int]]:
     """Return who hears whom, as (sender, receiver)."""
-    return [(j, i) for i in range(scene.peers) for j, _ in scene.hears(i)]
+    return [(j, i) for i in range(topology.peers) for j, _ in topology.receives(i)]
 
 
-def lossy_frame(scene: Scene, luck: Luck) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def lossy_frame(topology: TopologySource, noise: Luck) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the one-frame matrix (n, n) in floats, and what pushes at each tick make of the state (n, k).
 
     Behind the state of `frame_matrix` stands by way the packet, (x, v), that is heard until another is there.
     At each haptic tick every device is pushed anew, by 1 N until the next.
     """
-    size, frame, force_depth, packet_depth = _shape(scene)
-    n = size + 2 * len(ways_of(scene))
-    rows = np.eye(n + scene.peers * int(frame / scene.haptic))
+    size, frame, force_depth, packet_depth = _shape(topology)
+    n = size + 2 * len(ways_of(topology))
+    rows = np.eye(n + topology.peers * int(frame / topology.haptic))
     found = _one_frame(
-        scene, list(rows[:n]), frame, force_depth, packet_depth,
-        lambda value: np.asarray(value, dtype=np.float64)[..., None], np.exp, luck, iter(rows[n:]),
+        topology, list(rows[:n]), frame, force_depth, packet_depth,
+        lambda value: np.asarray(value, dtype=np.float64)[..., None], np.exp, noise, iter(rows[n:]),
     )  # fmt: skip
     whole = np.stack([np.broadcast_to(row, len(rows)) for row in found])
     return whole[:, :n], whole[:, n:]
@@ -134,8 +134,8 @@ def states_read(matrices: NDArray[np.float64]) -> NDArray[np.intp]:
     return read.nonzero()[0]
 
 
-def frame_matrices(scene: Scene, count: int) -> NDArray[np.float64]:
-    """Return the same in floats for many scenes at once, (count, n, n): numbers may be arrays (count,).
+def frame_matrices(topology: TopologySource, count: int) -> NDArray[np.float64]:
+    """Return the same in floats for many topologies at once, (count, n, n): numbers may be arrays (count,).
 
     All columns go through one frame together, as rows of numbers.
     """
@@ -143,17 +143,17 @@ def frame_matrices(scene: Scene, count: int) -> NDArray[np.float64]:
     def number(value: Any) -> NDArray[np.float64]:
         return np.asarray(value, dtype=np.float64)[..., None]
 
-    n, frame, force_depth, packet_depth = _shape(scene)
-    rows = _one_frame(scene, list(np.eye(n)), frame, force_depth, packet_depth, number, np.exp)
+    n, frame, force_depth, packet_depth = _shape(topology)
+    rows = _one_frame(topology, list(np.eye(n)), frame, force_depth, packet_depth, number, np.exp)
     return np.stack([np.broadcast_to(row, (count, n)) for row in rows], axis=1)
 
 
-def _shape(scene: Scene) -> tuple[int, Fraction, int, int]:
+def _shape(topology: TopologySource) -> tuple[int, Fraction, int, int]:
     """Return the number of states, the length of a frame, and how many forces and packets are kept."""
-    frame = common_period(scene.haptic, scene.network)
-    force_depth = math.ceil(max(scene.comp, scene.contact_delay) / scene.haptic) + 1
-    packet_depth = math.ceil(max(scene.comm, *scene.late.values(), Fraction(0)) / scene.network) + 1
-    return scene.peers * (4 + 3 * force_depth + 2 * packet_depth), frame, force_depth, packet_depth
+    frame = common_period(topology.haptic, topology.network)
+    force_depth = math.ceil(max(topology.comp, topology.contact_delay) / topology.haptic) + 1
+    packet_depth = math.ceil(max(topology.comm, *topology.late.values(), Fraction(0)) / topology.network) + 1
+    return topology.peers * (4 + 3 * force_depth + 2 * packet_depth), frame, force_depth, packet_depth
 
 
 def common_period(one: Fraction, other: Fraction) -> Fraction:
@@ -165,38 +165,40 @@ def common_period(one: Fraction, other: Fraction) -> Fraction:
 
 
 def _one_frame(
-    scene: Scene,
+    topology: TopologySource,
     state: Sequence[Any],
     frame: Fraction,
     force_depth: int,
     packet_depth: int,
     number: Callable[[Any], Any],
     exp: Any,
-    luck: Luck | None = None,
+    noise: Luck | None = None,
     pushes: Iterator[Any] | None = None,
 ) -> list[Any]:
     """Propagate all peers through one frame; with luck each way's last packet stands behind them."""
     size = 4 + 3 * force_depth + 2 * packet_depth
-    behind = iter(state[scene.peers * size :])
-    last = {way: (next(behind), next(behind)) for way in ways_of(scene)} if luck else {}
-    parts = [list(state[i * size : (i + 1) * size]) for i in range(scene.peers)]
+    behind = iter(state[topology.peers * size :])
+    last = (
+        {coupling_term: (next(behind), next(behind)) for coupling_term in ways_of(topology)} if noise else {}
+    )
+    parts = [list(state[i * size : (i + 1) * size]) for i in range(topology.peers)]
     value = [
         {
-            name: number(user.get(name, getattr(scene, name)))
+            name: number(user.get(name, getattr(topology, name)))
             for name in ("kt", "bt", "kc", "bc", "cube", "cube_damping", "device", "device_damping")
         }
-        for user in (scene.users or ({},) * scene.peers)
+        for user in (topology.users or ({},) * topology.peers)
     ]
     # Times in whole numbers of the unit that measures them all.
     exact = (
-        frame, scene.haptic, scene.network, scene.haptic_phase % scene.haptic,
-        scene.network_phase % scene.network, scene.comp, scene.contact_delay, scene.comm,
+        frame, topology.haptic, topology.network, topology.haptic_phase % topology.haptic,
+        topology.network_phase % topology.network, topology.comp, topology.contact_delay, topology.comm,
     )  # fmt: skip
-    per_second = math.lcm(*(time.denominator for time in (*exact, *scene.late.values())))
+    per_second = math.lcm(*(time.denominator for time in (*exact, *topology.late.values())))
     ending, haptic, network, haptic_0, network_0, comp, contact_comp, comm = (
         int(time * per_second) for time in exact
     )
-    late = {pair: int(time * per_second) for pair, time in scene.late.items()}
+    late = {pair: int(time * per_second) for pair, time in topology.late.items()}
     motion = [part[:4] for part in parts]
     # forces[i] is a list of (time computed, contact, own part, heard part); packets likewise (time, x, v).
     forces, packets = [], []
@@ -208,14 +210,14 @@ def _one_frame(
         packets.append(
             [(network_0 - (k + 1) * network, *part[at + 2 * k : at + 2 * k + 2]) for k in range(packet_depth)]
         )
-    pushing = [number(0)] * scene.peers
+    pushing = [number(0)] * topology.peers
     instants = {0, ending}
     for start, period, delay in (
         (haptic_0, haptic, comp),
         (haptic_0, haptic, contact_comp),
         (haptic_0, haptic, 0),
         (network_0, network, 0),
-        *((network_0, network, delay) for delay in {comm, *late.values()} if luck),
+        *((network_0, network, delay) for delay in {comm, *late.values()} if noise),
     ):
         first = -(delay // period) - 2
         instants |= {start + k * period + delay for k in range(first, ending // period + 2)}
@@ -224,59 +226,59 @@ def _one_frame(
     def newest(listed: Sequence[tuple[Any, ...]], now: int, delay: int) -> tuple[Any, ...]:
         return max((one for one in listed if one[0] + delay <= now), key=lambda one: one[0])
 
-    there = {way: iter(listed) for way, listed in luck.there.items()} if luck else {}
-    missed = set(luck.missed) if luck else set()
+    there = {coupling_term: iter(listed) for coupling_term, listed in noise.there.items()} if noise else {}
+    missed = set(noise.missed) if noise else set()
 
-    def hear(j: int, i: int, now: int) -> tuple[Any, ...]:
-        if not luck:
+    def receive(j: int, i: int, now: int) -> tuple[Any, ...]:
+        if not noise:
             return newest(packets[j], now, late.get((j, i), comm))
-        return (now, *(motion[i][2:] if luck.zero and (j, i) in missed else last[j, i]))
+        return (now, *(motion[i][2:] if noise.zero and (j, i) in missed else last[j, i]))
 
     for now, following in itertools.pairwise(times):
         if (now - network_0) % network == 0:
-            for i in range(scene.peers):
+            for i in range(topology.peers):
                 packets[i].append((now, motion[i][2], motion[i][3]))
-        for way in last:
-            delay = late.get(way, comm)
+        for coupling_term in last:
+            delay = late.get(coupling_term, comm)
             if (now - network_0 - delay) % network == 0:
-                missed -= {way}
-                if next(there[way]):
-                    last[way] = newest(packets[way[0]], now, delay)[1:]
+                missed -= {coupling_term}
+                if next(there[coupling_term]):
+                    last[coupling_term] = newest(packets[coupling_term[0]], now, delay)[1:]
                 else:
-                    missed |= {way}
+                    missed |= {coupling_term}
         if (now - haptic_0) % haptic == 0:
             pushing = [next(pushes) for _ in motion] if pushes else pushing
             for i, (x, v, x_o, v_o) in enumerate(motion):
                 p = value[i]
-                heard = [(number(weight), j, hear(j, i, now)) for j, weight in scene.hears(i)]
-                total = sum((weight for weight, _, _ in heard), number(0))
-                share = total if scene.operator == "mean" else number(1)
-                own = number(1) if scene.operator == "mean" else number(scene.peers - 1)
-                position = sum((weight * one[1] for weight, _, one in heard), number(0)) / share
-                velocity = sum((weight * one[2] for weight, _, one in heard), number(0)) / share
+                received = [(number(weight), j, receive(j, i, now)) for j, weight in topology.receives(i)]
+                total = sum((weight for weight, _, _ in received), number(0))
+                share = total if topology.operator == "mean" else number(1)
+                own = number(1) if topology.operator == "mean" else number(topology.peers - 1)
+                position = sum((weight * one[1] for weight, _, one in received), number(0)) / share
+                velocity = sum((weight * one[2] for weight, _, one in received), number(0)) / share
                 owned = own * (p["kt"] * x_o + p["bt"] * v_o)
                 others = -p["kt"] * position - p["bt"] * velocity
-                if scene.pairs:
+                if topology.pairs:
                     owned, others = number(0), number(0)
-                    for weight, j, one in heard:
-                        stiffness = number(scene.pairs[i, j])
+                    for weight, j, one in received:
+                        stiffness = number(topology.pairs[i, j])
                         owned += weight / share * (stiffness * x_o + p["bt"] * v_o)
                         others -= weight / share * (stiffness * one[1] + p["bt"] * one[2])
                 forces[i].append((now, p["kc"] * (x - x_o) + p["bc"] * (v - v_o), owned, others))
         duration = Fraction(following - now, per_second)
-        for i in range(scene.peers):
+        for i in range(topology.peers):
             p = value[i]
             delayed = newest(forces[i], now, comp)
             contact = newest(forces[i], now, contact_comp)[1]
             at_once = newest(forces[i], now, 0)
-            pull = delayed[2] + (at_once if scene.own_delay else delayed)[3]
+            pull = delayed[2] + (at_once if topology.own_delay else delayed)[3]
             x, v, x_o, v_o = motion[i]
             x, v = _coast(x, v, pushing[i] - contact, p["device"], p["device_damping"], duration, number, exp)
             x_o, v_o = _coast(x_o, v_o, contact - pull, p["cube"], p["cube_damping"], duration, number, exp)
             motion[i] = [x, v, x_o, v_o]
 
     result: list[Any] = []
-    for i in range(scene.peers):
+    for i in range(topology.peers):
         result += motion[i]
         for one in sorted(forces[i], key=lambda one: one[0], reverse=True)[:force_depth]:
             result += one[1:]

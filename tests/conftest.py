@@ -51,27 +51,27 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if config.getoption("--whole"):
         return
     marked: dict[str, tuple[int, list[pytest.Function]]] = {}
-    left_out = {item for item in items if item.get_closest_marker("whole")}
+    limitations = {item for item in items if item.get_closest_marker("whole")}
     for item in items:
         mark = item.get_closest_marker("few")
-        if mark and item not in left_out and isinstance(item, pytest.Function):
+        if mark and item not in limitations and isinstance(item, pytest.Function):
             marked.setdefault(item.nodeid.partition("[")[0], (mark.args[0], []))[1].append(item)
-    left_out |= {item for count, cases in marked.values() for item in {*cases} - {*few(cases, count)}}
-    config.hook.pytest_deselected(items=[item for item in items if item in left_out])
-    items[:] = [item for item in items if item not in left_out]
+    limitations |= {item for count, cases in marked.values() for item in {*cases} - {*few(cases, count)}}
+    config.hook.pytest_deselected(items=[item for item in items if item in limitations])
+    items[:] = [item for item in items if item not in limitations]
 
 
 def few(cases: list[pytest.Function], count: int) -> list[pytest.Function]:
     """Return so many cases, each the first of those that show most values not shown yet."""
     values = {case: {(name, repr(value)) for name, value in case.callspec.params.items()} for case in cases}
-    kept: list[pytest.Function] = []
+    stored: list[pytest.Function] = []
     rest, shown = [*cases], set[tuple[str, str]]()
-    while rest and len(kept) < count:
+    while rest and len(stored) < count:
         best = max(rest, key=lambda case: len(values[case] - shown))
         rest.remove(best)
-        kept.append(best)
+        stored.append(best)
         shown |= values[best]
-    return kept
+    return stored
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -105,14 +105,16 @@ def cli(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.
 def refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> Callable[..., str]:
-    """Return what gives a scene's text to `apc export` with words that it refuses, and what it says then."""
+    """Return what gives a topology's text to `apc export` with words that it refuses, and what it says
+    then.
+    """
     from apc.__main__ import run
 
     def export(text: str, *words: str) -> str:
         monkeypatch.chdir(tmp_path)
-        (tmp_path / "scene.yaml").write_text(text, encoding="utf-8")
+        (tmp_path / "topology.yaml").write_text(text, encoding="utf-8")
         assert run(["export", *words]) == 1
-        assert [path.name for path in tmp_path.iterdir()] == ["scene.yaml"]
+        assert [path.name for path in tmp_path.iterdir()] == ["topology.yaml"]
         return capsys.readouterr().err
 
     return export

@@ -1,4 +1,4 @@
-"""Channels of unreliable links, and scenes and packets over them, for tests."""
+"""Channels of unreliable links, and topologies and packets over them, for tests."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ LINK = "  lan: {clock: network, delay: 8 ms}"
 RELIABLE = ChannelLaw(0.0, 1.0, 1.0, 0.0, 0.008, 0.0, "uniform", None)
 BURSTS = replace(RELIABLE, p=0.01, r=0.25)
 STARTS = "[1 mm, 5 mm, -3 mm]"
-APART = ("{count: 3}", f"{{set: {{cube.x: {STARTS}, device.x: {STARTS}}}}}")
+SEPARATE = ("{count: 3}", f"{{set: {{cube.x: {STARTS}, device.x: {STARTS}}}}}")
 
 
 def unreliable(text: str) -> str:
-    """Return the three-users scene with a link that says more."""
+    """Return the three-users topology with a link that says more."""
     return replaced(AVERAGE, (LINK, f"{LINK[:-1]}, {text}}}"))
 
 
 def apart(text: str, more: str = "") -> str:
-    """Return a scene whose users start apart, over a link that says more."""
-    return replaced(text, APART, (LINK, f"{LINK[:-1]}, {more}}}" if more else LINK))
+    """Return a topology whose users start apart, over a link that says more."""
+    return replaced(text, SEPARATE, (LINK, f"{LINK[:-1]}, {more}}}" if more else LINK))
 
 
 def effective(late: Sequence[float], tick: int, *, newest: bool) -> tuple[int, bool]:

@@ -1,4 +1,4 @@
-"""The paper's scene in 60 digits by hand: all eigenvalues at a point, and the stability limit.
+"""The paper's topology in 60 digits by hand: all eigenvalues at a point, and the stability limit.
 
 Three users, forces 1 ms late, packets 8 ms late. A user who hears its own packets times an eigenvalue of the
 graph is all there is: 1 times the mean of the others where all move alike, −1/2 times where they move apart.
@@ -13,11 +13,11 @@ from typing import Any
 
 import flint
 
-from apc.eigen.balls import precision
+from apc.eigen.ball_arithmetic import precision
 
 BITS = 200
 CERTAIN = 1e-40  # so far, and no more, an eigenvalue may be off
-DEVICE, CUBE = Fraction(0.1), Fraction(0.6) / 3  # kg, as a compiled scene holds them
+DEVICE, CUBE = Fraction(0.1), Fraction(0.6) / 3  # kg, as a compiled topology holds them
 DAMPING = 5  # N·s/m of either
 
 

@@ -1,11 +1,11 @@
-"""Peers of the paper's scene that all differ."""
+"""Peers of the paper's topology that all differ."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from apc.compiler.compiled import Model
-from tests.bruteforce import Scene
+from tests.bruteforce import TopologySource
 from tests.topologies import compiled, replaced
 from tests.truths import text_of
 
@@ -20,5 +20,5 @@ def different(peers: int) -> Model:
     ):
         values = (least * (1 + 0.3 * random.random(peers))).tolist()
         columns.append(f"{name}: [{', '.join(f'{value!r} {unit}' for value in values)}]")
-    text = text_of(Scene(peers=peers, kt=400.0, bt=1.0, kc=1000.0, bc=1.0))
+    text = text_of(TopologySource(peers=peers, kt=400.0, bt=1.0, kc=1000.0, bc=1.0))
     return compiled(replaced(text, (f"{{count: {peers}}}", f"{{set: {{{', '.join(columns)}}}}}")))

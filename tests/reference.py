@@ -1,4 +1,5 @@
-"""The paper's scene in numbers, computed apart from this project by brute-force propagation over one frame.
+"""The paper's topology in numbers, computed apart from this project by brute-force propagation over one
+frame.
 
 Devices of 0.1 kg and copies of 0.2 kg, both damped by 5 N·s/m, forces every 1 ms, packets every 8 ms. Delayed
 means by 1 ms for a force and by 8 ms for a packet. "AP" is coordination to the others' mean, "VC" virtual
@@ -11,7 +12,7 @@ OPERATORS = {"AP": "mean", "VC": "sum"}
 
 # (scheme, peers, delayed, spectral radius of one frame without the common translation), at K_T = 800,
 # B_T = 2, K_C = 1500, B_C = 2; right to 1e-8.
-RADII = (
+MIDPOINT_RADIUS = (
     ("AP", 3, True, 0.8982367557),
     ("VC", 3, True, 0.9121448917),
     ("AP", 5, False, 0.8513958715),

@@ -34,12 +34,12 @@ class ByHand:
     """A scheme: force ticks every millisecond, packets every `ratio` of them, `late` and `comp` in ticks.
 
     `bodies` are by peer (mass, damping, springs to the ground). A packet holds the sampled (x, v) of `many`
-    bodies from `told` on, and what the law put out at the tick before. `hears` are by peer those it hears.
+    bodies from `told` on, and what the law put out at the tick before. `receives` are by peer those it hears.
     Where a packet is missing and `zero` is set, a peer hears its own motion in its place.
     """
 
     bodies: Sequence[Sequence[tuple[float, float, float]]]
-    hears: Sequence[Sequence[int]]
+    receives: Sequence[Sequence[int]]
     law: Law
     told: int
     many: int = 1
@@ -56,7 +56,7 @@ class ByHand:
         return [value for body in motion[self.told : self.told + self.many] for value in body]
 
     @property
-    def kept(self) -> int:
+    def stored(self) -> int:
         """How many packets of a peer are kept from before a frame."""
         return -(-self.late // self.ratio) + 1 if isinstance(self.late, int) else 1
 
@@ -86,14 +86,14 @@ def _tick(scheme: ByHand, now: Playing, tick: int) -> None:
             now.packets[i] = [[*scheme.sampled(now.motion[i]), *now.out[i]], *now.packets[i]]
     acting: list[Any] = []
     for i in peers:
-        heard = {}
-        for j in scheme.hears[i]:
+        received = {}
+        for j in scheme.receives[i]:
             number, missing = scheme.counts(j, i, tick)
             packet = now.packets[j][tick // scheme.ratio - number]
             if missing and scheme.zero:
                 packet = scheme.sampled(now.motion[i])
-            heard[j] = [*packet, (tick - number * scheme.ratio) * scheme.period]
-        new, now.memory[i], now.out[i] = scheme.law(i, now.motion[i], heard, now.memory[i])
+            received[j] = [*packet, (tick - number * scheme.ratio) * scheme.period]
+        new, now.memory[i], now.out[i] = scheme.law(i, now.motion[i], received, now.memory[i])
         queue = [list(new), *now.forces[i]]
         acting.append(queue[scheme.comp])
         now.forces[i] = queue[: scheme.comp]
@@ -106,13 +106,13 @@ def _tick(scheme: ByHand, now: Playing, tick: int) -> None:
 
 def frame_matrix(scheme: ByHand) -> NDArray[np.float64]:
     """Return the one-frame matrix of all peers."""
-    kept = scheme.kept
+    stored = scheme.stored
     sizes = [
         2 * len(own)
         + scheme.comp * len(own)
         + scheme.memory
         + scheme.out
-        + kept * (2 * scheme.many + scheme.out)
+        + stored * (2 * scheme.many + scheme.out)
         for own in scheme.bodies
     ]
     rows = iter(np.eye(sum(sizes)))
@@ -122,7 +122,7 @@ def frame_matrix(scheme: ByHand) -> NDArray[np.float64]:
         now.forces.append([[next(rows) for _ in own] for _ in range(scheme.comp)])
         now.memory.append([next(rows) for _ in range(scheme.memory)])
         now.out.append([next(rows) for _ in range(scheme.out)])
-        now.packets.append([[next(rows) for _ in range(2 * scheme.many + scheme.out)] for _ in range(kept)])
+        now.packets.append([[next(rows) for _ in range(2 * scheme.many + scheme.out)] for _ in range(stored)])
     assert next(rows, None) is None
     for tick in range(scheme.ratio):
         _tick(scheme, now, tick)
@@ -130,7 +130,11 @@ def frame_matrix(scheme: ByHand) -> NDArray[np.float64]:
     for i in range(len(scheme.bodies)):
         rows_out += [value for pair in now.motion[i] for value in pair]
         rows_out += [value for one in now.forces[i] for value in one]
-        rows_out += [*now.memory[i], *now.out[i], *(value for one in now.packets[i][:kept] for value in one)]
+        rows_out += [
+            *now.memory[i],
+            *now.out[i],
+            *(value for one in now.packets[i][:stored] for value in one),
+        ]
     return np.array(rows_out)
 
 
@@ -154,7 +158,7 @@ def course(
         forces=[[[0.0] * len(own)] * scheme.comp for own in starts],
         memory=[list(own) for own in memory or [()] * len(starts)],
         out=[silent for _ in starts],
-        packets=[[[*scheme.sampled(own), *silent]] * scheme.kept for own in starts],
+        packets=[[[*scheme.sampled(own), *silent]] * scheme.stored for own in starts],
     )
     for tick in itertools.count():
         yield now
@@ -179,12 +183,12 @@ def experiment(operator: str, ticks: int) -> NDArray[np.float64]:
     """
     pushes, half_width = [-4.0, 2.0, 2.0], 0.02
 
-    def law(i: int, motion: Sequence[tuple[Any, Any]], heard: Any, memory: Any) -> tuple[Any, Any, Any]:
+    def law(i: int, motion: Sequence[tuple[Any, Any]], received: Any, memory: Any) -> tuple[Any, Any, Any]:
         (x, v), (x_o, v_o) = motion
         side = math.copysign(1.0, pushes[i])  # the user at the right pushes to the left
         depth = half_width + side * (x - x_o)
         f_c = side * max(0.0, 3900 * depth + 0.05 * side * (v - v_o)) if depth > 0 else 0.0
-        f_t = sum(2000 * (x_o - packet[0]) + v_o - packet[1] for packet in heard.values())
+        f_t = sum(2000 * (x_o - packet[0]) + v_o - packet[1] for packet in received.values())
         f_t = f_t / 2 if operator == "mean" else f_t
         return [pushes[i] - f_c, f_c - f_t], [f_c, f_t], []
 
@@ -232,6 +236,6 @@ def everybody(peers: int) -> list[list[int]]:
     return [[j for j in range(peers) if j != i] for i in range(peers)]
 
 
-def mean(heard: dict[int, Sequence[Any]], place: int) -> Any:
+def mean(received: dict[int, Sequence[Any]], place: int) -> Any:
     """Return the mean of one channel over those heard."""
-    return sum(packet[place] for packet in heard.values()) / len(heard)
+    return sum(packet[place] for packet in received.values()) / len(received)

@@ -1,4 +1,6 @@
-"""Compiled scenes out of numbers: the paper's, with pairs that look at each other, and one number alone."""
+"""Compiled topologies out of numbers: the paper's, with pairs that look at each other, and one number
+alone.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,7 @@ from typing import Any
 
 from apc.compiler.compiled import Model
 from apc.compiler.components.component_library import Library
-from tests.bruteforce import Scene
+from tests.bruteforce import TopologySource
 from tests.topologies import compiled, replaced
 from tests.truths import text_of
 
@@ -18,14 +20,16 @@ MS = Fraction(1, 1000)
 
 
 def paper(operator: str = "mean", **values: Any) -> Model:
-    """Return the paper's system for equal users, compiled; the values are those of `bruteforce.Scene`."""
-    scene = Scene(operator, **values)
-    return compiled(text_of(scene).replace("topology: stepped", "topology: paper"))
+    """Return the paper's system for equal users, compiled; the values are those of
+    `bruteforce.TopologySource`.
+    """
+    topology = TopologySource(operator, **values)
+    return compiled(text_of(topology).replace("topology: stepped", "topology: paper"))
 
 
 EDGE = """\
 component: Edge
-about: Looks at each other one by itself.
+description: Looks at each other one by itself.
 connectors: {object: Flange}
 sends: {x: sample(object.x), v: sample(der(object.x))}
 parameters:
@@ -46,7 +50,7 @@ equations:
 def edged(operator: str, starts: Sequence[float], *, cubic: float = 0.0, **values: Any) -> Model:
     """Return the paper's system with F_T an operator over K_T d + B_T ḋ + cubic d³, d to each other user."""
     text = replaced(
-        text_of(Scene(peers=len(starts), **values)),
+        text_of(TopologySource(peers=len(starts), **values)),
         ("type: AveragePosition", f"type: Edge, cubic: {cubic!r} N/m^3"),
         (", delays: all", ""),
         (f"{{count: {len(starts)}}}", f"{{set: {{cube.x: [{', '.join(f'{x!r} m' for x in starts)}]}}}}"),
@@ -60,7 +64,7 @@ def alone(rate: str, *ticks: str, variables: str = "", delay: str = "0 s") -> Mo
     """Return one peer without network: 1 s·der(x) = rate; what `ticks` say each millisecond, as `it.x`."""
     clock = ", clock: clock, delay: {unit: s, default: 0 s}" if ticks else ""
     part = (
-        "component: Alone\nabout: A number that moves by itself.\n"
+        "component: Alone\ndescription: A number that moves by itself.\n"
         f"parameters: {{T: {{unit: s, default: 1 s}}{clock}}}\n"
         f"variables: {{x: {{unit: 1, start: 0}}{variables}}}\n"
         f"equations: {[f'T*der(x) = {rate}', *ticks]}\n"

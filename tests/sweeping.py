@@ -1,4 +1,4 @@
-"""A scene whose points are cheap, sweeps of it in processes of their own, and how to kill them."""
+"""A topology whose points are cheap, sweeps of it in processes of their own, and how to kill them."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from apc.compiler import store
 from apc.compiler.cache import Archive, Origin
 from tests.topologies import AVERAGE, ROOT
 
-STAGES = ("source", "language", "components", "scene", "equations", "functions", "view")  # of the compiler
+STAGES = ("source", "language", "components", "topology", "equations", "functions", "view")  # of the compiler
 PAGE = (ROOT / "runtime" / "README.md").read_text(encoding="utf-8")
 # The folders of the runtime, in the order in which its page names them.
 ROOMS = tuple(re.findall(r"`(\w+)`", "".join(re.findall(r"^\| (`.*?) \|", PAGE, re.MULTILINE))))
@@ -134,20 +134,20 @@ def test_what_casadi_reads_is_read_in_one_place_at_most() -> None:
         reading = {name.rpartition(".")[2] for name, one in modules().items() if what in one.calls}
         assert reading == places, what
     with pytest.raises(AssertionError):
-        store.opened(Archive(Origin("scene.yaml"), b"", sealed=False, compiled=True))
+        store.opened(Archive(Origin("topology.yaml"), b"", sealed=False, compiled=True))
 
 
 def test_what_holds_arrays_is_not_compared_by_them() -> None:
     """Two arrays compare entry by entry, and have no truth: such an object is equal to itself alone."""
-    looked, wrong = 0, []
+    evaluations, wrong = 0, []
     for name in modules():
         for one in vars(importlib.import_module(name)).values():
             if inspect.isclass(one) and one.__module__ == name and "__dataclass_fields__" in vars(one):
-                kinds = [str(field.type) for field in dataclasses.fields(one)]
-                if any(re.search(r"\bnp\.ndarray\b|\bNDArray\b", kind) for kind in kinds):
-                    looked += 1
+                peer_types = [str(field.type) for field in dataclasses.fields(one)]
+                if any(re.search(r"\bnp\.ndarray\b|\bNDArray\b", peer_type) for peer_type in peer_types):
+                    evaluations += 1
                     wrong += [f"{name}.{one.__name__}"] if one.__eq__ is not object.__eq__ else []
-    assert looked > 10
+    assert evaluations > 10
     assert not wrong
 
 
@@ -264,14 +264,14 @@ def test_code_in_strings_imports_names_that_exist() -> None:
 @pytest.mark.whole
 def test_a_command_loads_what_it_runs(tmp_path: Path) -> None:
     """Nothing to tell what there is or that nothing has changed; nothing optional to compute."""
-    (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    (tmp_path / "topology.yaml").write_text(AVERAGE, encoding="utf-8")
     begin = "import sys\nimport apc\nfrom apc.__main__ import run\n"
     tell = "\nprint('LOADED', *{one.partition('.')[0] for one in sys.modules})"
 
     def loaded(code: str) -> set[str]:
         return set(python(begin + code + tell, tmp_path).splitlines()[-1].split())
 
-    assert not OPTIONAL & loaded("assert run(['compile']) == run(['analyze', 'scene.apc', '--json']) == 0")
+    assert not OPTIONAL & loaded("assert run(['compile']) == run(['analyze', 'topology.apc', '--json']) == 0")
     unchanged = "assert run(['--help']) == run(['analyze', '--help']) == run(['compile']) == 0"
     assert not (OPTIONAL | HEAVY) & loaded(unchanged)
 

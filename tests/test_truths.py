@@ -1,6 +1,7 @@
-"""Every scene whose truth is known, by every way that answers it: refused in words, or true within its bound.
+"""Every topology whose truth is known, by every way that answers it: refused in words, or true within its
+bound.
 
-A way takes a case and gives what it says of it; a new method is one more line of `WAYS`. Every scene is
+A way takes a case and gives what it says of it; a new method is one more line of `WAYS`. Every topology is
 analysed each time, and by some of the other ways; `pytest --whole` takes all of them.
 """
 
@@ -15,7 +16,7 @@ import pytest
 
 import apc
 from apc.compiler.errors import ApcError
-from tests.bruteforce import Scene
+from tests.bruteforce import TopologySource
 from tests.fifty_digits.truth import spectral_truth
 from tests.reference import CONTACT_LIMITS, HELPED_LIMITS, LIMITS, OPERATORS
 from tests.topologies import compiled
@@ -34,12 +35,12 @@ class Said:
     notes: tuple[str, ...] = ()
 
 
-def _point(name: str, **asked: object) -> Said:
-    one = apc.analyze(model(name), **asked)  # type: ignore[arg-type] # a method or a proof
-    if asked.get("certify"):
+def _point(name: str, **requested: object) -> Said:
+    one = apc.analyze(model(name), **requested)  # type: ignore[arg-type] # a method or a proof
+    if requested.get("certify"):
         # Floats that decided stay where balls do not; of determinants there is no proof.
-        said = ("proved", "decided with") if one.stable is not None else "undecided at"
-        assert str(one.proof).startswith(said) or one.method == "determinant"
+        printed = ("proved", "decided with") if one.stable is not None else "undecided at"
+        assert str(one.proof).startswith(printed) or one.method == "determinant"
     return Said(
         one.spectral_radius, one.spectral_radius_error, one.rigid_modes, one.stable, one.verdict, one.notes
     )
@@ -59,7 +60,7 @@ def _number(name: str) -> tuple[str, float, str]:
 
 def _many(name: str) -> Said:
     parameter, value, _ = _number(name)
-    # Of points side by side some bounds are shared: the first of them is the scene's own.
+    # Of points side by side some bounds are shared: the first of them is the topology's own.
     found = apc.analyze_many(model(name), {parameter: value * np.linspace(1, 1.01, 6)})
     if found.message[0]:
         raise RuntimeError(found.message[0])
@@ -93,13 +94,13 @@ def _export(name: str) -> Said:
     found = apc.export(model(name), to="npz").a
     rigid = truth(name).rigid
     values = np.linalg.eigvals(found)
-    kept = values[np.argsort(np.abs(values - 1))][rigid:]
-    return Said(float(np.abs(kept).max(initial=0.0)), 1e-7, rigid)
+    stored = values[np.argsort(np.abs(values - 1))][rigid:]
+    return Said(float(np.abs(stored).max(initial=0.0)), 1e-7, rigid)
 
 
 def _box(name: str) -> Said:
     parameter, _, _ = _number(name)
-    found = apc.prove_box(model(name), {parameter: "±1e-9%"})
+    found = apc.robust_stability(model(name), {parameter: "±1e-9%"})
     return Said(float(truth(name).radius), 1e-15 * float(truth(name).radius), None, found.stable)
 
 
@@ -151,7 +152,9 @@ LEFT_OUT = {
     ("box", "non-commensurate"),
 }
 
-LONG = {(way, "non-commensurate") for way in ("point", "dense", "many", "sweep", "certify")} | {
+LONG = {
+    (coupling_term, "non-commensurate") for coupling_term in ("point", "dense", "many", "sweep", "certify")
+} | {
     ("point", "ring-of-eight"),
     ("box", "stiff-contact"),
     ("box", "a cycle one way"),
@@ -162,39 +165,44 @@ def _pairs() -> list[object]:
     """Return every case with every way; each case with `point` and a few others is no matter of --whole."""
     found = []
     for place, (name, case) in enumerate(CASES.items()):
-        for column, way in enumerate(WAYS):
-            if (way, case.name) in LEFT_OUT or (case.source == "closed" and way == "paper"):
+        for column, coupling_term in enumerate(WAYS):
+            if (coupling_term, case.name) in LEFT_OUT or (
+                case.source == "closed" and coupling_term == "paper"
+            ):
                 continue
-            ordinary = (way == "point" or (place + column) % 6 == 0) and (way, case.name) not in LONG
+            ordinary = (coupling_term == "point" or (place + column) % 6 == 0) and (
+                coupling_term,
+                case.name,
+            ) not in LONG
             marks = () if ordinary else pytest.mark.whole
-            found.append(pytest.param(name, way, marks=marks, id=f"{name}-{way}"))
+            found.append(pytest.param(name, coupling_term, marks=marks, id=f"{name}-{coupling_term}"))
     return found
 
 
 @pytest.mark.few(70)
-@pytest.mark.parametrize(("name", "way"), _pairs())
-def test_every_way_is_true_within_its_bound_or_refuses_in_words(name: str, way: str) -> None:
+@pytest.mark.parametrize(("name", "coupling_term"), _pairs())
+def test_every_way_is_true_within_its_bound_or_refuses_in_words(name: str, coupling_term: str) -> None:
     case, told = CASES[name], truth(name)
     try:
-        said = WAYS[way](name)
+        printed = WAYS[coupling_term](name)
     except ApcError as error:
-        assert any(words in str(error) for words in REFUSED.get(way, ())), str(error)
+        assert any(words in str(error) for words in REFUSED.get(coupling_term, ())), str(error)
         return
-    wide = WIDE.get(way, {}).get(case.name, USEFUL)
-    error = wide * max(1.0, said.radius) if way == "export" else said.error
-    assert distance(said.radius, told) <= error
-    assert error <= wide * max(1.0, said.radius)
-    assert said.rigid is None or said.rigid == told.rigid
-    if way == "export" or (way == "box" and abs(told.radius - 1) < 1e-8):
+    wide = WIDE.get(coupling_term, {}).get(case.name, USEFUL)
+    error = wide * max(1.0, printed.radius) if coupling_term == "export" else printed.error
+    assert distance(printed.radius, told) <= error
+    assert error <= wide * max(1.0, printed.radius)
+    assert printed.rigid is None or printed.rigid == told.rigid
+    if coupling_term == "export" or (coupling_term == "box" and abs(told.radius - 1) < 1e-8):
         return
-    if said.stable is None:
-        assert case.name in OPEN.get(way, ()) or abs(told.radius - 1) < 1e-30
+    if printed.stable is None:
+        assert case.name in OPEN.get(coupling_term, ()) or abs(told.radius - 1) < 1e-30
     else:
-        assert said.stable == (told.radius < 1 and told.verdict != "drifts")
-        assert not (said.verdict and told.verdict) or said.verdict == told.verdict
+        assert printed.stable == (told.radius < 1 and told.verdict != "drifts")
+        assert not (printed.verdict and told.verdict) or printed.verdict == told.verdict
 
 
-def test_every_scene_of_the_library_is_followed_or_says_why_not() -> None:
+def test_every_topology_of_the_library_is_followed_or_says_why_not() -> None:
     for path in LIBRARY:
         if path.stem in UNTOLD:
             assert UNTOLD[path.stem] in str(spectral_truth(apc.compile(path)))
@@ -206,7 +214,9 @@ def test_every_scene_of_the_library_is_followed_or_says_why_not() -> None:
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """The first value of a parameter at which a scene of the paper is no longer stable, right to `error`."""
+    """The first value of a parameter at which a topology of the paper is no longer stable, right to
+    `error`.
+    """
 
     text: str
     parameter: str
@@ -223,10 +233,10 @@ def _limits() -> dict[str, Limit]:
             words = f"{scheme} {'late' if delayed else 'at once'} {delays} B={damping} K_C={contact}"
             found[words] = Limit(text, "coordination.stiffness", value, 6e-4)
     for damping, value in CONTACT_LIMITS:
-        text = text_of(Scene(kt=0.0, bc=float(damping)))
+        text = text_of(TopologySource(kt=0.0, bc=float(damping)))
         found[f"contact alone B_C={damping}"] = Limit(text, "contact.stiffness", value, 6e-4)
     for late, value in HELPED_LIMITS:
-        text = text_of(Scene(bt=2.0, bc=2.0, kc=2000.0, comm=Fraction(late, 1000)))
+        text = text_of(TopologySource(bt=2.0, bc=2.0, kc=2000.0, comm=Fraction(late, 1000)))
         found[f"{late} ms late"] = Limit(text, "coordination.stiffness", value, 0.5)
     return found
 
@@ -234,7 +244,7 @@ def _limits() -> dict[str, Limit]:
 def _text(scheme: str, *, delayed: bool, own: bool, kc: float, damping: float) -> str:
     delays = {} if delayed else {"comp": Fraction(0), "comm": Fraction(0)}
     gains = {"kc": float(kc), "bt": float(damping), "bc": float(damping)}
-    return text_of(Scene(OPERATORS[scheme], own_delay=own, **gains, **delays))
+    return text_of(TopologySource(OPERATORS[scheme], own_delay=own, **gains, **delays))
 
 
 LIMIT = _limits()
@@ -243,7 +253,7 @@ LIMIT = _limits()
 def _critical(one: Limit) -> float:
     found = apc.critical(compiled(one.text), one.parameter, lower="1 N/m", upper=f"{2 * one.value} N/m")
     first = found.crossings[0]
-    assert first.stable_side == "below" and str(first.proof).startswith("proved") and found.whole
+    assert first.stable_side == "below" and str(first.proof).startswith("proved") and found.complete
     assert first.error <= 1e-12 * first.value
     return first.value
 
@@ -262,7 +272,7 @@ def _curves(one: Limit) -> float:
 def _margin(one: Limit) -> float:
     system = compiled(one.text)
     begin = {one.parameter: f"{one.value / 2} N/m"}
-    rows = {row.parameter: row for row in apc.margins(system, set=begin).rows}
+    rows = {row.parameter: row for row in apc.margins(system, params=begin).rows}
     return rows[one.parameter].value
 
 
@@ -271,17 +281,19 @@ def _both_sides(one: Limit) -> float:
     sides = [one.value - one.error, one.value + one.error]
     found = apc.analyze_many(compiled(one.text), {one.parameter: [0.5 * one.value, *sides]})
     assert found.stable.tolist() == [True, True, False]
-    each = [apc.analyze(compiled(one.text), set={one.parameter: f"{value!r} N/m"}).stable for value in sides]
+    each = [
+        apc.analyze(compiled(one.text), params={one.parameter: f"{value!r} N/m"}).stable for value in sides
+    ]
     assert each == [True, False]
     return one.value
 
 
 def _boxes(one: Limit) -> float:
     below = f"{0.5 * one.value} N/m:{one.value - max(one.error, 1e-3 * one.value)} N/m"
-    proved = apc.prove_box(compiled(one.text), {one.parameter: below}).stable
+    proved = apc.robust_stability(compiled(one.text), {one.parameter: below}).stable
     assert proved or (proved is None and "delays: own" in one.text)
     beyond = f"{0.99 * one.value} N/m:{one.value + one.error} N/m"
-    assert apc.prove_box(compiled(one.text), {one.parameter: beyond}).stable is False
+    assert apc.robust_stability(compiled(one.text), {one.parameter: beyond}).stable is False
     return one.value
 
 
@@ -295,11 +307,11 @@ SEARCHES = {
 
 
 @pytest.mark.few(16)
-@pytest.mark.parametrize("way", SEARCHES)
+@pytest.mark.parametrize("coupling_term", SEARCHES)
 @pytest.mark.parametrize("name", LIMIT)
-def test_a_limit_is_that_of_the_reference(name: str, way: str) -> None:
+def test_a_limit_is_that_of_the_reference(name: str, coupling_term: str) -> None:
     one = LIMIT[name]
-    assert SEARCHES[way](one) == pytest.approx(one.value, abs=one.error)
+    assert SEARCHES[coupling_term](one) == pytest.approx(one.value, abs=one.error)
 
 
 def test_without_damping_the_mesh_holds_exactly_half_of_what_the_average_does() -> None:

@@ -9,26 +9,26 @@ from pathlib import Path
 from apc.compiler.cache import Origin, program_digest
 from apc.compiler.compiled import Model
 from apc.compiler.components.component_library import Library
+from apc.compiler.equations.causalization import SortedSystem, sort
 from apc.compiler.equations.clocks import ClockedSystem, partition
 from apc.compiler.equations.flatten import FlatSystem, flatten
-from apc.compiler.equations.structure import SortedSystem, sort
 from apc.compiler.errors import ApcError
 from apc.compiler.functions.functions import build_functions
 from apc.compiler.pipeline import linear_system
-from apc.compiler.scene.scene import Topology, build_scene
 from apc.compiler.source.source import Source, parse_source
+from apc.compiler.topology.topology import Topology, build_topology
 
 ROOT = Path(__file__).resolve().parents[1]
-SCENES = ROOT / "models" / "scenes"
+TOPOLOGIES = ROOT / "models" / "topologies"
 
 
-def _scene(name: str) -> str:
-    """Return a scene's text without its first line, which is for editors."""
-    return (SCENES / name).read_text(encoding="utf-8").partition("\n")[2]
+def _topology(name: str) -> str:
+    """Return a topology's text without its first line, which is for editors."""
+    return (TOPOLOGIES / name).read_text(encoding="utf-8").partition("\n")[2]
 
 
-AVERAGE = _scene("three-users-average.yaml")
-MESH = _scene("three-users-mesh.yaml")
+AVERAGE = _topology("three-users-average.yaml")
+MESH = _topology("three-users-mesh.yaml")
 
 # One part alone at one peer: what it does is all that happens.
 ONE_MASS = """\
@@ -50,7 +50,7 @@ couplers:
 
 
 def source(text: str) -> Source:
-    return parse_source(text.encode(), file="scene.yaml")
+    return parse_source(text.encode(), file="topology.yaml")
 
 
 @functools.cache
@@ -59,12 +59,12 @@ def built_in() -> Library:
     return Library()
 
 
-def scene(text: str, library: Library | None = None) -> Topology:
-    return build_scene(source(text), library or built_in())
+def topology(text: str, library: Library | None = None) -> Topology:
+    return build_topology(source(text), library or built_in())
 
 
 def flat(text: str, library: Library | None = None) -> FlatSystem:
-    return flatten(scene(text, library))
+    return flatten(topology(text, library))
 
 
 def clocked(text: str, library: Library | None = None) -> ClockedSystem:
@@ -79,8 +79,8 @@ def ordered(text: str, library: Library | None = None) -> SortedSystem:
 def compiled(text: str, library: Library | None = None) -> Model:
     """Compile a text; the same text gives the same model, with all that it keeps."""
     system = ordered(text, library)
-    origin = Origin("scene.yaml", (("scene.yaml", text.encode()),), program_digest())
-    return build_functions(system, origin, linear=linear_system(system.scene))
+    origin = Origin("topology.yaml", (("topology.yaml", text.encode()),), program_digest())
+    return build_functions(system, origin, linear=linear_system(system.topology))
 
 
 def wall(mass: float, damping: float, delay: float, stiffness: float, virtual: float = 0.0) -> Model:

@@ -1,9 +1,10 @@
-"""The scenes whose spectral radius is known, with where the number comes from and what it may be off by.
+"""The topologies whose spectral radius is known, with where the number comes from and what it may be off by.
 
 Takes: nothing. Gives: `Case`, `CASES`, `Truth`; `model`, `truth` of a case, each made once.
 Guarantees: no number here was computed by what it judges. `hard` are the stored fifty digits of tests/hard,
-`library` the scenes that come with apc and `stiff` ones, followed in fifty digits when they are asked for;
-`reference` the numbers of `tests.reference`; `closed` formulas, by hand; `stepped` all peers, one by one.
+`library` the topologies that come with apc and `stiff` ones, followed in fifty digits when they are asked
+for; `reference` the numbers of `tests.reference`; `closed` formulas, by hand; `stepped` all peers, one by
+one.
 Does not: say anything of the modes but the largest (see `many_users/test_bounds.py`).
 """
 
@@ -21,16 +22,16 @@ from typing import Any
 import flint
 
 import apc
-from apc.eigen.balls import precision
-from tests.bruteforce import Scene, as_ball, frame_matrix
+from apc.eigen.ball_arithmetic import precision
+from tests.bruteforce import TopologySource, as_ball, frame_matrix
 from tests.fifty_digits.truth import RIGID, spectral_truth
-from tests.reference import OPERATORS, RADII
+from tests.reference import MIDPOINT_RADIUS, OPERATORS
 from tests.topologies import ONE_MASS, OSCILLATOR, ROOT, compiled
 
 TRANSLATING = "stable up to a common translation"
 STORED: dict[str, dict[str, Any]] = json.loads((ROOT / "tests" / "hard" / "truths.json").read_text("utf-8"))
-LIBRARY = sorted((ROOT / "models" / "scenes").glob("*.yaml")) + sorted(
-    (ROOT / "tests" / "scenes").glob("*.yaml")
+LIBRARY = sorted((ROOT / "models" / "topologies").glob("*.yaml")) + sorted(
+    (ROOT / "tests" / "small_topologies").glob("*.yaml")
 )
 
 # Linearizations of which no truth is to be had event by event, and why; they are played by hand elsewhere.
@@ -56,7 +57,7 @@ class Truth:
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A scene by what makes it, and its truth by what computes that."""
+    """A topology by what makes it, and its truth by what computes that."""
 
     name: str
     source: str
@@ -93,7 +94,7 @@ def _reference(scheme: str, peers: int, delayed: bool, radius: float) -> Case:
     return Case(
         f"{scheme} of {peers}, {'delayed' if delayed else 'at once'}",
         "reference",
-        lambda: compiled(text_of(Scene(OPERATORS[scheme], peers, **gains, **delays))),
+        lambda: compiled(text_of(TopologySource(OPERATORS[scheme], peers, **gains, **delays))),
         lambda: Truth(flint.arb(radius), 1, 1e-8, TRANSLATING),
     )
 
@@ -132,7 +133,7 @@ couplers:
 
 
 CLOSED = [
-    # m dv/dt = −b v over the frame of 1 s of a scene without clocks; a position that nothing holds.
+    # m dv/dt = −b v over the frame of 1 s of a topology without clocks; a position that nothing holds.
     _closed("a damped mass", ONE_MASS, lambda: (-flint.arb(3) / 2).exp(), 1, TRANSLATING),
     _closed(
         "a light one",
@@ -167,54 +168,55 @@ CLOSED = [
 ]
 
 
-def _in_balls(scene: Scene, rigid: int, bits: int) -> Truth:
+def _in_balls(topology: TopologySource, rigid: int, bits: int) -> Truth:
     with precision(bits):
-        rows = frame_matrix(scene, number=as_ball, exp=lambda value: value.exp())
+        rows = frame_matrix(topology, number=as_ball, exp=lambda value: value.exp())
         values = flint.acb_mat([[flint.acb(e.mid()) for e in row] for row in rows]).eig(algorithm="approx")
         values.sort(key=lambda value: float(abs(value - 1).mid()))
         assert all(float(abs(value - 1).mid()) < RIGID for value in values[:rigid])
         return Truth(max((abs(value).mid() for value in values[rigid:]), default=flint.arb(0)), rigid, 1e-20)
 
 
-def text_of(scene: Scene) -> str:
-    """Return the topology of a scene: equal users are one group, others a group each."""
-    each = scene.users or ({},) * scene.peers
-    names = [f"u{i + 1}" for i in range(scene.peers)]
-    alike = not scene.users and not scene.late
-    groups = f"  user: {{count: {scene.peers}}}\n"
-    if not alike:
+def text_of(topology: TopologySource) -> str:
+    """Return the YAML text of a topology: equal users are one group, others a group each."""
+    each = topology.users or ({},) * topology.peers
+    names = [f"u{i + 1}" for i in range(topology.peers)]
+    interchangeable = not topology.users and not topology.late
+    groups = f"  user: {{count: {topology.peers}}}\n"
+    if not interchangeable:
         own = [", ".join(f"{OWN[key]}: {value!r} {UNIT[key]}" for key, value in one.items()) for one in each]
         groups = "".join(
             f"  {name}: {{count: 1, set: {{{one}}}}}\n" for name, one in zip(names, own, strict=True)
         )
-    heard = {
+    received = {
         names[i]: "".join(
-            f"{names[j]}: {_ms(late)}, " for (sender, j), late in scene.late.items() if sender == i
+            f"{names[j]}: {_ms(late)}, " for (sender, j), late in topology.late.items() if sender == i
         )
-        for i, _ in scene.late
+        for i, _ in topology.late
     }
-    pairs = "".join(f"{name}: {{{listed}}}, " for name, listed in heard.items())
-    arcs = "".join(f"[{i + 1}, {j + 1}, {weight!r}], " for (i, j), weight in (scene.weights or {}).items())
-    link = f"clock: network, delay: {_ms(scene.comm)}"
+    pairs = "".join(f"{name}: {{{listed}}}, " for name, listed in received.items())
+    arcs = "".join(f"[{i + 1}, {j + 1}, {weight!r}], " for (i, j), weight in (topology.weights or {}).items())
+    link = f"clock: network, delay: {_ms(topology.comm)}"
     link += f", delays: {{{pairs}}}" if pairs else ""
     link += f", graph: {{arcs: [{arcs}]}}" if arcs else ""
-    kind = {"mean": "AveragePosition", "sum": "FullMesh"}[scene.operator]
+    peer_type = {"mean": "AveragePosition", "sum": "FullMesh"}[topology.operator]
+    which = "own" if topology.own_delay else "all"
     return f"""\
 topology: stepped
 clocks:
-  haptic: {{period: {_ms(scene.haptic)}, phase: {_ms(scene.haptic_phase)}}}
-  network: {{period: {_ms(scene.network)}, phase: {_ms(scene.network_phase)}}}
+  haptic: {{period: {_ms(topology.haptic)}, phase: {_ms(topology.haptic_phase)}}}
+  network: {{period: {_ms(topology.network)}, phase: {_ms(topology.network_phase)}}}
 peers:
 {groups}masses:
-  device: {{mass: {scene.device!r} kg, damping: {scene.device_damping!r} N*s/m}}
-  cube: {{mass: {scene.cube!r} kg, damping: {scene.cube_damping!r} N*s/m}}
+  device: {{mass: {topology.device!r} kg, damping: {topology.device_damping!r} N*s/m}}
+  cube: {{mass: {topology.cube!r} kg, damping: {topology.cube_damping!r} N*s/m}}
 couplers:
   contact:
-    {{type: SampledSpringDamper, a: device, b: cube, stiffness: {scene.kc!r} N/m, damping: {scene.bc!r} N*s/m,
-      clock: haptic, delay: {_ms(scene.contact_delay)}}}
+    {{type: SampledSpringDamper, a: device, b: cube, stiffness: {topology.kc!r} N/m,
+      damping: {topology.bc!r} N*s/m, clock: haptic, delay: {_ms(topology.contact_delay)}}}
   coordination:
-    {{type: {kind}, object: cube, stiffness: {scene.kt!r} N/m, damping: {scene.bt!r} N*s/m,
-      clock: haptic, delay: {_ms(scene.comp)}, link: lan, delays: {"own" if scene.own_delay else "all"}}}
+    {{type: {peer_type}, object: cube, stiffness: {topology.kt!r} N/m, damping: {topology.bt!r} N*s/m,
+      clock: haptic, delay: {_ms(topology.comp)}, link: lan, delays: {which}}}
 links:
   lan: {{{link}}}
 """
@@ -224,14 +226,16 @@ def _ms(time: Fraction) -> str:
     return f"{1000 * time} ms"
 
 
-# What `bruteforce.Scene` calls a user's own numbers, and what a topology does.
+# What `bruteforce.TopologySource` calls a user's own numbers, and what a topology does.
 OWN = {"kc": "contact.stiffness", "cube": "cube.mass", "device": "device.mass"}
 UNIT = {"kc": "N/m", "cube": "kg", "device": "kg"}
 
 
 def _stepped(name: str, *, rigid: int = 1, bits: int = 500, **values: Any) -> Case:
-    scene = Scene(**{"peers": 2, **values})
-    return Case(name, "stepped", lambda: compiled(text_of(scene)), lambda: _in_balls(scene, rigid, bits))
+    topology = TopologySource(**{"peers": 2, **values})
+    return Case(
+        name, "stepped", lambda: compiled(text_of(topology)), lambda: _in_balls(topology, rigid, bits)
+    )
 
 
 MS = Fraction(1, 1000)
@@ -239,7 +243,7 @@ GAINS = {"kt": 800.0, "bt": 2.0, "kc": 1500.0, "bc": 2.0}
 NONE = Fraction(0)
 RING = dict.fromkeys([(i, j) for i in range(4) for j in range(4) if (i - j) % 4 in (1, 3)], 1.0)
 CYCLE = {(0, 1): 0.7, (1, 2): 0.7, (2, 0): 0.7}
-APART = {(0, 1): 2.0, (1, 0): 2.0, (0, 2): -0.5, (3, 2): 1.5, (2, 3): 1.0}
+SEPARATE = {(0, 1): 2.0, (1, 0): 2.0, (0, 2): -0.5, (3, 2): 1.5, (2, 3): 1.0}
 LAMENESS = {"device_damping": 1e-12, "cube_damping": 1e-12}
 
 STEPPED = [
@@ -268,7 +272,7 @@ STEPPED = [
         "different on a ring", peers=4, weights=RING, users=tuple({"device": m / 10} for m in (1, 2, 1.5, 3))
     ),
     _stepped("a ring", peers=4, weights=RING, **{**GAINS, "kt": 300.0}),
-    _stepped("weights of either sign", peers=4, weights=APART, **GAINS),
+    _stepped("weights of either sign", peers=4, weights=SEPARATE, **GAINS),
     _stepped("a cycle one way", peers=3, weights=CYCLE, **GAINS),
     _stepped("pairs with delays of their own", peers=3, late={(0, 1): 12 * MS, (1, 0): 3 * MS}, **GAINS),
     _stepped("nobody hears the third", peers=3, weights={(0, 1): 1.0, (1, 0): 1.0, (0, 2): 1.0}),
@@ -284,7 +288,7 @@ CASES: dict[str, Case] = {
             if path.stem not in UNTOLD
         ),
         *(_followed(name, "stiff", functools.partial(compiled, text)) for name, text in STIFF.items()),
-        *(_reference(*row) for row in RADII),
+        *(_reference(*row) for row in MIDPOINT_RADIUS),
         *CLOSED,
         *STEPPED,
     )
@@ -293,7 +297,7 @@ CASES: dict[str, Case] = {
 
 @functools.cache
 def model(name: str) -> apc.Model:
-    """Return the compiled scene of a case."""
+    """Return the compiled topology of a case."""
     return CASES[name].build()
 
 

@@ -1,1 +1,1 @@
-"""The component library: what a component declares, checked, extended, found."""
+"""The component library: declarations of components, checked, extended, searched."""

@@ -1,6 +1,7 @@
-"""What a component is: its declarations and equations, in its own names.
+"""The definition of a component: its declarations and equations, in local names.
 
-Takes: nothing (data types). Gives: `Component` and its parts.
+Takes: nothing (data types). Gives: `Component` and its parts: `ComponentVariable`, `Connector`,
+`NumberParameter`, `Option`, `Reference`, `SentValue`, `PartBindings`, `Inner`, `Linearized`; `option_test`.
 Guarantees: plain frozen data.
 Does not: read or check text (see `library`).
 """
@@ -40,7 +41,7 @@ RESERVED = frozenset(
 # Symbols of published conditions on virtual walls: stiffness and damping of the wall, damping and Coulomb
 # friction of the device, sampling period, delay of the loop, resolution of the position.
 SYMBOLS = ("K", "B", "b", "c", "T", "t_d", "D")
-# A parameter of one of these roles isn't a number: it names, or describes, something of the scene.
+# A parameter of one of these roles isn't a number: it names, or describes, something of the topology.
 ROLES = (
     "clock",
     "link",
@@ -62,8 +63,8 @@ class ComponentVariable:
     name: str
     unit: Unit
     start: Fraction | None
-    about: str
-    place: SourceLocation
+    description: str
+    location: SourceLocation
     limit: str = ""
 
 
@@ -72,7 +73,7 @@ class Connector:
     """A connector type: potentials are equal where connectors meet, flows sum to zero."""
 
     name: str
-    about: str
+    description: str
     potentials: tuple[ComponentVariable, ...]
     flows: tuple[ComponentVariable, ...]
 
@@ -88,28 +89,28 @@ class NumberParameter:
     unit: Unit
     default: Fraction | None
     minimum: Fraction | None
-    open_minimum: bool
+    exclusive_minimum: bool
     maximum: Fraction | None
     divided: bool
     words: Named[Fraction]
-    about: str
-    place: SourceLocation
+    description: str
+    location: SourceLocation
 
     @property
     def bounds(self) -> Bounds:
-        """Where its values must lie."""
-        return Bounds(self.unit.text, self.unit.scale, self.minimum, self.open_minimum, self.maximum)
+        """The range of valid values."""
+        return Bounds(self.unit.text, self.unit.scale, self.minimum, self.exclusive_minimum, self.maximum)
 
 
 @dataclass(frozen=True, slots=True)
 class Option:
-    """A parameter that is a word, decided when the scene is compiled."""
+    """A parameter that is a word, decided when the topology is compiled."""
 
     name: str
     words: tuple[str, ...]
     default: str | None
-    about: str
-    place: SourceLocation
+    description: str
+    location: SourceLocation
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,8 +119,8 @@ class Reference:
 
     name: str
     role: str
-    about: str
-    place: SourceLocation
+    description: str
+    location: SourceLocation
     unit: Unit | None = None  # of a table's numbers
 
 
@@ -133,13 +134,13 @@ class SentValue:
     name: str
     expression: Expr
     text: str
-    place: SourceLocation
+    location: SourceLocation
     dimension: Dimension
 
 
 @dataclass(frozen=True, slots=True)
 class PartBindings:
-    """What a part's entry says, in the terms of what surrounds it.
+    """The entry of a part, in the names of the enclosing scope.
 
     `described` are the nodes of parameters that describe something (a graph, a table). `connections` join a
     connector to (part, connector); the part "ground" is fixed, an empty part is the component around.
@@ -160,14 +161,15 @@ class Inner:
     name: str
     component: Component
     entry: PartBindings
-    place: SourceLocation
+    location: SourceLocation
 
 
 @dataclass(frozen=True, slots=True)
 class Linearized:
-    """What represents a component in a linear analysis.
+    """The linear representation of a component in a linear analysis.
 
-    Each of `equations` replaces the equation with the same left side. `valid` says for which motions.
+    Each of `equations` replaces the equation with the same left side. `valid` describes the motions it
+    applies to.
     """
 
     equations: tuple[Equation, ...]
@@ -176,18 +178,18 @@ class Linearized:
 
 @dataclass(frozen=True, slots=True)
 class Component:
-    """A component, whole.
+    """A complete component.
 
-    `locals` are names that stand alone on the left of an equation without being declared; they take the
-    dimension of the right-hand side. `passed` are the connectors that belong to an inner part: (connector,
-    inner part, its connector). `grips` are the connectors a hand is joined to where it names none; `peers` is
-    for how many peers it is, 0 for any number.
+    `locals` are undeclared names that are the left side of an equation; they have the dimension of the right
+    side. `passed` are the connectors that belong to an inner part: (connector, inner part, its connector).
+    `grips` are the connectors a hand is joined to where it names none; `peers` is for how many peers it is, 0
+    for any number.
     """
 
     name: str
-    about: str
+    description: str
     source: str
-    place: SourceLocation
+    location: SourceLocation
     connectors: Named[Connector] = ()
     parameters: tuple[Parameter, ...] = ()
     variables: tuple[ComponentVariable, ...] = ()
@@ -216,7 +218,7 @@ class Component:
 
     @property
     def flows(self) -> Iterator[tuple[str, ComponentVariable]]:
-        """The flows of its own connectors, those of inner parts left out, each with its connector."""
+        """The flows of the outer connectors, each with its connector."""
         passed = {connector for connector, _, _ in self.passed}
         return ((name, flow) for name, kind in self.connectors if name not in passed for flow in kind.flows)
 
@@ -230,20 +232,20 @@ class Component:
 
     @property
     def depth(self) -> int:
-        """How deep parts stand inside parts: 1 for a component without any."""
+        """Return the nesting depth of parts: 1 for a component without any."""
         return 1 + max((inner.component.depth for inner in self.inner), default=0)
 
     @property
     def size(self) -> int:
-        """How many parts it makes, itself and those inside parts included."""
+        """The number of parts, including the part itself and inner ones."""
         return 1 + sum(inner.component.size for inner in self.inner)
 
     @property
-    def hears_others(self) -> bool:
+    def receives_from_others(self) -> bool:
         """Whether an equation, here or in an inner part, reads the other peers."""
         read = (names(side) for equation in self.equations for side in (equation.left, equation.right))
-        own = any(name.parts[0] == OTHERS for side in read for name in side)
-        return own or any(inner.component.hears_others for inner in self.inner)
+        local = any(name.parts[0] == OTHERS for side in read for name in side)
+        return local or any(inner.component.receives_from_others for inner in self.inner)
 
 
 Settable = (

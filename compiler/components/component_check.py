@@ -7,7 +7,7 @@ Does not: read text (see `definitions`).
 
 A component is locally balanced in Modelica's sense (Modelica Language Specification 3.6, section 4.8): it
 gives one equation for each of its variables and one for each flow of its connectors; the connections of a
-scene give the rest.
+topology give the rest.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from itertools import count
 from typing import TypeVar
 
 from apc.compiler.components.component import OTHERS, Component, Linearized, Option, SentValue, option_test
-from apc.compiler.errors import Mistakes, SourceLocation, place_in
+from apc.compiler.errors import Mistakes, SourceLocation, location_in
 from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND, Dimension
 from apc.compiler.language.expression import (
     Call,
@@ -44,18 +44,18 @@ from apc.compiler.language.vectors import (
     written_out,
 )
 from apc.compiler.source.reading import brief, fault, unknown
-from apc.compiler.words import counted
+from apc.compiler.wording import counted
 
 TRUE = Call("==", (Literal(Fraction(1)), Literal(Fraction(1))))
 
 Path = tuple[str, ...]  # a name in an equation, between its dots
-Where = Equation | SentValue  # what an expression stands in
+Where = Equation | SentValue  # the context of an expression
 Written = tuple[Expr, Where]
 T = TypeVar("T")
 
 
 class ComponentNames:
-    """Resolves a component's names to dimensions, and finds the locals on the way.
+    """Resolves a component's names to dimensions, and determines its local names.
 
     `dimensions` are those of all names, one for a vector and its entries; `sizes` those of the vectors among
     them and of what is being inferred; None is one that isn't known. `variables` are the names whose values
@@ -74,7 +74,7 @@ class ComponentNames:
         known: dict[Path, Dimension | None] = {
             (word,): p.unit.dimension for p in component.numbers for word, _ in p.words
         }
-        # `others` alone stands for count(others).
+        # `others` alone means count(others).
         known |= computed | {PEERS: DIMENSIONLESS, ("time",): SECOND, (OTHERS,): DIMENSIONLESS}
         for parameter in component.parameters:
             if not isinstance(parameter, Option) and parameter.unit is not None:  # a number or a table
@@ -82,22 +82,22 @@ class ComponentNames:
             elif getattr(parameter, "role", "") == "clock":
                 known[(interval_of(parameter.name),)] = SECOND
         known |= {(OTHERS, send.name): send.dimension for send in component.sends}
-        self.dimensions = {_whole(path): dimension for path, dimension in known.items()}
+        self.dimensions = {_complete(path): dimension for path, dimension in known.items()}
         self.sizes: dict[Path, int | None] = {**sizes_of(known)}
 
     def size_of(self, parts: Path) -> int | None:
-        """Return the size of a name: 0 for a number, None for what is to be inferred."""
+        """Return the size of a name: 0 for a scalar, None if to be inferred."""
         return self.sizes.get(parts, 0)
 
     def completed(self, sends: Collection[SentValue], mistakes: Mistakes) -> Component:
-        """Return the component with its locals and what it sends, checked, its vectors entry by entry.
+        """Return the component with its local names and sends, checked, its vectors expanded by entry.
 
         The dimensions of `sends` are found here.
         """
         locals_, sent, equations = self._infer_locals(sends), list[SentValue](), list[Equation]()
         for send in sends:
             with mistakes:
-                written = written_out(send.expression, self.size_of, send.text, send.place)
+                written = written_out(send.expression, self.size_of, send.text, send.location)
                 dimension = _known(self._dimension(send.expression, send))
                 each = written or (send.expression,)
                 named = entries(send.name, len(each) if len(each) > 1 else 0)
@@ -132,18 +132,18 @@ class ComponentNames:
                 for written in self._checked(equation, mistakes):
                     left = format_expression(written.left)
                     if left in [format_expression(other.left) for other in replaced]:
-                        raise fault("E514", equation.place, f"linearized: {left} is replaced twice")
+                        raise fault("E514", equation.location, f"linearized: {left} is replaced twice")
                     if left not in lefts:
-                        what = f"linearized: no equation of {self.component.name} has {left} on its left"
-                        raise unknown("E514", equation.place, what, left, sorted(lefts))
+                        message = f"linearized: no equation of {self.component.name} has {left} on its left"
+                        raise unknown("E514", equation.location, message, left, sorted(lefts))
                     replaced.append(written)
         return replace(linearized, equations=tuple(replaced))
 
     def _infer_locals(self, sends: Collection[SentValue]) -> list[tuple[str, Dimension]]:
-        """Return the undeclared names that stand alone on the left of an equation, a vector's entry by entry.
+        """Return the undeclared names that are the left side of an equation, a vector's entry by entry.
 
-        What one is may hang on another, on itself, or on what is sent. An unknown name on the right is
-        reported once, by `_checked`.
+        The dimension of one may depend on another, on itself, or on sent values. An unknown name on the right
+        is reported once, by `_checked`.
         """
         undeclared = {
             equation.left.parts: (equation.right, equation)
@@ -157,7 +157,7 @@ class ComponentNames:
         self.dimensions |= dict.fromkeys(waiting)
         self.sizes |= dict.fromkeys(waiting)
         _settle(waiting, self._size, self.sizes)
-        # A size that contradicts itself, or hangs on itself alone, is none.
+        # A size that contradicts itself, or depends only on itself, is undefined.
         self.sizes |= {name: self._size(*written) or 0 for name, written in waiting.items()}
         _settle(waiting, self._inferred, self.dimensions)
         return [
@@ -169,7 +169,7 @@ class ComponentNames:
     def _size(self, expression: Expr, where: Where) -> int | None:
         """Return the size of an expression; 0 of one at fault, which `_checked` reports."""
         with Mistakes():
-            result = written_out(expression, self.size_of, where.text, where.place)
+            result = written_out(expression, self.size_of, where.text, where.location)
             return None if result is None else len(result) if len(result) > 1 else 0
         return 0
 
@@ -190,38 +190,40 @@ class ComponentNames:
         return written_equation(equation, self.size_of)
 
     def _check_reductions(self, expression: Expr, where: Where, mistakes: Mistakes) -> None:
-        """Record a reduction that doesn't run over the other peers, and an age of what is not heard."""
+        """Record a reduction not over the other peers, and an age of a value that is not received."""
         for node in (node for node in walk(expression) if isinstance(node, Call)):
             function, others = node.function, [name for name in names(node) if name.parts[0] == OTHERS]
-            heard = [name for name in others if len(name.parts) > 1]
-            what, expected = function, "others.x in it"
+            received = [name for name in others if len(name.parts) > 1]
+            message, expected = function, "others.x in it"
             hint = "count(others)" if function == "count" else f"{function}(others.x)"
-            if function == "age" and node.arguments[0] not in heard:
+            if function == "age" and node.arguments[0] not in received:
                 sent = next((send.name for send in self.component.sends), "x")
-                shown = format_expression(heard[0]) if heard else f"{OTHERS}.{sent}"
-                what, expected = "age is of one value that is heard of the others, and", f"{shown} in it"
+                shown = format_expression(received[0]) if received else f"{OTHERS}.{sent}"
+                message, expected = "age is of one value that is heard of the others, and", f"{shown} in it"
                 hint = f"age({shown})"
             elif function in ("mean", "sum", "count") and not others:
-                what = f"{function} runs over the other peers and"
+                message = f"{function} runs over the other peers and"
             elif function in ("max", "min") and len(node.arguments) == 1 and not others:
                 expected = "two values, or one of the other peers"
             else:
                 continue
             got = format_expression(node)
-            mistakes.add("E506", _place(where, node), what, expected=expected, got=got, hint=hint)
+            mistakes.add("E506", _location(where, node), message, expected=expected, got=got, hint=hint)
 
     def _check_sent(self, send: SentValue) -> None:
-        """Refuse a send of what is heard: that is known at ticks of the clock, not of the link."""
-        for heard in names(send.expression):
-            if heard.parts[0] == OTHERS:
+        """Refuse sending a received value: it is available at ticks of the clock, not of the link."""
+        for received in names(send.expression):
+            if received.parts[0] == OTHERS:
                 name = next(text for n in count(1) if (text := f"sent{n}",) not in self.dimensions)
-                what = f"{send.name} is sent at ticks of the link, and {format_expression(heard)} is heard at"
+                message = (
+                    f"{send.name} is sent at ticks of the link, and {format_expression(received)} is heard at"
+                )
                 sample = f"{{{send.name}: sample(hold({name}))}}"
                 hint = f"{name} = {send.text} among the equations, and sends: {sample}"
-                raise fault("E505", _place(send, heard), f"{what} those of the clock", hint=hint)
+                raise fault("E505", _location(send, received), f"{message} those of the clock", hint=hint)
 
     def _decided(self, expression: Expr) -> Expr:
-        """Return the expression without what has no dimension: words of options, and clocks to sample at.
+        """Return the expression without items that have no dimension: words of options, and sampling clocks.
 
         Each test of an option becomes a true statement: both branches are checked.
         """
@@ -234,78 +236,83 @@ class ComponentNames:
 
         return transform(expression, decided)
 
-    def dimension_of_held(self, expression: Expr, text: str, place: SourceLocation) -> Dimension | None:
+    def dimension_of_held(self, expression: Expr, text: str, location: SourceLocation) -> Dimension | None:
         """Return the dimension of a checked expression, or None if it is a variable, which has its own."""
         if isinstance(expression, Name) and expression.parts in self.variables:
             return None
-        return _known(dimension_of(self._decided(expression), self._lookup, text, place))
+        return _known(dimension_of(self._decided(expression), self._lookup, text, location))
 
     def _dimension(self, expression: Expr, where: Where) -> Dimension | None:
         """Return the dimension of an expression. Raises ApcError for its names and units."""
         expression, wrong = self._decided(expression), Mistakes()
         self._check_names(expression, where, wrong)
         wrong.raise_if_any()
-        return dimension_of(expression, self._lookup, where.text, where.place)
+        return dimension_of(expression, self._lookup, where.text, where.location)
 
     def _lookup(self, name: Name) -> Dimension | None:
-        return self.dimensions.get(_whole(name.parts))
+        return self.dimensions.get(_complete(name.parts))
 
     def _check_names(self, expression: Expr, where: Where, mistakes: Mistakes) -> None:
-        """Record names that nothing of the component has, and words and tables in the place of numbers."""
-        judged = set[int]()
+        """Record names that the component does not have, and words and tables instead of numbers."""
+        decided = set[int]()
         for node in walk(expression):
             match node:
                 case Call("==" | "!=", (Name((name,)) as left, Name() as right)) if name in self.options:
                     # Else it was decided.
-                    judged |= {left.start, right.start}
+                    decided |= {left.start, right.start}
                     word, words = format_expression(right), self.options[name].words
-                    what, at = f"{name} has no option {brief(word)}", _place(where, right)
-                    mistakes.take(unknown("E206", at, what, word, words))
+                    message, at = f"{name} has no option {brief(word)}", _location(where, right)
+                    mistakes.take(unknown("E206", at, message, word, words))
                 case Call("interpolate", (Name((name,)) as table, _)) if name in self.tables:
-                    judged.add(table.start)
+                    decided.add(table.start)
                 case Call("interpolate", (other, _)):
-                    judged.add(other.start)
+                    decided.add(other.start)
                     got, known = format_expression(other), ", ".join(sorted(self.tables)) or "none"
-                    what, expected = "interpolate", f"the name of a table ({known} in {self.component.name})"
-                    mistakes.add("E325", _place(where, other), what, expected=expected, got=got)
+                    message, expected = (
+                        "interpolate",
+                        f"the name of a table ({known} in {self.component.name})",
+                    )
+                    mistakes.add("E325", _location(where, other), message, expected=expected, got=got)
                 case Call("count" | "age", (Name((name,)) as every,)) if name == OTHERS:
-                    judged.add(every.start)
-                case Name((name,)) if name == OTHERS and node.start not in judged:
-                    heard = (".".join(path) for path in self.dimensions if path[:-1] == (OTHERS,))
-                    what, sent = "a value of the other peers", next(heard, f"count({OTHERS})")
-                    mistakes.add("E506", _place(where, node), what, expected=sent, got=name, hint=sent)
-                case Name((name,)) if name in self.tables and node.start not in judged:
+                    decided.add(every.start)
+                case Name((name,)) if name == OTHERS and node.start not in decided:
+                    received = (".".join(path) for path in self.dimensions if path[:-1] == (OTHERS,))
+                    message, sent = "a value of the other peers", next(received, f"count({OTHERS})")
+                    mistakes.add("E506", _location(where, node), message, expected=sent, got=name, hint=sent)
+                case Name((name,)) if name in self.tables and node.start not in decided:
                     hint = f"interpolate({name}, time)"
-                    mistakes.add("E303", _place(where, node), f"{name} is a table and no number", hint=hint)
-                case Name(parts) if node.start not in judged:
-                    self._check_name(parts, _place(where, node), mistakes)
+                    mistakes.add(
+                        "E303", _location(where, node), f"{name} is a table and no number", hint=hint
+                    )
+                case Name(parts) if node.start not in decided:
+                    self._check_name(parts, _location(where, node), mistakes)
 
-    def _check_name(self, parts: Path, place: SourceLocation, mistakes: Mistakes) -> None:
+    def _check_name(self, parts: Path, location: SourceLocation, mistakes: Mistakes) -> None:
         """Record a name there isn't, or an entry that a vector hasn't got."""
-        whole, index = _whole(parts), whole_and_index(parts[-1])[1]
+        whole, index = _complete(parts), whole_and_index(parts[-1])[1]
         shown, size = ".".join(whole), self.size_of(whole) or 0
         if whole in self.dimensions and index <= size:
             return
         if parts[0] == OTHERS:
-            what = f"{self.component.name} sends nothing called {brief('.'.join(parts[1:]))}"
-            mistakes.add("E303", place, what, hint="sends: {x: sample(object.x)}")
+            message = f"{self.component.name} sends nothing called {brief('.'.join(parts[1:]))}"
+            mistakes.add("E303", location, message, hint="sends: {x: sample(object.x)}")
         elif whole in self.dimensions:
             expected, got, hint = "a vector before the index", f"{shown}, which is a number", shown
             if size:
                 expected, got, hint = f"an index from 1 to {size}", f"{index}", entry(shown, size)
-            mistakes.add("E408", place, entry(shown, index), expected=expected, got=got, hint=hint)
+            mistakes.add("E408", location, entry(shown, index), expected=expected, got=got, hint=hint)
         else:
-            what, known = f"{self.component.name} has no {brief(shown)}", map(".".join, self.dimensions)
-            mistakes.take(unknown("E303", place, what, shown, sorted(known)))
+            message, known = f"{self.component.name} has no {brief(shown)}", map(".".join, self.dimensions)
+            mistakes.take(unknown("E303", location, message, shown, sorted(known)))
 
 
-def _whole(path: Path) -> Path:
+def _complete(path: Path) -> Path:
     """Return the vector that an entry is of; of a number its own path."""
     return (*path[:-1], whole_and_index(path[-1])[0])
 
 
-def _place(where: Where, node: Expr) -> SourceLocation:
-    return place_in(where.place, where.text, node.start)
+def _location(where: Where, node: Expr) -> SourceLocation:
+    return location_in(where.location, where.text, node.start)
 
 
 def _settle(
@@ -315,20 +322,20 @@ def _settle(
 ) -> None:
     """Infer something of each name, which may depend on others: round by round, while any is settled."""
     while True:
-        found = {name: infer(*written) for name, written in waiting.items() if known[name] is None}
-        known |= found
-        if all(value is None for value in found.values()):
+        result = {name: infer(*written) for name, written in waiting.items() if known[name] is None}
+        known |= result
+        if all(value is None for value in result.values()):
             return
 
 
 def _visible_names(component: Component) -> Iterator[tuple[Path, Dimension]]:
-    """Yield what may be named of a component from outside: its variables and its connectors' potentials."""
+    """Yield the names of a component visible from outside: variables and potentials of connectors."""
     yield from (((variable.name,), variable.unit.dimension) for variable in component.variables)
     yield from (((name,), dimension) for name, dimension in component.locals)
     for name, connector in component.connectors:
         yield from (((name, potential.name), potential.unit.dimension) for potential in connector.potentials)
     for inner in component.inner:
-        yield from (((inner.name, *path), its) for path, its in _visible_names(inner.component))
+        yield from (((inner.name, *path), related) for path, related in _visible_names(inner.component))
 
 
 def _known(dimension: Dimension | None) -> Dimension:
@@ -343,6 +350,6 @@ def check_balance(component: Component) -> None:
     unknowns += [f"{name}.{flow.name}" for name, flow in component.flows]
     if len(component.equations) != len(unknowns):
         numbers = f"{counted(len(component.equations), 'equation')} for {counted(len(unknowns), 'unknown')}"
-        what = f"{component.name} is unbalanced: {numbers} ({', '.join(unknowns) or 'none'})"
+        message = f"{component.name} is unbalanced: {numbers} ({', '.join(unknowns) or 'none'})"
         hint = "one equation for each variable and one for each flow of a connector"
-        raise fault("E501", component.place, what, hint=hint)
+        raise fault("E501", component.location, message, hint=hint)

@@ -1,8 +1,8 @@
 """The component library: which definitions there are, each read when it is first asked for.
 
 Takes: folders of YAML files. Gives: `Library`, `definition_of`.
-Guarantees: a file is read at most once, and only if a scene needs it (or it lies in a user's own folder); no
-two files of a user's define one name.
+Guarantees: a file is read at most once, and only if a topology needs it (or it lies in a user's own folder);
+no two files of a user's define one name.
 Does not: read what is in a definition (see `definitions`).
 """
 
@@ -32,15 +32,15 @@ class Library:
     """Hands out components by name, each read and checked when it is first asked for.
 
     A user's component takes the place of the built-in one of its name. In the built-in library a component's
-    file has its name in kebab case, so that a scene reads only the files it needs. A user's file that can't
-    be read is a mistake; with `aside`, one that is put there.
+    file has its name in kebab case, so that a topology reads only the files it needs. A user's file that
+    can't be read is a mistake; with `aside`, one that is put there.
     """
 
     def __init__(self, folders: tuple[Path, ...] = (), aside: list[ApcError] | None = None) -> None:
         self._sources: dict[str, Source] = {}
         self._read: dict[str, Any] = {}  # a component, a connector, or what is wrong with it
         self._open: list[str] = []  # the components being read, each asked for by the one before
-        own: dict[str, Path] = {}
+        local: dict[str, Path] = {}
         for path in (path for folder in folders for path in files_below(folder, SUFFIX)):
             try:
                 source = _read(path)
@@ -50,11 +50,11 @@ class Library:
                 aside.append(error)
                 continue
             if name := definition_of(source)[1]:
-                if own.setdefault(name, path) != path and not same_file(own[name], path):
-                    what = f"{brief(name)} is defined in {own[name]} already"
-                    raise fault("E218", source.root.place, what, hint="another name in one of the two")
+                if local.setdefault(name, path) != path and not same_file(local[name], path):
+                    message = f"{brief(name)} is defined in {local[name]} already"
+                    raise fault("E218", source.root.location, message, hint="another name in one of the two")
                 self._sources[name] = source
-        self.files = builtin_files() | own  # by the name of what each defines
+        self.files = builtin_files() | local  # by the name of what each defines
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -81,17 +81,17 @@ class Library:
         return self._definition(name, "connector", read_connector)
 
     def _definition(self, name: str, kind: str, read: Callable[[Source], T]) -> T | None:
-        """Return what is called so and is of a kind, read once, even if a hundred parts are of it."""
+        """Return the definition of a name and type, read once, even for a hundred parts."""
         if name not in self.files or definition_of(source := self._source(name))[0] != kind:
             return None
         if name not in self._read:
-            what = "components contain or extend"
+            message = "components contain or extend"
             if name in self._open:
                 chain = " → ".join([*self._open[self._open.index(name) :], name])
-                raise fault("E212", source.root.place, f"{what} each other: {chain}")
+                raise fault("E212", source.root.location, f"{message} each other: {chain}")
             if len(self._open) == LONGEST_CHAIN:
-                what += f" one another more than {LONGEST_CHAIN} deep"
-                raise fault("E212", source.root.place, what, hint="fewer of them in one another")
+                message += f" one another more than {LONGEST_CHAIN} deep"
+                raise fault("E212", source.root.location, message, hint="fewer of them in one another")
             self._open.append(name)
             try:
                 self._read[name] = read(source)
@@ -111,22 +111,22 @@ class Library:
 
 
 def _read(path: Path) -> Source:
-    """Read a file of a user's folder; of one that is about something else, no text is told."""
+    """Read a file of a user's folder; of an unrelated file no text is printed."""
     try:
         return read_source(path)
     except ApcError as error:
-        text = b"component"  # why a file is refused tells nothing of what is in it
+        text = b"component"  # the reason contains nothing of the file's text
         with suppress(RefusedError):
             text = read_file(path, MAX_BYTES)
         if b"component" in text or b"connector" in text:
             raise
-        what, expected = "a file of a library", "YAML that defines a component or connector"
-        places = [replace(mistake.place, source_line="") for mistake in error.mistakes]
-        raise ApcError(Diagnostic("E219", place, what, expected) for place in places) from None
+        message, expected = "a file of a library", "YAML that defines a component or connector"
+        locations = [replace(mistake.location, source_line="") for mistake in error.mistakes]
+        raise ApcError(Diagnostic("E219", location, message, expected) for location in locations) from None
 
 
 def definition_of(source: Source) -> tuple[str, str]:
-    """Return what a text defines, a component or connector, and its name; two empty texts if neither."""
+    """Return the type of a definition (component or connector) and its name; two empty texts if neither."""
     if isinstance(source.root, Mapping) and source.root.get("topology") is None:
         for kind in ("component", "connector"):
             node = source.root.get(kind)

@@ -1,7 +1,7 @@
-"""The declarations of a component: equations, what it sends, variables and parameters; YAML to typed data.
+"""The declarations of a component: equations, sends, variables and parameters; YAML to typed data.
 
 Takes: the body of a definition.
-Gives: `read_equations`, `read_sends`, `read_variables`, `read_parameters`.
+Gives: `read_equations`, `read_linearized`, `read_sends`, `read_variables`, `read_parameters`.
 Guarantees: a number is in SI and of its declared unit's dimension; a fault is reported and its item left out;
 a vector is declared as its entries, `x[1]`, `x[2]`.
 Does not: look at how the declarations fit together (see `definitions`).
@@ -35,7 +35,7 @@ from apc.compiler.language.dimensions import DIMENSIONLESS
 from apc.compiler.language.expression import Equation
 from apc.compiler.language.grammar import parse_equation, parse_expression
 from apc.compiler.language.units import Unit, parse_quantity, parse_unit, quantity
-from apc.compiler.language.values import AlreadyReportedError, ScalarValue, text_place
+from apc.compiler.language.values import AlreadyReportedError, ScalarValue, text_location
 from apc.compiler.language.vectors import SIZES
 from apc.compiler.language.vectors import entries as names_of
 from apc.compiler.source.nodes import Mapping as NodeMapping
@@ -53,10 +53,10 @@ from apc.compiler.source.reading import (
     whole_number,
 )
 
-VARIABLE = ("unit", "size", "start", "limit", "about")
-NUMBER = ("unit", "size", "min", "above", "max", "default", "about", "shared", "options")
-OPTION = ("options", "default", "about")
-TABLE = ("table", "about")
+VARIABLE = ("unit", "size", "start", "limit", "description")
+NUMBER = ("unit", "size", "min", "exclusive_min", "max", "default", "description", "shared", "options")
+OPTION = ("options", "default", "description")
+TABLE = ("table", "description")
 _DEFINES = re.compile(r"\A\s*([A-Za-z]\w*)\s*=", re.ASCII)
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\Z", re.ASCII)
 
@@ -69,11 +69,11 @@ def read_equations(root: MappingReader, mistakes: Mistakes) -> tuple[tuple[Equat
     root
         The definition.
     mistakes
-        Takes those of equations, which hide no mistake of the others.
+        Collects the errors of equations, independent of other errors.
 
     Returns
     -------
-    The equations, and the names that stand alone on the left of those that couldn't be read.
+    The equations, and the names that are the left side of unreadable ones.
     """
     equations, undefined = list[Equation](), set[str]()
     for item in root.read("equations", _items, ()):
@@ -81,7 +81,7 @@ def read_equations(root: MappingReader, mistakes: Mistakes) -> tuple[tuple[Equat
             text = text_of(item, "an equation", "- a + b = c")
             defined = _DEFINES.findall(text)
             undefined.update(defined)
-            equations.append(_equation(text, text_place(item)))
+            equations.append(_equation(text, text_location(item)))
             undefined.difference_update(defined)
     return tuple(equations), undefined
 
@@ -94,7 +94,7 @@ def read_linearized(root: MappingReader, mistakes: Mistakes) -> Linearized | Non
     root
         The definition.
     mistakes
-        Takes those of equations.
+        Collects the errors of equations.
     """
     node = root.nodes.get("linearized")
     if node is None:
@@ -108,26 +108,26 @@ def read_linearized(root: MappingReader, mistakes: Mistakes) -> Linearized | Non
     equations = []
     if not items:
         example = "linearized: a = b"
-        mistakes.take(fault("E203", node.place, "linearized", "at least one equation", "none", example))
+        mistakes.take(fault("E203", node.location, "linearized", "at least one equation", "none", example))
     for item in items:
         with mistakes:
             text = text_of(item, "an equation", "linearized: a = b")
-            equations.append(_equation(text, text_place(item)))
+            equations.append(_equation(text, text_location(item)))
     return Linearized(tuple(equations), valid)
 
 
-def _equation(text: str, place: SourceLocation) -> Equation:
+def _equation(text: str, location: SourceLocation) -> Equation:
     """Return an equation whose constants are bounded."""
-    equation = parse_equation(text, place)
+    equation = parse_equation(text, location)
     for side in (equation.left, equation.right):
-        check_constants(side, text, place)
+        check_constants(side, text, location)
     return equation
 
 
-def _items(node: Node, what: str) -> tuple[Node, ...]:
+def _items(node: Node, message: str) -> tuple[Node, ...]:
     if isinstance(node, Sequence):
         return node.items
-    raise fault("E203", node.place, what, "a list", form(node), "equations: [a + b = c]")
+    raise fault("E203", node.location, message, "a list", form(node), "equations: [a + b = c]")
 
 
 def read_sends(root: MappingReader, mistakes: Mistakes) -> tuple[SentValue, ...]:
@@ -136,10 +136,10 @@ def read_sends(root: MappingReader, mistakes: Mistakes) -> tuple[SentValue, ...]
     for key, value in root.section("sends", "{x: sample(object.x)}"):
         with mistakes:
             name = name_of(key, "what is sent")
-            text, place = text_of(value, name, f"{name}: sample(object.x)"), text_place(value)
-            expression = parse_expression(text, place)
-            check_constants(expression, text, place)
-            sends.append(SentValue(name, expression, text, place, DIMENSIONLESS))
+            text, location = text_of(value, name, f"{name}: sample(object.x)"), text_location(value)
+            expression = parse_expression(text, location)
+            check_constants(expression, text, location)
+            sends.append(SentValue(name, expression, text, location, DIMENSIONLESS))
     return tuple(sends)
 
 
@@ -151,10 +151,12 @@ def read_variables(root: MappingReader, section: str = "variables") -> tuple[Com
         meant = value.text if isinstance(value, Scalar) and _is_unit(value.text) else "…"
         node = mapping_of(value, name, f"{name}: {{unit: {meant}}}")
         body = MappingReader(node, VARIABLE, f"variable {name}", root.mistakes)
-        about, limit = body.text("about"), body.text("limit", "limit: force_limit")
+        description, limit = body.text("description"), body.text("limit", "limit: force_limit")
         unit, size = _unit_and_size(body, name)
         starts = _entry_by_entry(body, "start", name, unit, size)
-        return [ComponentVariable(text, unit, start, about, key.place, limit) for text, start in starts]
+        return [
+            ComponentVariable(text, unit, start, description, key.location, limit) for text, start in starts
+        ]
 
     return tuple(chain(*root.each(section, "{x: {unit: m}}", read)))
 
@@ -170,21 +172,21 @@ def read_parameters(root: MappingReader) -> tuple[Parameter, ...]:
 
     def read(key: Scalar, value: Node) -> Several[Parameter]:
         name = name_of(key, "a parameter")
-        what = f"parameter {name}"
+        message = f"parameter {name}"
         if isinstance(value, Scalar):
             if value.text in ROLES:
-                return [Reference(name, value.text, "", value.place)]
+                return [Reference(name, value.text, "", value.location)]
             expected, hint = f"{', '.join(ROLES)}, or a mapping with its unit", "{unit: N/m, min: 0}"
             got = brief(value.text) or "nothing"
-            raise fault("E203", value.place, what, expected, got, f"{name}: {hint}")
-        node = mapping_of(value, what, f"{name}: {{unit: N/m}}")
+            raise fault("E203", value.location, message, expected, got, f"{name}: {hint}")
+        node = mapping_of(value, message, f"{name}: {{unit: N/m}}")
         if (table := node.get("table")) is not None:
-            body = MappingReader(node, TABLE, what, root.mistakes)
+            body = MappingReader(node, TABLE, message, root.mistakes)
             unit = _unit(table, "table", "table: N")
-            return [Reference(name, "table", body.text("about"), node.place, unit)]
+            return [Reference(name, "table", body.text("description"), node.location, unit)]
         if isinstance(options := node.get("options"), Sequence):
-            return [_option(name, options, MappingReader(node, OPTION, what, root.mistakes))]
-        return _numbers(name, MappingReader(node, NUMBER, what, root.mistakes))
+            return [_option(name, options, MappingReader(node, OPTION, message, root.mistakes))]
+        return _numbers(name, MappingReader(node, NUMBER, message, root.mistakes))
 
     return tuple(chain(*root.each("parameters", "{stiffness: {unit: N/m, min: 0}}", read)))
 
@@ -196,35 +198,45 @@ def _option(name: str, options: Sequence, body: MappingReader) -> Option:
             words.append(text_of(item, "an option"))
 
     def known(node: Node, key: str) -> str:
-        return among(text_of(node, key), words, node.place, f"{name} has no option {{}}")
+        return among(text_of(node, key), words, node.location, f"{name} has no option {{}}")
 
-    return Option(name, tuple(words), body.read("default", known, None), body.text("about"), options.place)
+    return Option(
+        name, tuple(words), body.read("default", known, None), body.text("description"), options.location
+    )
 
 
 def _numbers(name: str, body: MappingReader) -> list[NumberParameter]:
     """Read a number's declaration, or a vector's, of which each entry is a number."""
-    about, shared, nodes, mistakes = body.text("about"), body.text("shared"), body.nodes, body.mistakes
+    description, shared, nodes, mistakes = (
+        body.text("description"),
+        body.text("shared"),
+        body.nodes,
+        body.mistakes,
+    )
     if shared not in ("", "divided", "whole"):
-        mistakes.take(fault("E203", nodes["shared"].place, "shared", "divided or whole", brief(shared)))
+        mistakes.take(fault("E203", nodes["shared"].location, "shared", "divided or whole", brief(shared)))
     unit, size = _unit_and_size(body, name)
     minimum, above, most = (
-        body.read(key, lambda node, _: _number(node, name, unit), None) for key in ("min", "above", "max")
+        body.read(key, lambda node, _: _number(node, name, unit), None)
+        for key in ("min", "exclusive_min", "max")
     )
     if size and "options" in nodes:
-        place = nodes["options"].place
-        raise fault("E203", place, name, "a number, to have names for its values", "a vector")
+        location = nodes["options"].location
+        raise fault("E203", location, name, "a number, to have names for its values", "a vector")
     if minimum is not None and above is not None:
-        mistakes.add("E203", nodes["above"].place, name, expected="either min or above", got="both")
+        mistakes.add(
+            "E203", nodes["exclusive_min"].location, name, expected="either min or exclusive_min", got="both"
+        )
     least = minimum if above is None else above
     first, *_ = names_of(name, size)
     model = NumberParameter(
-        first, unit, None, least, above is not None, most, shared == "divided", (), about, body.place
+        first, unit, None, least, above is not None, most, shared == "divided", (), description, body.location
     )
 
-    def check(number: Fraction | None, node: Node | None, what: str) -> None:
+    def check(number: Fraction | None, node: Node | None, subject: str) -> None:
         """Hold a number of the declaration itself against its bounds."""
         if number is not None and node is not None:
-            model.bounds.check(ScalarValue(number, unit.dimension, None, node.place), what, mistakes)
+            model.bounds.check(ScalarValue(number, unit.dimension, None, node.location), subject, mistakes)
 
     check(most, nodes.get("max"), f"the max of {first}")
     words: dict[str, Fraction] = {}
@@ -245,22 +257,22 @@ def _unit_and_size(body: MappingReader, name: str) -> tuple[Unit, int]:
     size = body.read("size", partial(_size, name=name), 0)
     if unit is None and "unit" not in body.nodes:
         hint = f"{name}: {{unit: N/m}}  (unit: 1 when it has none)"
-        raise fault("E201", body.place, f"{name} has no unit", hint=hint)
+        raise fault("E201", body.location, f"{name} has no unit", hint=hint)
     if unit is None:
         raise AlreadyReportedError
     return unit, size
 
 
-def _unit(node: Node, what: str, hint: str = "unit: N/m") -> Unit:
-    return parse_unit(text_of(node, what, hint), node.place)
+def _unit(node: Node, subject: str, hint: str = "unit: N/m") -> Unit:
+    return parse_unit(text_of(node, subject, hint), node.location)
 
 
-def _size(node: Node, what: str, name: str) -> int:
+def _size(node: Node, subject: str, name: str) -> int:
     size = whole_number(node)
     if size in SIZES:
         return size
-    hint = f"{name}: {{unit: m, {what}: 2}}" if size != 1 else f"{name}: {{unit: m}}"
-    raise fault("E203", node.place, f"the {what} of {name}", "2 or 3", form(node), hint)
+    hint = f"{name}: {{unit: m, {subject}: 2}}" if size != 1 else f"{name}: {{unit: m}}"
+    raise fault("E203", node.location, f"the {subject} of {name}", "2 or 3", form(node), hint)
 
 
 def _entry_by_entry(
@@ -282,11 +294,11 @@ def _entry_by_entry(
     return tuple(zip(named, values, strict=True))
 
 
-def _number(node: Node, what: str, unit: Unit, words: Mapping[str, Fraction] | None = None) -> Fraction:
-    """Read a number of a declaration: bare, it is in the unit declared beside it; or a word for one."""
-    text = text_of(node, what)
+def _number(node: Node, subject: str, unit: Unit, words: Mapping[str, Fraction] | None = None) -> Fraction:
+    """Read a number of a declaration: a bare one is in the declared unit; or a word for one."""
+    text = text_of(node, subject)
     if words and text in words:
         return words[text]
     if _NUMBER.match(text):
-        return parse_quantity(text, node.place).value * unit.scale
-    return quantity(text, node.place, what=what, unit=unit.text).value
+        return parse_quantity(text, node.location).value * unit.scale
+    return quantity(text, node.location, subject=subject, unit=unit.text).value

@@ -1,10 +1,10 @@
-"""The entries of parts, in a topology or inside a component, read against the components they are of.
+"""The entries of parts, in a topology or inside a component, checked against their components.
 
-Takes: YAML mappings, the components, and the scope they stand in. Gives: `PartEntry`, `PartEntries`;
-`PartBindings` by `read_entry`.
-Guarantees: every number, word, reference and connection a component asks for is there, or a mistake says so;
-what is missing or faulty is reported once.
-Does not: know the sections of a topology.
+Takes: YAML mappings, the components, and the enclosing scope. Gives: `PartEntry`, `PartEntries`,
+`EntryScope`; `read_entry`, the `PartBindings` of an entry; `Definitions`, `component_named`.
+Guarantees: every number, word, reference and connection required by a component exists, or an error reports
+it, once.
+Does not: handle the sections of a topology.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from apc.compiler.language.values import (
     ValueBinding,
     is_quantity,
     read_binding,
-    text_place,
+    text_location,
 )
 from apc.compiler.language.vectors import by_vector, sizes_of, whole_and_index, written_out
 from apc.compiler.source.nodes import Mapping as MappingNode
@@ -56,7 +56,7 @@ from apc.compiler.source.reading import (
     unknown,
     whole_number,
 )
-from apc.compiler.words import enumerated
+from apc.compiler.wording import enumerated
 
 T = TypeVar("T")
 Item = TypeVar("Item", bound=Settable)
@@ -65,7 +65,7 @@ GROUND = "ground"
 LARGEST_ARRAY = 500
 # Of one peer, those inside parts included: half a minute and 1 GB of compiling.
 MOST_PARTS = 1000
-# The keys of every part of a topology beside its type.
+# The keys of every part of a topology in addition to its type.
 PART_KEYS = (
     "at",
     "shared",
@@ -79,7 +79,7 @@ EXAMPLES = {
     "hands": ("hand", "{type: ConstantForce}", "ConstantForce"),
     "parts": ("tip", "{type: Mass}", "Mass"),
 }
-_FAULTY = MappingNode((), SourceLocation(""))  # stands for an entry of a vector whose fault was reported
+_FAULTY = MappingNode((), SourceLocation(""))  # placeholder for an entry of a vector whose error was reported
 DEFAULT_TYPES = {"masses": "Mass", "links": "Link"}
 # A part, the first and last elements of an array, a connector.
 _TARGET = re.compile(
@@ -89,7 +89,7 @@ _TARGET = re.compile(
 
 
 class Definitions(Protocol):
-    """Where a definition finds the others it names."""
+    """The lookup of other definitions by name."""
 
     @property
     def component_names(self) -> tuple[str, ...]:
@@ -106,14 +106,14 @@ class Definitions(Protocol):
         """Return a connector type, or None if there is no such name."""
 
 
-def component_named(name: str, place: SourceLocation, library: Definitions, hint: str) -> Component:
+def component_named(name: str, location: SourceLocation, library: Definitions, hint: str) -> Component:
     """Return a component that is named at a place. Raises ApcError where there is none, or its mistakes."""
     component = library.component(name)
     if component is not None:
         return component
     if name in library.names:
-        raise fault("E206", place, f"{name} is a connector type, not a component", hint=hint)
-    raise unknown("E206", place, f"there is no component {brief(name)}", name, library.component_names)
+        raise fault("E206", location, f"{name} is a connector type, not a component", hint=hint)
+    raise unknown("E206", location, f"there is no component {brief(name)}", name, library.component_names)
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,17 +124,17 @@ class PartEntry:
     section: str
     body: MappingNode
     component: Component
-    place: SourceLocation
+    location: SourceLocation
     count: int | None
 
     @property
     def words(self) -> set[str]:
-        """What its keys say in a word."""
+        """The meaning of its keys in one word."""
         return {value.text for _, value in self.body.entries if isinstance(value, Scalar)}
 
     def connectors(self, kind: str) -> list[str]:
         """Return its connectors of a type."""
-        return [name for name, its in self.component.connectors if its.name == kind]
+        return [name for name, related in self.component.connectors if related.name == kind]
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,46 +142,46 @@ class PartEntries:
     """The parts of a topology or component, section by section, before their entries are read.
 
     `entries` are those of a known component; `faulty` names parts that are there and can't be read, which
-    was reported. `taken` are names that nothing may have again, None inside a component.
+    was reported. `used` are names that nothing may have again, None inside a component.
     """
 
     library: Definitions
     mistakes: Mistakes
-    taken: set[str] | None = None
+    used: set[str] | None = None
     entries: dict[str, PartEntry] = field(default_factory=dict)
     faulty: set[str] = field(default_factory=set)
 
     def read(self, section: str, root: MappingReader) -> None:
         """Collect the parts of a section and their components, so that names can be resolved."""
         name, example, _ = EXAMPLES[section]
-        what, words = ("a part", ()) if self.taken is None else (f"a part of {section}", RESERVED)
+        subject, words = ("a part", ()) if self.used is None else (f"a part of {section}", RESERVED)
         for key, value in root.section(section, f"{{{name}: {example}}}"):
             if key.text not in self.entries:
                 self.faulty.add(key.text)  # until it has been read
             with self.mistakes:
                 body = mapping_of(value, key.text, f"{key.text}: {example}")
-                name_of(key, what, self.taken or (), "this topology", words)
+                name_of(key, subject, self.used or (), "this topology", words)
                 component = self._component(section, key, body)
                 count = None
                 with self.mistakes:
                     count = _count(key.text, section, body)
-                self.entries[key.text] = PartEntry(key.text, section, body, component, key.place, count)
+                self.entries[key.text] = PartEntry(key.text, section, body, component, key.location, count)
                 self.faulty.discard(key.text)
-                if self.taken is not None:
-                    self.taken.add(key.text)
+                if self.used is not None:
+                    self.used.add(key.text)
 
     def _component(self, section: str, key: Scalar, body: MappingNode) -> Component:
         """Return the component that an entry is of."""
-        node, name, usual = body.get("type"), DEFAULT_TYPES.get(section), EXAMPLES[section][-1]
-        hint = f"type: {usual}"
+        node, name, typical = body.get("type"), DEFAULT_TYPES.get(section), EXAMPLES[section][-1]
+        hint = f"type: {typical}"
         if node is not None:
             name = text_of(node, "type", hint)
         if name is None:
-            hint = hint if section == "parts" else f"type: {self._example(section, body, usual)}"
-            raise fault("E201", key.place, f"{key.text} has no type", hint=hint)
-        return component_named(name, (node or key).place, self.library, hint)
+            hint = hint if section == "parts" else f"type: {self._example(section, body, typical)}"
+            raise fault("E201", key.location, f"{key.text} has no type", hint=hint)
+        return component_named(name, (node or key).location, self.library, hint)
 
-    def _example(self, section: str, body: MappingNode, usual: str) -> str:
+    def _example(self, section: str, body: MappingNode, typical: str) -> str:
         """Return a type to propose for an entry without one: with its keys, and as few others as can be."""
         keys, fitting = {*body.keys()} - {*PART_KEYS}, []
         for name in self.library.component_names:
@@ -190,29 +190,29 @@ class PartEntries:
                     connectors = {connector for connector, _ in component.connectors}
                     known = connectors | {item.name for item in (*component.parameters, *component.variables)}
                     if known >= keys and (section != "hands" or connectors == {"flange"}):
-                        fitting.append((name != usual, len(known), name))
-        return min(fitting, default=(True, 0, usual))[-1]
+                        fitting.append((name != typical, len(known), name))
+        return min(fitting, default=(True, 0, typical))[-1]
 
 
 def _count(name: str, section: str, body: MappingNode) -> int | None:
-    """Return how many of a part there are; None for one that is no array, as a link never is."""
+    """Return the number of elements of an array of parts; None for a single part and for a link."""
     if (node := body.get("count")) is None:
         return None
     count, link = whole_number(node), section == "links"
     if not link and count in range(1, LARGEST_ARRAY + 1):
         return count
     expected = "no count, as a link is one" if link else f"a whole number from 1 to {LARGEST_ARRAY}"
-    raise fault("E208", node.place, f"the count of {name}", expected, form(node))
+    raise fault("E208", node.location, f"the count of {name}", expected, form(node))
 
 
 @dataclass(frozen=True, slots=True)
 class EntryScope:
-    """What an entry can refer to.
+    """The names that an entry can refer to.
 
-    `dimension` and `names` are the names an expression may use; `references` gives the names of a role, for
-    a word, or raises what is wrong with the section that would hold them; `parts` are the parts that can be
-    joined; `whole` is what the entry stands in, in words; `complete` is False when a whole section of parts
-    is missing or faulty and was reported; `outer` is the component around it, if there is one.
+    `dimension` and `names` are the names an expression may use; `references` returns the names of a role, for
+    a word, or raises the error of their section; `parts` are the connectable parts; `whole` is the context of
+    the entry, in words; `complete` is False when a whole section of parts is missing or faulty and was
+    reported; `outer` is the component around it, if there is one.
     """
 
     dimension: Callable[[tuple[str, ...]], Dimension | None]
@@ -232,11 +232,11 @@ def read_entry(entry: PartEntry, scope: EntryScope, mistakes: Mistakes, index: i
     entry
         The entry, and what it is of.
     scope
-        What it can refer to.
+        The names that it can refer to.
     mistakes
-        Where faults go.
+        The collector of errors.
     index
-        Which element of an array this is.
+        The index of the element in its array.
     """
     component, within = entry.component, scope.outer
     # What names something; inside a component, a table is one of the outer's.
@@ -248,20 +248,20 @@ def read_entry(entry: PartEntry, scope: EntryScope, mistakes: Mistakes, index: i
     nodes = MappingReader(entry.body, keys, f"{entry.name} ({component.name})", mistakes).nodes
     numbers: tuple[NumberParameter | ComponentVariable, ...] = (*component.numbers, *starts)
     for name, vector in by_vector(numbers).items():
-        if len(vector) > 1 and name in nodes:  # a key for each entry, x[1], in the place of x: [1 m, 0 m]
+        if len(vector) > 1 and name in nodes:  # a key for each entry, x[1], instead of x: [1 m, 0 m]
             values: tuple[Node, ...] = (_FAULTY,) * len(vector)
             with mistakes:
                 values = _vector(nodes[name], name, vector, scope)
             nodes.update(zip((item.name for item in vector), values, strict=True))
 
     def due(parameter: Parameter) -> str:
-        """Return what to write for a parameter that must be given; nothing of one that may be left out."""
+        """Return the suggested text for a required parameter; empty for an optional one."""
         if isinstance(parameter, Reference):
             texts = scope.references(parameter.role, "") if parameter.role in naming else [""]
             return next(iter(texts), "name")
         if parameter.default is not None:
             return ""
-        return parameter.words[0] if isinstance(parameter, Option) else _one(parameter.unit)
+        return parameter.words[0] if isinstance(parameter, Option) else _single(parameter.unit)
 
     def number(item: NumberParameter | ComponentVariable) -> ValueBinding | None:
         """Return a parameter's number, the default of one that isn't given, or a variable's start value."""
@@ -269,11 +269,11 @@ def read_entry(entry: PartEntry, scope: EntryScope, mistakes: Mistakes, index: i
         if isinstance(item, NumberParameter):
             words = item.words
             if node is None and item.default is not None:
-                return ValueBinding(item.default, None, unit.dimension, entry.place, unit.text)
+                return ValueBinding(item.default, None, unit.dimension, entry.location, unit.text)
         if node is None or node is _FAULTY:
             return None
-        what, pair = (item.name, unit.dimension, unit.text), (scope.dimension, scope.names)
-        return read_binding(node, *what, *pair, words)
+        message, pair = (item.name, unit.dimension, unit.text), (scope.dimension, scope.names)
+        return read_binding(node, *message, *pair, words)
 
     def option(item: Option) -> str | None:
         name, words, node = item.name, item.words, nodes.get(item.name)
@@ -283,7 +283,7 @@ def read_entry(entry: PartEntry, scope: EntryScope, mistakes: Mistakes, index: i
         if word in words:
             return word
         hint = f"{name}: {item.default or words[0]}"
-        raise fault("E206", node.place, name, " or ".join(words), brief(word), hint)
+        raise fault("E206", node.location, name, " or ".join(words), brief(word), hint)
 
     def reference(item: Reference) -> str | None:
         name, role, node = item.name, item.role, nodes.get(item.name)
@@ -294,14 +294,14 @@ def read_entry(entry: PartEntry, scope: EntryScope, mistakes: Mistakes, index: i
         if isinstance(outer, Reference) and item.unit is not None and outer.unit is not None:
             # A table handed on to a part inside: only here do the two units meet.
             if outer.unit.dimension != item.unit.dimension:
-                raise fault("E204", node.place, name, item.unit.text, outer.unit.text)
+                raise fault("E204", node.location, name, item.unit.text, outer.unit.text)
             return word
         missing = f"isn't in {role}s" if within is None else f"is no {role} of {within.name}"
-        what = f"{entry.name} names {role} {{}}, which {missing}"
-        return among(word, scope.references(role, word), node.place, what)
+        message = f"{entry.name} names {role} {{}}, which {missing}"
+        return among(word, scope.references(role, word), node.location, message)
 
     def each(items: Iterable[Item], read: Callable[[Item], T | None]) -> Named[T]:
-        """Return what is read of items by their names, those at fault left out."""
+        """Return the results of reading items by name, invalid ones omitted."""
         pairs = []
         for item in items:
             with mistakes:
@@ -311,13 +311,13 @@ def read_entry(entry: PartEntry, scope: EntryScope, mistakes: Mistakes, index: i
 
     missing = dict[str, str]()
     for name, parameters in by_vector(component.parameters).items():
-        wanted = [due(parameter) for parameter in parameters if parameter.name not in nodes]
-        if any(wanted):
-            missing[name] = wanted[0] if len(wanted) == 1 else f"[{', '.join(wanted)}]"
+        requested = [due(parameter) for parameter in parameters if parameter.name not in nodes]
+        if any(requested):
+            missing[name] = requested[0] if len(requested) == 1 else f"[{', '.join(requested)}]"
     if missing:
         hint = ", ".join(f"{key}: {value}" for key, value in missing.items())
-        what = f"{entry.name} has no {enumerated(tuple(missing))}"
-        mistakes.add("E201", entry.place, what, hint=hint)
+        message = f"{entry.name} has no {enumerated(tuple(missing))}"
+        mistakes.add("E201", entry.location, message, hint=hint)
     references = [parameter for parameter in component.parameters if isinstance(parameter, Reference)]
     described = (reference.name for reference in references if reference.role not in naming)
     connections = []
@@ -325,9 +325,9 @@ def read_entry(entry: PartEntry, scope: EntryScope, mistakes: Mistakes, index: i
         with mistakes:
             if joined := _joined(name, kind.name, nodes.get(name), entry, scope, index):
                 connections.append((name, *joined))
-    targets = [(part, its) for _, part, its in connections if part != GROUND]
+    targets = [(part, related) for _, part, related in connections if part != GROUND]
     if len(targets) > 1 and len(set(targets)) == 1:
-        mistakes.add("E210", entry.place, f"{entry.name} joins {targets[0][0]} to itself")
+        mistakes.add("E210", entry.location, f"{entry.name} joins {targets[0][0]} to itself")
     return PartBindings(
         each(component.numbers, number),
         each((parameter for parameter in component.parameters if isinstance(parameter, Option)), option),
@@ -343,13 +343,13 @@ def _vector(
 ) -> tuple[Node, ...]:
     """Return a node for each entry of a vector, which inside a component may be an expression."""
     if isinstance(node, Scalar) and scope.outer is not None and not is_quantity(node.text):
-        place = text_place(node)
+        location = text_location(node)
         sizes = sizes_of(tuple(name.split(".")) for name in scope.names)
-        tree = parse_expression(node.text, place)
-        result = written_out(tree, lambda parts: sizes.get(parts, 0), node.text, place)
+        tree = parse_expression(node.text, location)
+        result = written_out(tree, lambda parts: sizes.get(parts, 0), node.text, location)
         if result is not None and len(result) == len(vector):
             return tuple(replace(node, text=format_expression(item)) for item in result)
-    return list_of(node, name, len(vector), _one(vector[0].unit))
+    return list_of(node, name, len(vector), _single(vector[0].unit))
 
 
 def _joined(
@@ -365,13 +365,13 @@ def _joined(
             return None
         free = (part for part in parts.values() if part.name not in {name, *entry.words})
         fitting = (part.name for part in free if part.connectors(kind))
-        what = f"{name} does not say what its {connector} is joined to"
+        message = f"{name} does not say what its {connector} is joined to"
         hint = f"{connector}: {next(fitting, GROUND)}"
         for item in parts.values():  # who joins the part without saying which of its connectors is meant
             for key, value in item.body.entries:
                 if isinstance(value, Scalar) and value.text == name and key.text in item.connectors(kind):
                     hint = f"{item.name}: {{{key.text}: {name}.{connector}}}"
-        raise fault("E210", entry.place, what, hint=hint)
+        raise fault("E210", entry.location, message, hint=hint)
     text = text_of(node, connector, f"{connector}: device")
     if text == GROUND:
         return GROUND, ""
@@ -379,16 +379,18 @@ def _joined(
         return "", text
     if (result := _TARGET.match(text)) is None:
         expected = "a part, such as device, device.flange or chain[2]"
-        raise fault("E210", node.place, connector, expected, brief(text))
+        raise fault("E210", node.location, connector, expected, brief(text))
     other, first, last, named = result.groups()
     part = parts.get(other)
     if other in scope.parts.faulty or (part is None and not scope.complete):
         raise AlreadyReportedError
     if part is None:
-        what = f"{name} joins its {connector} to {brief(other)}, which is no part of {scope.whole}"
-        raise unknown("E206", node.place, what, other, [*(part for part in parts if part != name), GROUND])
-    element = _element(part, first, last, entry, index, connector, node.place)
-    return element, _its_connector(part, named, connector, kind, entry.section == "hands", node.place)
+        message = f"{name} joins its {connector} to {brief(other)}, which is no part of {scope.whole}"
+        raise unknown(
+            "E206", node.location, message, other, [*(part for part in parts if part != name), GROUND]
+        )
+    element = _element(part, first, last, entry, index, connector, node.location)
+    return element, _matching_connector(part, named, connector, kind, entry.section == "hands", node.location)
 
 
 def _element(
@@ -401,26 +403,26 @@ def _element(
     at: SourceLocation,
 ) -> str:
     """Return the part that an entry is joined to; of an array from `first` to `last`, the element."""
-    other, size, what, hint = part.name, part.count, "", ""
+    other, size, message, hint = part.name, part.count, "", ""
     if size is None and first is None:
         return other
     low, high = int(first or 1), int(last or first or size or 0)
     if size is None:
-        what, hint = f"{other} is one part, not an array", f"{connector}: {other}"
+        message, hint = f"{other} is one part, not an array", f"{connector}: {other}"
     elif not 1 <= low <= high <= size:
-        what = f"{other} is an array of {size}: its elements are {other}[1] to {other}[{size}]"
+        message = f"{other} is an array of {size}: its elements are {other}[1] to {other}[{size}]"
     elif low == high and first:
         return f"{other}[{low}]"
     elif entry.count == high - low + 1:
         return f"{other}[{low + index - 1}]"
     else:
         mine = "one part" if entry.count is None else f"an array of {entry.count}"
-        what = f"{entry.name} is {mine} and {other}[{low}:{high}] has {high - low + 1} elements"
+        message = f"{entry.name} is {mine} and {other}[{low}:{high}] has {high - low + 1} elements"
         hint = f'{connector}: "{other}[1]"'
-    raise fault("E210", at, what, hint=hint)
+    raise fault("E210", at, message, hint=hint)
 
 
-def _its_connector(
+def _matching_connector(
     part: PartEntry, named: str | None, connector: str, kind: str, by_hand: bool, at: SourceLocation
 ) -> str:
     """Return the connector of another part that is named, or meant where none is."""
@@ -430,13 +432,13 @@ def _its_connector(
         return among(named, fitting, at, f"{shown} has no {kind} called {{}}")
     if len(meant) == 1:
         return meant[0]
-    what, hint = f"{shown} has no connector of type {kind} to join {connector} to", ""
+    message, hint = f"{shown} has no connector of type {kind} to join {connector} to", ""
     if fitting:
-        what = f"{shown} has {len(fitting)} connectors of type {kind}"
+        message = f"{shown} has {len(fitting)} connectors of type {kind}"
         hint = f"{connector}: {part.name}.{fitting[0]}"
-    raise fault("E210", at, what, hint=hint)
+    raise fault("E210", at, message, hint=hint)
 
 
-def _one(unit: Unit) -> str:
+def _single(unit: Unit) -> str:
     """Return a number in a unit, to show in a message."""
     return f"1 {unit.text}".removesuffix(" 1")

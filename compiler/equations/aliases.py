@@ -1,8 +1,8 @@
-"""Alias elimination: equations a = b, a = -b and a = 0 taken out, and what stands for what.
+"""Alias elimination: removal of equations a = b, a = -b and a = 0, and the resulting substitutions.
 
-Takes: residuals, and which of their symbols move. Gives: `Aliases`.
-Guarantees: of two names that mean the same the one to be preferred as a state is kept, and of both one value.
-Does not: look at equations of more than two unknowns.
+Takes: residuals, and the time-varying symbols. Gives: `Aliases`.
+Guarantees: of two aliases the one preferred as a state is kept, with one start value.
+Does not: use equations of more than two unknowns.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from apc.compiler.equations.terms import Term, derivative, symbol
 
 
 class Aliases:
-    """The equations a = b, a = -b and a = 0 between unknowns taken out, and what stands for what.
+    """The eliminated equations a = b, a = -b and a = 0 between unknowns, and the substitutions.
 
     Of two, the one with a start value stays; then the one a component declares, not the connector's:
-    `device.x`, not `device.flange.x`; then the one named first. By der(x) = v, v stands for der(x), so that
-    masses with one position are seen to have one velocity; it is shown by its name.
+    `device.x`, not `device.flange.x`; then the one named first. By der(x) = v, v is an alias of der(x), so
+    that masses with one position have one velocity; it is printed by its name.
     """
 
     def __init__(self, moving: DifferentiatedNames, started: Set[str]) -> None:
         self.moving = moving
         self.names = sorted(moving.variables, key=lambda name: (name not in started, name.count(".")))
-        self.rank = {name: place for place, name in enumerate(self.names)}
+        self.rank = {name: index for index, name in enumerate(self.names)}
         self.stands: dict[str, tuple[int, str, int]] = {}  # name: ± (or 0 times) a derivative of another
         self.velocities: dict[Derivative, str] = {}  # derivatives that have names of their own
 
@@ -40,7 +40,7 @@ class Aliases:
         return result
 
     def value(self, name: str, order: int = 0) -> Term:
-        """Return what a derivative of a variable is, in the variables that stand for themselves."""
+        """Return the derivative of a variable, in the retained variables."""
         sign, name, order = self._meaning(name, order)
         return sign * derivative(name, order)
 
@@ -60,7 +60,7 @@ class Aliases:
         return expression.xreplace(names)
 
     def assignments(self) -> tuple[Assignment, ...]:
-        """Return what each name stands for that isn't shown."""
+        """Return the retained variable of each name that is not printed."""
         values = ((name, self.shown(self.value(name))) for name in self.moving.variables)
         return tuple((name, value) for name, value in values if value is not symbol(name))
 
@@ -78,7 +78,7 @@ class Aliases:
         return left
 
     def _takes(self, expression: Term) -> bool:
-        """Note a = ±b or a = 0, if that is what an equation says, and it may be."""
+        """Record a = ±b or a = 0, if an equation has this form and elimination is allowed."""
         held = self.moving.derivatives(expression)
         parts = [part.as_coeff_Mul() for part in Add.make_args(expression)]
         if len(parts) > 2 or any(name not in held for _, name in parts):
@@ -96,6 +96,6 @@ class Aliases:
     def _meaning(self, name: str, order: int) -> tuple[int, str, int]:
         sign = 1
         while sign and name in self.stands:
-            its, name, more = self.stands[name]
-            sign, order = sign * its, order + more
+            related, name, more = self.stands[name]
+            sign, order = sign * related, order + more
         return sign, name, order

@@ -1,14 +1,15 @@
-"""Equations partitioned by clock: which variables and equations tick together, and with which clock.
+"""Clock partitioning: the variables and equations of each clock.
 
-Takes: `FlatSystem`. Gives: `ClockedSystem`.
-Guarantees: each variable is continuous or belongs to one clock, and so does each equation, or a mistake says
-what would have to cross; each crossing knows its clock.
+Takes: `FlatSystem`. Gives: `partition`, a `ClockedSystem` of `ClockedPeerType`s with a `Partition` per clock;
+`check_single`, for one component.
+Guarantees: each variable is continuous or belongs to one clock, and so does each equation, or an error names
+the missing crossing; each crossing has its clock.
 Does not: solve or sort anything.
 
-Modelica's clock partitioning (Modelica Language Specification 3.6, section 16.7) does the same: variables
-that meet in an equation are merged into sets, which samples, holds, `der` and a part's clock pin down.
+Modelica's clock partitioning (Modelica Language Specification 3.6, section 16.7) does the same: variables of
+one equation are merged into sets, which samples, holds, `der` and a part's clock pin down.
 
-Time, written once. Periods, phases and delays are exact rationals of a second. At an instant t:
+Event order. Periods, phases and delays are exact rationals of a second. At an instant t:
 
 1. continuous variables are sampled: their value at t⁻, before anything below happens;
 2. network clocks tick: each sender's packet takes the sample at t, and packets with an arrival time ≤ t are
@@ -37,11 +38,11 @@ from apc.compiler.equations.flatten import (
     PreviousCrossing,
     ReceiveCrossing,
     SampleCrossing,
-    flatten_alone,
+    flatten_single,
 )
 from apc.compiler.errors import Mistakes, SourceLocation
 from apc.compiler.language.expression import Call, Expr, Name, format_expression, names, transform, walk
-from apc.compiler.scene.scene import Topology
+from apc.compiler.topology.topology import Topology
 
 CONTINUOUS = "continuous"
 
@@ -57,7 +58,7 @@ class Partition:
 
 @dataclass(frozen=True, slots=True)
 class ClockedPeerType:
-    """A kind of peer, partitioned. `partitions` starts with the continuous one."""
+    """A peer type, partitioned. `partitions` starts with the continuous one."""
 
     flat: FlatPeerType
     partitions: tuple[Partition, ...]
@@ -69,40 +70,40 @@ class ClockedPeerType:
 
 @dataclass(frozen=True, slots=True)
 class ClockedSystem:
-    """The scene, partitioned."""
+    """The topology, partitioned."""
 
-    scene: Topology
-    kinds: tuple[ClockedPeerType, ...]
+    topology: Topology
+    peer_types: tuple[ClockedPeerType, ...]
 
 
 def partition(flat: FlatSystem) -> ClockedSystem:
     """Give every variable its clock. Raises ApcError with every crossing that isn't said."""
-    mistakes = Mistakes(flat.scene.names)
-    kinds = tuple(_partitioned(kind, mistakes) for kind in flat.kinds)
+    mistakes = Mistakes(flat.topology.names)
+    peer_types = tuple(_partitioned(peer_type, mistakes) for peer_type in flat.peer_types)
     mistakes.raise_if_any()
-    return ClockedSystem(flat.scene, kinds)
+    return ClockedSystem(flat.topology, peer_types)
 
 
-def check_alone(component: Component, place: SourceLocation, mistakes: Mistakes) -> None:
-    """Record what a component by itself says of clocks that no scene can mend."""
-    flat = flatten_alone(component, place, mistakes)
+def check_single(component: Component, location: SourceLocation, mistakes: Mistakes) -> None:
+    """Record errors of a component's clocks that occur in every topology."""
+    flat = flatten_single(component, location, mistakes)
     if mistakes:
         return
     clocks = _Clocks(flat, mistakes)
     for name, connector in component.connectors:
         for potential, flow in zip(connector.potentials, connector.flows, strict=True):
-            text, other = (f"{component.name}.{name}.{its.name}" for its in (potential, flow))
+            text, other = (f"{component.name}.{name}.{related.name}" for related in (potential, flow))
             if clocks.pinned(text) == CONTINUOUS != clocks.of(other) and other in clocks.given:
                 clocks.report_flow(other, clocks.given[other])
 
 
-def _partitioned(kind: FlatPeerType, mistakes: Mistakes) -> ClockedPeerType:
-    clocks = _Clocks(kind, mistakes)
+def _partitioned(peer_type: FlatPeerType, mistakes: Mistakes) -> ClockedPeerType:
+    clocks = _Clocks(peer_type, mistakes)
     crossings = [
         crossing
         if isinstance(crossing, SampleCrossing)
         else replace(crossing, clock=clocks.of(getattr(crossing, "variable", crossing.symbol)))
-        for crossing in kind.crossings
+        for crossing in peer_type.crossings
     ]
     samples = tuple(crossing for crossing in crossings if isinstance(crossing, SampleCrossing))
     holds = tuple(crossing for crossing in crossings if isinstance(crossing, HoldCrossing))
@@ -111,34 +112,36 @@ def _partitioned(kind: FlatPeerType, mistakes: Mistakes) -> ClockedPeerType:
     for hold in holds:
         if hold.clock == CONTINUOUS:
             call = format_expression(Call("hold", (Name((hold.shown,)), hold.delay)))
-            what = f"{call} holds {hold.shown}, which is continuous already"
+            message = f"{call} holds {hold.shown}, which is continuous already"
             if (given := clocks.given.get(hold.shown)) and (hint := _sampled(given)):
-                what = f"{call} acts from a tick on, so that {hold.shown} samples what moves"
-                mistakes.add("E505", given.place, what, hint=hint)
+                message = f"{call} acts from a tick on, so that {hold.shown} samples what moves"
+                mistakes.add("E505", given.location, message, hint=hint)
             else:
-                mistakes.add("E505", hold.place, what, hint=hold.shown)
+                mistakes.add("E505", hold.location, message, hint=hold.shown)
     for previous_crossing in previous:
         if previous_crossing.clock == CONTINUOUS:
             mistakes.add(
                 "E505",
-                previous_crossing.place,
+                previous_crossing.location,
                 previous_crossing.symbol,
                 expected="a variable that belongs to a clock",
             )
-    for send in kind.sends:
+    for send in peer_type.sends:
         for variable in map(format_expression, names(send.expression)):
-            clocks.check_start(variable, send.place)
+            clocks.check_start(variable, send.location)
             if variable in clocks.variables and (clock := clocks.of(variable)) != CONTINUOUS:
-                what = f"{send.name} is sent at ticks of {send.link}, and {variable} is on clock {clock}"
+                message = f"{send.name} is sent at ticks of {send.link}, and {variable} is on clock {clock}"
                 shown = variable.removeprefix(f"{send.name.rpartition('.')[0]}.")
-                mistakes.add("E505", send.place, what, hint=f"sample(hold({shown}))")
+                mistakes.add("E505", send.location, message, hint=f"sample(hold({shown}))")
     members: dict[str, tuple[list[str], list[FlatEquation]]] = {CONTINUOUS: ([], [])}
-    for index, equation in enumerate(kind.equations):
+    for index, equation in enumerate(peer_type.equations):
         members.setdefault(clocks.of(f"equation {index}"), ([], []))[1].append(equation)
     for variable in clocks.variables:
         members.setdefault(clocks.of(variable), ([], []))[0].append(variable)
-    partitions = tuple(Partition(clock, tuple(its), tuple(of)) for clock, (its, of) in members.items())
-    return ClockedPeerType(kind, partitions, samples, holds, previous, receives)
+    partitions = tuple(
+        Partition(clock, tuple(related), tuple(of)) for clock, (related, of) in members.items()
+    )
+    return ClockedPeerType(peer_type, partitions, samples, holds, previous, receives)
 
 
 # Operators beneath which nothing is sampled once more.
@@ -169,36 +172,36 @@ def _sampled(equation: FlatEquation) -> str:
 
 
 class _Clocks:
-    """The clock of each variable and equation of a kind, by sets of names that must tick together.
+    """The clock of each variable and equation of a peer type, by sets of names with a common clock.
 
-    A clock is a member of its set, by its own name. `given` are the parts' equations, by the name alone on
-    their left side; `variables` say which have a start value.
+    A clock is a member of its set, by its own name. `given` are the parts' equations, by the name on their
+    left side; `variables` are those with a start value.
     """
 
-    def __init__(self, kind: FlatPeerType, mistakes: Mistakes) -> None:
+    def __init__(self, peer_type: FlatPeerType, mistakes: Mistakes) -> None:
         self.mistakes = mistakes
-        self.variables = {variable.name: variable.start for variable in kind.variables}
+        self.variables = {variable.name: variable.start for variable in peer_type.variables}
         self.given: dict[str, FlatEquation] = {}
-        self._crossings = {crossing.symbol: crossing for crossing in kind.crossings}
+        self._crossings = {crossing.symbol: crossing for crossing in peer_type.crossings}
         self._sets = DisjointSet()
-        crossed = (crossing.clock for crossing in kind.crossings if isinstance(crossing, SampleCrossing))
+        crossed = (crossing.clock for crossing in peer_type.crossings if isinstance(crossing, SampleCrossing))
         named = {
             CONTINUOUS,
             *crossed,
-            *(equation.clock for equation in kind.equations if equation.clock is not None),
+            *(equation.clock for equation in peer_type.equations if equation.clock is not None),
         }
         self._clocks = {clock: clock for clock in named}  # of each set that has one, by its root
         self._reported: set[str] = set()  # parts whose clocked flow was reported
-        hearing: dict[str, FlatEquation] = {}
-        for index, equation in enumerate(kind.equations):
+        receiving: dict[str, FlatEquation] = {}
+        for index, equation in enumerate(peer_type.equations):
             if isinstance(equation.left, Name) and equation.origin != CONNECTION:
                 self.given.setdefault(format_expression(equation.left), equation)
             for side in (equation.left, equation.right):
-                self._visit(side, f"equation {index}", equation, hearing)
-        for name, equation in hearing.items():
+                self._visit(side, f"equation {index}", equation, receiving)
+        for name, equation in receiving.items():
             if self.of(name) == CONTINUOUS:
-                what = f"{equation.origin} hears the other peers but has no parameter that names one clock"
-                mistakes.add("E504", equation.place, what, hint="parameters: {clock: clock}")
+                message = f"{equation.origin} hears the other peers but has no parameter that names one clock"
+                mistakes.add("E504", equation.location, message, hint="parameters: {clock: clock}")
 
     def of(self, name: str) -> str:
         """Return the clock of a variable or equation; continuous where nothing asks for a clock."""
@@ -208,28 +211,28 @@ class _Clocks:
         """Return the clock that something asks for, empty if nothing does."""
         return self._clocks.get(self._root(name), "")
 
-    def check_start(self, name: str, place: SourceLocation) -> None:
+    def check_start(self, name: str, location: SourceLocation) -> None:
         """Record a value at the start, or at the tick before, of a variable that has no start value."""
         call, _, variable = name[:-1].partition("(")
         if call in ("initial", "previous") and not self.variables.get(variable, True):
             hint = f"variables: {{{variable.rpartition('.')[2]}: {{unit: …, start: 0}}}}"
-            self.mistakes.add("E507", place, f"{name} needs a start value of {variable}", hint=hint)
+            self.mistakes.add("E507", location, f"{name} needs a start value of {variable}", hint=hint)
 
     def _root(self, name: str) -> str:
         self._sets.add(name)
         return str(self._sets[name])
 
     def _visit(
-        self, expression: Expr, domain: str, equation: FlatEquation, hearing: dict[str, FlatEquation]
+        self, expression: Expr, domain: str, equation: FlatEquation, receiving: dict[str, FlatEquation]
     ) -> None:
-        """Join what stands in an expression with its domain: its equation, or the inside of a sample."""
+        """Merge the names in an expression with its domain: its equation, or the argument of a sample."""
         for node in walk(expression):
             if isinstance(node, Call) and node.function == "der":
                 self._join(domain, CONTINUOUS, format_expression(node), equation)
             if not isinstance(node, Name):
                 continue
             name = ".".join(node.parts)
-            self.check_start(name, equation.place)
+            self.check_start(name, equation.location)
             crossing = self._crossings.get(name)
             if name in self.variables:
                 self._join(domain, name, name, equation)
@@ -240,16 +243,16 @@ class _Clocks:
                     self._join(domain, crossing.clock, name, equation)
                     inside = f"inside {name} of {equation.origin}"
                     self._join(inside, CONTINUOUS, name, equation)
-                    self._visit(crossing.expression, inside, equation, hearing)
+                    self._visit(crossing.expression, inside, equation, receiving)
                 case HoldCrossing():
                     self._join(domain, CONTINUOUS, name, equation)
                 case PreviousCrossing():
                     self._join(domain, crossing.variable, crossing.variable, equation)
                 case ReceiveCrossing():
-                    self._visit(crossing.argument, domain, equation, hearing)
+                    self._visit(crossing.argument, domain, equation, receiving)
                     self._join(domain, name, name, equation)
                     if equation.clock is None:
-                        hearing.setdefault(domain, equation)
+                        receiving.setdefault(domain, equation)
 
     def _join(self, domain: str, name: str, shown: str, equation: FlatEquation) -> None:
         """Merge the sets of a domain and of a name in it, unless they have different clocks."""
@@ -263,7 +266,7 @@ class _Clocks:
         if equation.origin == CONNECTION and others == CONTINUOUS and name in self.given:
             self.report_flow(name, self.given[name])
             return
-        if equation.origin == CONNECTION:  # of what a part's equation takes as it is
+        if equation.origin == CONNECTION:  # of the unsampled names in a part's equation
             sides = {format_expression(side) for side in (equation.left, equation.right)}
             taking = [
                 equation
@@ -274,20 +277,24 @@ class _Clocks:
             taking = [equation] if clock == CONTINUOUS else []
         for other in taking if CONTINUOUS in (clock, others) else ():
             if hint := _sampled(other):
-                what = f"`{other.text}` of {other.origin} is on clock {other.clock}, and samples what moves"
-                self.mistakes.add("E505", other.place, what, hint=hint)
+                message = (
+                    f"`{other.text}` of {other.origin} is on clock {other.clock}, and samples what moves"
+                )
+                self.mistakes.add("E505", other.location, message, hint=hint)
                 return
         hint = f"one clock for both, or sample(hold({name}))"
         if CONTINUOUS in (clock, others):
             hint = f"sample({name})" if clock == CONTINUOUS else f"hold({name})"
         words = [CONTINUOUS if text == CONTINUOUS else f"on clock {text}" for text in (clock, others)]
-        what = f"in `{equation.text}` of {equation.origin}, {name} is {words[0]} and the rest is {words[1]}"
-        self.mistakes.add("E505", equation.place, what, hint=hint)
+        message = (
+            f"in `{equation.text}` of {equation.origin}, {name} is {words[0]} and the rest is {words[1]}"
+        )
+        self.mistakes.add("E505", equation.location, message, hint=hint)
 
     def report_flow(self, name: str, given: FlatEquation) -> None:
-        """Report a part's clocked flow where the part gives it: one of them holds what the others follow."""
+        """Report a part's clocked flow at its equation, with a hold as the fix."""
         if given.origin not in self._reported and given.written is not None:
             self._reported.add(given.origin)
             left, right = format_expression(given.written.left), format_expression(given.written.right)
-            what = f"{name} acts on what it is joined to at all times, and is on clock {self.of(name)}"
-            self.mistakes.add("E505", given.place, what, hint=f"{left} = hold({right})")
+            message = f"{name} acts on what it is joined to at all times, and is on clock {self.of(name)}"
+            self.mistakes.add("E505", given.location, message, hint=f"{left} = hold({right})")

@@ -1,6 +1,6 @@
 """Connectors that meet, and the equations of their meeting.
 
-Takes: the parts of one kind of peer. Gives: `connection_equations`.
+Takes: the parts of one peer type. Gives: `connection_equations`.
 Guarantees: potentials that meet are equal, flows that meet sum to zero; at the ground potentials are zero and
 flows whatever they must be.
 Does not: write out the parts' own equations (see `flatten`).
@@ -14,7 +14,7 @@ from fractions import Fraction
 from apc.compiler.components.parts import GROUND
 from apc.compiler.errors import Mistakes, SourceLocation
 from apc.compiler.language.expression import Call, Expr, Name, NumberLiteral
-from apc.compiler.scene.instances import PartInstance
+from apc.compiler.topology.instances import PartInstance
 
 Terminal = tuple[str, str]  # (part, connector)
 ZERO = NumberLiteral(Fraction(0))
@@ -23,13 +23,13 @@ ZERO = NumberLiteral(Fraction(0))
 def connection_equations(
     parts: Sequence[PartInstance], mistakes: Mistakes
 ) -> Iterator[tuple[Expr, Expr, SourceLocation]]:
-    """Yield the equations (left, right, place) of each set of connectors that meet.
+    """Yield the equations (left, right, place) of each set of connected connectors.
 
-    Each set reads from what is joined to outwards: a mass's connector stands before those joined to it. The
-    ground joins nothing: each set has its own.
+    Each set is ordered outwards: a mass's connector comes before those connected to it. The ground joins
+    nothing: each set has its own.
     """
     by_name = {part.name: part for part in parts}
-    connectors = {(part.name, own): type_ for part in parts for own, type_ in part.component.connectors}
+    connectors = {(part.name, local): type_ for part in parts for local, type_ in part.component.connectors}
     meeting = {terminal: [terminal] for terminal in connectors}
 
     def join(pair: Terminal, other: Terminal) -> None:
@@ -40,28 +40,28 @@ def connection_equations(
 
     passed, grounded = set(), set()
     for part in parts:
-        for connector, inner, its in part.component.passed:
+        for connector, inner, related in part.component.passed:
             passed.add((part.name, connector))
-            join((part.name, connector), (f"{part.name}.{inner}", its))
+            join((part.name, connector), (f"{part.name}.{inner}", related))
     for part in parts:
-        for connector, other, its in part.connections:
+        for connector, other, related in part.connections:
             if other == GROUND:
                 grounded.add((part.name, connector))
             elif other in by_name:
-                join((part.name, connector), (other, its))
+                join((part.name, connector), (other, related))
             else:
-                what = f"{part.name} is at groups where {other}, which it joins, is not"
+                message = f"{part.name} is at groups where {other}, which it joins, is not"
                 hint = f"at: the same groups at both {part.name} and {other}"
-                mistakes.add("E210", part.place, what, hint=hint)
+                mistakes.add("E210", part.location, message, hint=hint)
     for members in {id(members): members for members in meeting.values()}.values():
         joined = [terminal for terminal in members if terminal not in passed]
-        place, type_ = by_name[joined[-1][0]].place, connectors[joined[0]]
+        location, type_ = by_name[joined[-1][0]].location, connectors[joined[0]]
         is_free = grounded.isdisjoint(members)
         for potential in type_.potentials:
             terms = [_name(terminal, potential.name) for terminal in joined]
-            yield from ((name, terms[0] if is_free else ZERO, place) for name in terms[is_free:])
+            yield from ((name, terms[0] if is_free else ZERO, location) for name in terms[is_free:])
         for flow in type_.flows if is_free else ():
-            yield _sum([_name(terminal, flow.name) for terminal in joined]), ZERO, place
+            yield _sum([_name(terminal, flow.name) for terminal in joined]), ZERO, location
 
 
 def _name(terminal: Terminal, variable: str) -> Name:

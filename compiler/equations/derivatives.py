@@ -1,4 +1,4 @@
-"""Which symbols of a term move, and time derivatives of terms.
+"""The time-varying symbols of a term, and time derivatives of terms.
 
 Takes: names of variables, and which values jump. Gives: `Derivative`, `DifferentiatedNames`.
 Guarantees: a derivative that doesn't exist is refused.

@@ -1,8 +1,8 @@
 """A block of linear equations solved by Gaussian elimination with sparse symbolic rows.
 
 Takes: linear forms, and the tests of what may be divided by. Gives: `Elimination`, `eliminate`.
-Guarantees: what is divided by is never zero with the scene's numbers; a long entry gets a name of its own, so
-that a chain of a thousand equations stays as long as it was.
+Guarantees: what is divided by is never zero with the parameter values; a long entry gets a name of its own,
+so that a chain of a thousand equations stays as long as it was.
 Does not: know sizes: numbers come in when a model runs.
 
 The next pivot is one that stays when every parameter that may be zero is, if there is one; of these one of a
@@ -20,9 +20,9 @@ from collections.abc import Iterable, Mapping, Sequence
 import sympy
 from sympy.matrices import dotprodsimp
 
+from apc.compiler.equations.divisor_test import Divisors
 from apc.compiler.equations.solution import Assignment
 from apc.compiler.equations.terms import ONE, ZERO, LinearForm, Symbol, Term, size, symbol
-from apc.compiler.equations.zero_test import Divisors
 
 # An entry with more nodes than this gets a name of its own: substituted into one another, the entries of a
 # chain of a thousand equations would grow without end.
@@ -92,7 +92,7 @@ class Elimination:
         return [(column.name, value / divisor) for column, value in zip(columns, solved, strict=True)]
 
     def solution(self) -> list[Assignment]:
-        """Return what gives each unknown of a pivot, by back substitution."""
+        """Return the solution for each unknown of a pivot, by back substitution."""
         return [
             (unknown.name, -sympy.Add(*(c * u for u, c in row.items() if u is not unknown)) / row[unknown])
             for unknown, row in reversed(self.pivots)
@@ -123,9 +123,9 @@ def eliminate(
     forms
         For each equation the coefficients of the unknowns and the rest; their sum is zero.
     unknowns
-        What to solve for.
+        The unknowns.
     divisors
-        What may be divided by.
+        The test of divisors.
 
     Returns
     -------

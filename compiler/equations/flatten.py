@@ -1,10 +1,12 @@
-"""A scene to equations: per kind of peer, the scalar equations after connection.
+"""Flattening of a topology: per peer type, the scalar equations after connection.
 
-Takes: `Topology`. Gives: `FlatSystem`.
-Guarantees: peers of one structure share one `FlatPeerType`, whatever their numbers and their count; every
-name is whole (`contact.a.x`); potentials that meet are equal, flows that meet sum to zero; options are
-decided; a value crosses between what is continuous, clocks and peers only through a named crossing.
-Does not: put a number in the place of a parameter, or find out what belongs to which clock (see `clocks`).
+Takes: `Topology`. Gives: `flatten`, a `FlatSystem`; `flatten_single`, for one component. `FlatPeerType`,
+`FlatVariable`, `FlatEquation`, `FlatSend`; `SampleCrossing`, `HoldCrossing`, `PreviousCrossing`,
+`ReceiveCrossing`.
+Guarantees: peers of one structure share one `FlatPeerType`, independent of parameter values and counts. Names
+are qualified (`contact.a.x`). Connected potentials are equal, connected flows sum to zero. Options are
+resolved. Values cross between continuous time, clocks and peers only through a named crossing.
+Does not: substitute parameter values, or assign clocks (see `clocks`).
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ from apc.compiler.components.component import (
 )
 from apc.compiler.components.component_check import TRUE, ComponentNames
 from apc.compiler.equations.connections import ZERO, connection_equations
-from apc.compiler.errors import Mistakes, SourceLocation, place_in
+from apc.compiler.errors import Mistakes, SourceLocation, location_in
 from apc.compiler.language.dimensions import Dimension
 from apc.compiler.language.expression import (
     INTERVAL,
@@ -44,21 +46,21 @@ from apc.compiler.language.expression import (
     walk,
 )
 from apc.compiler.language.values import ScalarValue
-from apc.compiler.scene.groups import SceneGroup
-from apc.compiler.scene.instances import PartInstance
-from apc.compiler.scene.scene import Topology
+from apc.compiler.topology.groups import GroupDeclaration
+from apc.compiler.topology.instances import PartInstance
+from apc.compiler.topology.topology import Topology
 
-HEARD_AGE = f"{OTHERS}.age"  # in what a reduction runs over; no send has this name, as a part's stands before
+RECEIVED_AGE = f"{OTHERS}.age"  # argument of a reduction; no send has this name: sends are qualified
 CONNECTION = "connection"  # where an equation comes from that is no part's
 
-# The functions whose value hangs on those of their arguments at the same moment, and on nothing else.
+# The functions that depend only on the present values of their arguments.
 POINTWISE = frozenset(("max", "min", "abs", "sign", "sqrt", "floor", "atan2", *SMOOTH, *LEVELS))
 REDUCTIONS = ("mean", "sum", "max", "min", "count")
 
 
 @dataclass(frozen=True, slots=True)
 class FlatVariable:
-    """A scalar unknown of one site; `declared` is a component's declaration of it, if there is one."""
+    """A scalar unknown of one subsystem; `declared` is a component's declaration of it, if there is one."""
 
     name: str
     dimension: Dimension
@@ -86,7 +88,7 @@ class FlatEquation:
     right: Expr
     origin: str
     clock: str | None
-    place: SourceLocation
+    location: SourceLocation
     written: Equation | None = None
 
     @property
@@ -97,18 +99,18 @@ class FlatEquation:
 
 @dataclass(frozen=True, slots=True)
 class FlatSend:
-    """What a part sends to the other peers over a link, sampled at the ticks of the link's clock."""
+    """A part's sent values over a link, sampled at the ticks of the link's clock."""
 
     name: str
     link: str
     expression: Expr
     dimension: Dimension
-    place: SourceLocation
+    location: SourceLocation
 
 
 @dataclass(frozen=True, slots=True)
 class SampleCrossing:
-    """`symbol` stands in a clocked equation for a continuous expression, taken at t⁻ of the clock's tick."""
+    """`symbol` represents, in a clocked equation, a continuous expression at t⁻ of the clock's tick."""
 
     symbol: str
     clock: str
@@ -117,42 +119,43 @@ class SampleCrossing:
 
 @dataclass(frozen=True, slots=True)
 class HoldCrossing:
-    """`symbol` stands in a continuous equation for a clocked variable, held from its tick + `delay` on.
+    """`symbol` represents, in a continuous equation, a clocked variable, held from its tick + `delay` on.
 
-    `shown` is what is held, as text; `clock` is empty until the variable's is known.
+    `shown` is the held expression as text; `clock` is empty until determined.
     """
 
     symbol: str
     variable: str
     delay: Expr
     shown: str
-    place: SourceLocation
+    location: SourceLocation
     clock: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class PreviousCrossing:
-    """`symbol` stands for a clocked variable's value at the previous tick of its clock."""
+    """`symbol` represents a clocked variable's value at the previous tick of its clock."""
 
     symbol: str
     variable: str
-    place: SourceLocation
+    location: SourceLocation
     clock: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class ReceiveCrossing:
-    """`symbol` stands, at a tick, for a reduction over the other peers that are heard over `link`.
+    """`symbol` represents, at a tick, a reduction over the other peers received over `link`.
 
-    It runs over the value that `argument` has for each of them, in which the names `others.…` are what that
-    peer sent, `previous(others.…)` what was heard of it a tick before, and `HEARD_AGE` its packet's age.
+    It runs over the value that `argument` has for each of them, in which the names `others.…` are the values
+    sent by that peer, `previous(others.…)` those received at the previous tick, and `RECEIVED_AGE` its
+    packet's age.
     """
 
     symbol: str
     operator: str
     argument: Expr
     link: str
-    place: SourceLocation
+    location: SourceLocation
     clock: str = ""
 
 
@@ -178,77 +181,87 @@ class FlatPeerType:
 
 @dataclass(frozen=True, slots=True)
 class FlatSystem:
-    """The scene as equations; every group of peers belongs to one kind."""
+    """The topology as equations; every group of peers belongs to one peer type."""
 
-    scene: Topology
-    kinds: tuple[FlatPeerType, ...]
+    topology: Topology
+    peer_types: tuple[FlatPeerType, ...]
 
 
-def flatten(scene: Topology, *, linear: bool = False) -> FlatSystem:
-    """Write out the equations of every kind; `linear` those of a linear analysis.
+def flatten(topology: Topology, *, linear: bool = False) -> FlatSystem:
+    """Write the equations of every peer type; `linear` those of a linear analysis.
 
-    Raises ApcError with every mistake found on the way.
+    Raises ApcError with all errors found.
     """
-    mistakes = Mistakes(scene.names)
-    structures: dict[object, list[SceneGroup]] = {}
-    for group in scene.groups:
-        present = tuple((part.name, part.component.name) for part in scene.parts if group.name in part.groups)
+    mistakes = Mistakes(topology.names)
+    structures: dict[object, list[GroupDeclaration]] = {}
+    for group in topology.groups:
+        present = tuple(
+            (part.name, part.component.name) for part in topology.parts if group.name in part.groups
+        )
         structures.setdefault((present, tuple(sorted(group.words))), []).append(group)
-    kinds = []
+    peer_types = []
     for groups in structures.values():
         first = groups[0]
-        parts = [_with_words(part, dict(first.words)) for part in scene.parts if first.name in part.groups]
-        kind = _flat_kind("", parts, mistakes, linear=linear)
+        parts = [_with_words(part, dict(first.words)) for part in topology.parts if first.name in part.groups]
+        peer_type = _flat_peer_type("", parts, mistakes, linear=linear)
         joints = connection_equations(parts, mistakes)
-        equations = (FlatEquation(left, right, CONNECTION, None, place) for left, right, place in joints)
-        kind = replace(kind, equations=(*kind.equations, *equations))
-        delays = _delay_names(kind)
-        # The schedule is a kind's: a group that sets a delay can have it changed without the others'.
+        equations = (
+            FlatEquation(left, right, CONNECTION, None, location) for left, right, location in joints
+        )
+        peer_type = replace(peer_type, equations=(*peer_type.equations, *equations))
+        delays = _delay_names(peer_type)
+        # The schedule is a peer type's: a group that sets a delay can have it changed without the others'.
         sharing: dict[str, tuple[list[str], Named[ScalarValue]]] = {}
         for group in groups:
             for name in delays.intersection(name for name, _ in group.columns):
-                what = f"{name} can't differ from peer to peer within a group"
-                mistakes.add("E211", group.place, what, hint="a group of its own for each delay")
+                message = f"{name} can't differ from peer to peer within a group"
+                mistakes.add("E211", group.location, message, hint="a group of its own for each delay")
             pairs = tuple(setting for setting in group.values if setting[0] in delays)
             sharing.setdefault(group.name if pairs else "", ([], pairs))[0].append(group.name)
         for members, pairs in sharing.values():
-            kinds.append(replace(kind, name=" and ".join(members), groups=tuple(members), delays=pairs))
+            peer_types.append(
+                replace(peer_type, name=" and ".join(members), groups=tuple(members), delays=pairs)
+            )
     mistakes.raise_if_any()
-    return FlatSystem(scene, tuple(kinds))
+    return FlatSystem(topology, tuple(peer_types))
 
 
-def _delay_names(kind: FlatPeerType) -> set[str]:
+def _delay_names(peer_type: FlatPeerType) -> set[str]:
     """Return the numbers of parts that a hold's delay is or depends on: of the schedule, not of equations."""
-    delays = [crossing.delay for crossing in kind.crossings if isinstance(crossing, HoldCrossing)]
+    delays = [crossing.delay for crossing in peer_type.crossings if isinstance(crossing, HoldCrossing)]
     texts = {format_expression(name) for delay in delays for name in names(delay)}
-    for part in reversed(kind.parts):  # what an inner part's number depends on is a number of an outer part
+    for part in reversed(
+        peer_type.parts
+    ):  # what an inner part's number depends on is a number of an outer part
         for name, value in part.values:
             if f"{part.name}.{name}" in texts and value.expression is not None:
                 texts.update(map(format_expression, names(value.expression)))
     return texts
 
 
-def flatten_alone(component: Component, place: SourceLocation, mistakes: Mistakes) -> FlatPeerType:
-    """Write out a component by itself: a clock or link has the name it has there, an option its first word.
+def flatten_single(component: Component, location: SourceLocation, mistakes: Mistakes) -> FlatPeerType:
+    """Write the equations of a component: clocks and links by local names, options by their first word.
 
-    What parts inside give is not written.
+    Equations of inner parts are omitted.
     """
     options = tuple((p.name, p.words[0]) for p in component.parameters if isinstance(p, Option))
     references = tuple((p.name, p.name) for p in component.parameters if isinstance(p, Reference))
-    part = PartInstance(component.name, "", component, (), options, references, (), (), (), False, (), place)
-    return _flat_kind(component.name, [part], mistakes)
+    part = PartInstance(
+        component.name, "", component, (), options, references, (), (), (), False, (), location
+    )
+    return _flat_peer_type(component.name, [part], mistakes)
 
 
 def _with_words(part: PartInstance, words: Mapping[str, str]) -> PartInstance:
     """Return a part with the options, clocks and links that a group of peers sets for itself."""
 
-    def own(named: Named[str]) -> Named[str]:
+    def declared(named: Named[str]) -> Named[str]:
         return tuple((name, words.get(f"{part.name}.{name}", word)) for name, word in named)
 
-    return replace(part, options=own(part.options), references=own(part.references))
+    return replace(part, options=declared(part.options), references=declared(part.references))
 
 
-def _flat_kind(
+def _flat_peer_type(
     name: str, parts: Sequence[PartInstance], mistakes: Mistakes, *, linear: bool = False
 ) -> FlatPeerType:
     """Write out parts, without their connections."""
@@ -258,7 +271,7 @@ def _flat_kind(
     crossings: dict[str, Crossing] = {}
     for part in parts:
         writer, component = _PartWriter(part, crossings, mistakes), part.component
-        own: list[tuple[str, Dimension, ComponentVariable | None]] = [
+        declared: list[tuple[str, Dimension, ComponentVariable | None]] = [
             *((variable.name, variable.unit.dimension, variable) for variable in component.variables),
             *((local, dimension, None) for local, dimension in component.locals),
             *(
@@ -268,18 +281,20 @@ def _flat_kind(
                 for variable in (*type_.potentials, *type_.flows)
             ),
         ]
-        variables += [FlatVariable(f"{part.name}.{its}", unit, variable) for its, unit, variable in own]
+        variables += [
+            FlatVariable(f"{part.name}.{related}", unit, variable) for related, unit, variable in declared
+        ]
         for equation in component.linear_equations if linear else component.equations:
             left, right = (writer.written(item, equation) for item in (equation.left, equation.right))
-            equations.append(FlatEquation(left, right, part.name, writer.clock, equation.place, equation))
+            equations.append(FlatEquation(left, right, part.name, writer.clock, equation.location, equation))
         for send in component.sends:
             if writer.link is None:
-                what = f"{component.name} sends {send.name} but has no parameter that names one link"
-                mistakes.add("E504", send.place, what, hint="parameters: {link: link}")
+                message = f"{component.name} sends {send.name} but has no parameter that names one link"
+                mistakes.add("E504", send.location, message, hint="parameters: {link: link}")
                 continue
             expression = writer.written(transform(send.expression, _unsampled), send)
             whole = f"{part.name}.{send.name}"
-            sends.append(FlatSend(whole, writer.link, expression, send.dimension, send.place))
+            sends.append(FlatSend(whole, writer.link, expression, send.dimension, send.location))
         variables += [variable for variable, _ in writer.held]
         equations += [equation for _, equation in writer.held]
     unknowns, listed = tuple(variables), tuple(crossings.values())
@@ -287,7 +302,7 @@ def _flat_kind(
 
 
 def _unsampled(node: Expr) -> Expr | None:
-    """Take the samples off what is sent: it is evaluated at the link's tick as a whole."""
+    """Remove the samples from a send: it is evaluated entirely at the link's tick."""
     match node:
         case Call("sample", (argument, *_)):
             return transform(argument, _unsampled)
@@ -297,9 +312,9 @@ def _unsampled(node: Expr) -> Expr | None:
 
 
 class _PartWriter:
-    """Writes a component's expressions in whole names, with a symbol in the place of each crossing.
+    """Writes a component's expressions with qualified names, and a symbol for each crossing.
 
-    An expression that is held gets a variable and an equation of its own; `where` is what is being written.
+    A held expression gets a separate variable and equation; `where` is the present location.
     """
 
     def __init__(self, part: PartInstance, crossings: dict[str, Crossing], mistakes: Mistakes) -> None:
@@ -312,22 +327,22 @@ class _PartWriter:
         self.where: Equation | SentValue
 
     def written(self, expression: Expr, where: Equation | SentValue) -> Expr:
-        """Return an expression of a part's equation, or of what it sends, in whole names."""
+        """Return an expression of a part's equation or send, with qualified names."""
         self.where = where
         return self._whole(expression)
 
-    def _whole(self, expression: Expr, *, heard: bool = False) -> Expr:
-        """Return an expression in whole names; `heard` in a reduction, where alone others can be named."""
+    def _whole(self, expression: Expr, *, received: bool = False) -> Expr:
+        """Return an expression with qualified names; names of others are allowed for `received` only."""
 
         def whole(node: Expr) -> Expr | None:
             reads = isinstance(node, Name | Call) and any(name.parts[0] == OTHERS for name in names(node))
             match node:
                 case Name():
-                    return self._name(node) if heard or not reads else self._each(node)
+                    return self._name(node) if received or not reads else self._each(node)
                 case Call(function, (argument,)) if reads and function in REDUCTIONS:
                     return self._receive(function, argument)
                 case Call("age" | "previous", (Name() as of,)) if reads:
-                    return Name((self._called(node, of),)) if heard else self._each(node)
+                    return Name((self._called(node, of),)) if received else self._each(node)
                 case Call("sample"):
                     return self._sample(node)
                 case Call("hold"):
@@ -336,7 +351,9 @@ class _PartWriter:
                     return Name((self._called(node, of),))
                 case Call("previous", (Name() as of,)) if of.parts in self.names.variables:
                     variable = format_expression(self._name(of))
-                    return self._crossed(PreviousCrossing(self._called(node, of), variable, self.where.place))
+                    return self._crossed(
+                        PreviousCrossing(self._called(node, of), variable, self.where.location)
+                    )
                 case Call("previous" | "initial", (of,)):
                     return transform(transform(of, partial(self._moved_back, node.function)), whole)
             return None
@@ -352,7 +369,7 @@ class _PartWriter:
         return None if holds is None else TRUE if holds else Call("not", (TRUE,))
 
     def _holds(self, node: Expr) -> bool | None:
-        """Say whether a comparison of an option with a word holds; None of all else."""
+        """Return whether a comparison of an option with a word holds; None for other expressions."""
         test = option_test(node, self.names.options)
         if test is None or not isinstance(node, Call):
             return None
@@ -366,32 +383,32 @@ class _PartWriter:
         return Name((crossing.symbol,))
 
     def _report(
-        self, code: str, node: Expr, what: str, *, expected: str = "", got: str = "", hint: str = ""
+        self, code: str, node: Expr, message: str, *, expected: str = "", got: str = "", hint: str = ""
     ) -> None:
-        place = place_in(self.where.place, self.where.text, node.start)
-        self.mistakes.add(code, place, what, expected=expected, got=got, hint=hint)
+        location = location_in(self.where.location, self.where.text, node.start)
+        self.mistakes.add(code, location, message, expected=expected, got=got, hint=hint)
 
     def _each(self, node: Name | Call) -> Expr:
-        """Report what is of each other peer outside of a reduction."""
+        """Report values of other peers outside of a reduction."""
         shown = format_expression(node)
-        what = f"{shown} of {self.part.name} is a value of each other peer, and one is due here"
-        self._report("E506", node, what, hint=f"mean({shown}), or sum, max, min")
+        message = f"{shown} of {self.part.name} is a value of each other peer, and one is due here"
+        self._report("E506", node, message, hint=f"mean({shown}), or sum, max, min")
         return ZERO
 
     def _receive(self, function: str, argument: Expr) -> Expr:
-        """Return the symbol of a reduction, or the parameter of a site that counts who is heard."""
+        """Return the symbol of a reduction, or the parameter of a subsystem that counts its senders."""
         link = self.link or ""
         if function == "count":
             if not self.part.component.sends:
-                what = "count(others) counts those that are heard, and this component sends nothing"
-                self.mistakes.add("E506", self.where.place, what, hint="sends: {x: sample(object.x)}")
+                message = "count(others) counts those that are heard, and this component sends nothing"
+                self.mistakes.add("E506", self.where.location, message, hint="sends: {x: sample(object.x)}")
             return Name((count_of(link),))
-        of = self._whole(argument, heard=True)
+        of = self._whole(argument, received=True)
         symbol = format_expression(Call(function, (of,)))
-        return self._crossed(ReceiveCrossing(symbol, function, of, link, self.where.place))
+        return self._crossed(ReceiveCrossing(symbol, function, of, link, self.where.location))
 
     def _moved_back(self, function: str, node: Expr) -> Expr | None:
-        """Return a node of what is asked for as it was before, or at the start, as the function says."""
+        """Return the node of a previous or start value, according to the function."""
         back = function == "previous"
         if isinstance(node, Name):
             head = node.parts[0]
@@ -404,7 +421,7 @@ class _PartWriter:
         elif (back and node.function in ("mean", "sum")) and not any(
             isinstance(call, Call) and call.function == "age" for call in walk(node)
         ):
-            return None  # of what was heard before
+            return None  # of previously received values
         name = next(text for n in count(1) if (text := f"y{n}",) not in self.names.dimensions)
         shown = format_expression(node)
         hint = f"{name} = {shown}, and {name}: {{unit: …, start: 0}} among the variables"
@@ -414,21 +431,21 @@ class _PartWriter:
     def _hold(self, held: Expr, *delay: Expr) -> Expr:
         """Give an expression that is held a variable, which a clock of this part computes."""
         where = self.where
-        dimension = self.names.dimension_of_held(held, where.text, where.place)
+        dimension = self.names.dimension_of_held(held, where.text, where.location)
         variable = shown = self._whole(held)
         if dimension is not None:
-            taken = {name for (name, *_) in self.names.variables}
-            free = (text for n in count(1) if (text := f"held{n}") not in taken)
+            used = {name for (name, *_) in self.names.variables}
+            free = (text for n in count(1) if (text := f"held{n}") not in used)
             variable = Name((*self.part.name.split("."), next(islice(free, len(self.held), None))))
-            equation = FlatEquation(variable, shown, self.part.name, self.clock, where.place)
+            equation = FlatEquation(variable, shown, self.part.name, self.clock, where.location)
             self.held.append((FlatVariable(format_expression(variable), dimension), equation))
         for moving in (name for item in delay for name in names(item)):
             if moving.parts in self.names.variables or moving.parts[0] in ("time", OTHERS):
-                what, got = "the delay of a hold", format_expression(moving)
-                self._report("E505", moving, what, expected="parameters only", got=got)
+                subject, got = "the delay of a hold", format_expression(moving)
+                self._report("E505", moving, subject, expected="parameters only", got=got)
         call = Call("hold", (variable, *map(self._whole, delay)))
         name, symbol, text = map(format_expression, (variable, call, shown))
-        return self._crossed(HoldCrossing(symbol, name, (*call.arguments[1:], ZERO)[0], text, where.place))
+        return self._crossed(HoldCrossing(symbol, name, (*call.arguments[1:], ZERO)[0], text, where.location))
 
     def _sample(self, node: Call) -> Expr:
         argument, clock = self._whole(node.arguments[0]), self.clock
@@ -439,19 +456,19 @@ class _PartWriter:
             if (name := format_expression(named)) in clocks:
                 clock = self.references[name]
             else:
-                what, expected = (
+                message, expected = (
                     "the second argument of sample",
                     "a parameter of this component that is a clock",
                 )
-                self._report("E504", named, what, expected=expected, got=name)
+                self._report("E504", named, message, expected=expected, got=name)
         if clock is None:
-            what = f"{component.name} samples but has no parameter that names one clock"
+            message = f"{component.name} samples but has no parameter that names one clock"
             hint = "parameters: {clock: clock}"
             if clocks:
-                what = f"{component.name} samples, and has clocks {', '.join(clocks)}"
+                message = f"{component.name} samples, and has clocks {', '.join(clocks)}"
                 written = self.where.text[node.arguments[0].start : node.arguments[0].end]
                 hint = f"sample({written}, {clocks[0]})"
-            self._report("E504", node, what, hint=hint)
+            self._report("E504", node, message, hint=hint)
         clock = clock or "?"
         symbol = format_expression(Call("sample", (argument, Name((clock,)))))
         return self._crossed(SampleCrossing(symbol, clock, argument))

@@ -3,7 +3,7 @@
 Takes: residuals in variables and their derivatives (see `derivatives`). Gives: `IndexReduction`, whose result
 are the equations to solve, their unknowns, and the states.
 Guarantees: as many equations as unknowns; the states are independent and chosen once and for all.
-Does not: solve anything (see `blocks`).
+Does not: solve anything (see `blt_solver`).
 
 Two masses joined rigidly have one position: `a.x = b.x` is a constraint between states, and the force between
 the masses follows only from its second derivative. Pantelides (SIAM J. Sci. Stat. Comput. 1988) finds which
@@ -21,7 +21,7 @@ from collections.abc import Iterable, Mapping, Sequence, Set
 
 import sympy
 
-from apc.compiler.equations.blocks import balanced
+from apc.compiler.equations.blt_solver import balanced
 from apc.compiler.equations.derivatives import TIME, Derivative, DifferentiatedNames
 from apc.compiler.equations.elimination import Elimination
 from apc.compiler.equations.matching import match
@@ -51,20 +51,20 @@ Reduced = tuple[list[Residual], list[Symbol], list[Symbol]]
 
 
 class IndexReduction:
-    """The equations as they grow: each may have a derivative, which then takes its place in the matching.
+    """The equations during index reduction: a derivative of an equation replaces it in the matching.
 
     Parameters
     ----------
     residuals
         The equations.
     orders
-        The variables they hold, in the order of preference as states, and how many derivatives of each are
-        asked for even if no equation holds them.
+        Their variables, in order of preference as states, and the number of derivatives required of each even
+        if no equation has them.
     moving
-        Knows the derivatives of the variables.
+        Provides the derivatives of the variables.
     problem
-        What they are called. Raised are E502 equations or unknowns left over or constraints that say the
-        same, E508 the derivative of a value that jumps, E509 states that can't be chosen once and for all.
+        Their names. Raised are E502 unmatched equations or unknowns, or redundant constraints, E508 the
+        derivative of a discontinuous value, E509 a state selection that would vary.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class IndexReduction:
             self._add(residual)
 
     def reduced(self, started: Set[Symbol]) -> Reduced:
-        """Differentiate what must be and choose the states.
+        """Reduce the index by differentiation and select the states.
 
         `started` are the variables and derivatives with a declared start value.
         """
@@ -109,7 +109,7 @@ class IndexReduction:
     # ---- Pantelides ----
 
     def _differentiate_constraints(self) -> None:
-        """Match every equation to a highest derivative, differentiating those that hold none of their own."""
+        """Match every equation to a highest derivative, differentiating those without an unknown to match."""
         while True:
             newest = sorted({*range(len(self.residuals))} - {*self.integral.values()})
             held = [[x for x, order in self.held[i].items() if order == self.order[x]] for i in newest]
@@ -119,25 +119,25 @@ class IndexReduction:
             self._pass_on([newest[i] for i in rows], names)
 
     def _pass_on(self, rows: Sequence[int], names: Sequence[str]) -> None:
-        """Differentiate equations that block one another, and with them the order of what they hold."""
+        """Differentiate an overdetermined set of equations, and increase the order of its unknowns."""
         blocking = [self.residuals[row] for row in rows]
         for row, residual in zip(rows, blocking, strict=True):
             if not self._moves_on(row):
-                what = (
+                message = (
                     "holds no unknown once what the connections and other equations say is put in: "
                     "it says what they say already, or contradicts them"
                 )
-                raise self.problem.fault("E502", [residual], f"{residual.shown} {what}")
+                raise self.problem.fault("E502", [residual], f"{residual.shown} {message}")
         for name in names:
             self.order[name] += 1
-        # Each factor of a product stands beside the slopes of all the others.
+        # Each factor of a product is multiplied by the derivatives of all the others.
         grown = (
             sum(size(term) ** 2 for term in sympy.Add.make_args(residual.expression)) for residual in blocking
         )
         if any(self.order[name] > HIGHEST_ORDER for name in names) or max(grown) > LARGEST:
             shown = ", ".join(dict.fromkeys(residual.shown for residual in blocking))
-            what = f"no number of derivatives of these equations determines what they hold: {shown}"
-            raise self.problem.fault("E509", blocking, what)
+            message = f"no number of derivatives of these equations determines what they hold: {shown}"
+            raise self.problem.fault("E509", blocking, message)
         for row, residual in zip(rows, blocking, strict=True):
             try:
                 expression = self.moving.differentiate(residual.expression)
@@ -147,7 +147,7 @@ class IndexReduction:
             self._add(Residual(expression, residual.equation))
 
     def _moves_on(self, row: int) -> bool:
-        """Return whether an equation holds what a derivative of it may determine.
+        """Return whether an equation contains an unknown that its derivative may determine.
 
         One that holds nothing has cancelled. One whose derivatives hold nothing new, though conditions were
         passed by that hold higher ones, asks for its unknowns in conditions only.
@@ -189,9 +189,9 @@ class IndexReduction:
             form = linear_form(constraint.expression, symbols.keys())
             if form is None:  # else a derivative is linear in the highest derivatives
                 shown = constraint.shown
-                what = f"in the constraint {shown} a condition hangs on a derivative that it ties down"
+                message = f"in the constraint {shown} a condition hangs on a derivative that it ties down"
                 hint = "a condition on positions, parameters or time"
-                raise self.problem.fault("E509", [constraint], f"{where}: {what}", hint)
+                raise self.problem.fault("E509", [constraint], f"{where}: {message}", hint)
             linear.append(form[0])
         system = Elimination(linear, divisors, "", LARGEST)
         chosen = []
@@ -205,16 +205,18 @@ class IndexReduction:
                 system.clear(min(fixed)[-1], s)
                 chosen.append(candidate)
         for i, entries in system.rows.items():
-            what = f"the constraint {constraints[i].shown} says what other constraints say already"
+            message = f"the constraint {constraints[i].shown} says what other constraints say already"
             code, hint = "E502", ""
             if not all(divisors.vanishes(factor) for factor in entries.values()):
                 factors = ", ".join(
                     f"{symbols[s][0]} (by the factor {text_of(entries[s])})" for s in in_order(entries)
                 )
-                what = f"no variable follows from the constraint {constraints[i].shown} in every position"
-                what, code = f"{what}, since the factor moves and may vanish: {factors}", "E509"
+                message = f"no variable follows from the constraint {constraints[i].shown} in every position"
+                message, code = f"{message}, since the factor moves and may vanish: {factors}", "E509"
                 hint = "the constraint with an angle or another coordinate that gives every position"
-            self.problem.mistakes.take(self.problem.fault(code, [constraints[i]], f"{where}: {what}", hint))
+            self.problem.mistakes.take(
+                self.problem.fault(code, [constraints[i]], f"{where}: {message}", hint)
+            )
         if system.rows:
             raise AlreadyReportedError
         return chosen

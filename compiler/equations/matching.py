@@ -1,4 +1,4 @@
-"""Which equation may be matched to which unknown, what a matching leaves over, and the order it implies.
+"""Matching of equations to unknowns, unmatched parts, and the resulting order.
 
 Takes: which unknowns each equation holds. Gives: `match`.
 Guarantees: the same input gives the same matching.
@@ -21,33 +21,32 @@ Block = tuple[list[int], list[Unknown]]  # places of equations, and unknowns the
 def match(
     held: Sequence[Collection[Unknown]], unknowns: Sequence[Unknown]
 ) -> tuple[list[int], Block[Unknown], Block[Unknown], list[Block[Unknown]]]:
-    """Match equations to as many unknowns as can be.
+    """Find a maximum matching of equations and unknowns.
 
-    In the graph of it an edge goes from each equation to what it holds, and from each matched unknown to its
-    equation. What can be reached from an equation that is left over is too much for its unknowns, and from
-    where an unknown that is left over can be reached is too little (Dulmage and Mendelsohn 1958).
+    The directed graph has an edge from each equation to its unknowns, and from each matched unknown to its
+    equation. The part reachable from an unmatched equation is overdetermined, and the part from which an
+    unmatched unknown is reachable is underdetermined (Dulmage and Mendelsohn 1958).
 
     Parameters
     ----------
     held
-        What each equation holds.
+        The unknowns of each equation.
     unknowns
-        What there is to be held.
+        All unknowns.
 
     Returns
     -------
     left_over
-        The equations without an unknown of their own.
+        The unmatched equations.
     over, under
-        The equations that are too many, with the unknowns they hold; the unknowns that are too many, with the
-        equations that hold them.
+        The overdetermined equations with their unknowns; the underdetermined unknowns with their equations.
     blocks
-        What has to be computed together, in an order in which each stands behind what it needs: SciPy numbers
-        strong components as Pearce's algorithm ends with them, after all that can be reached from them.
+        The strong components in order of dependence: SciPy numbers strong components in the order of
+        completion in Pearce's algorithm, after all components reachable from them.
     """
     n = len(held)
     node = {unknown: j for j, unknown in enumerate(unknowns, n)}
-    edges = [sorted(node[item] for item in its) for its in held]
+    edges = [sorted(node[item] for item in related) for related in held]
     holds = _graph(edges + [[]] * len(node))
     partner = maximum_bipartite_matching(holds[:n, n:], perm_type="row").tolist()
     graph = _graph(edges + [[i] if i >= 0 else [] for i in partner])
@@ -70,5 +69,5 @@ def match(
 def _graph(edges: Sequence[Sequence[int]]) -> Any:
     """Return the adjacency matrix of a graph, by where the edges of each of its nodes end."""
     ends = np.cumsum([0, *map(len, edges)])
-    places = np.array([number for its in edges for number in its], dtype=np.int32)
-    return csr_array((np.ones(len(places)), places, ends), shape=(len(edges), len(edges)))
+    locations = np.array([number for related in edges for number in related], dtype=np.int32)
+    return csr_array((np.ones(len(locations)), locations, ends), shape=(len(edges), len(edges)))

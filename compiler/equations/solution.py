@@ -1,9 +1,10 @@
 """Equations as residuals and what solving them gives: assignments, and loops that an iteration has to solve.
 
-Takes: nothing (data types). Gives: `Residual`, `Problem`; `Assignment`, `ImplicitBlock`, their union `Step`,
-`Definition`.
+Takes: nothing (data types).
+Gives: `Residual`, `Problem`; `Assignment`, `ImplicitBlock`, their union `Step`, `Definition`; `listed`,
+equations or unknowns as text.
 Guarantees: plain frozen data.
-Does not: solve anything (see `blocks`).
+Does not: solve anything (see `blt_solver`).
 """
 
 from __future__ import annotations
@@ -11,9 +12,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from apc.compiler.equations.divisor_test import Divisors
 from apc.compiler.equations.flatten import FlatEquation
 from apc.compiler.equations.terms import NoDerivativeError, Symbol, Term, symbol
-from apc.compiler.equations.zero_test import Divisors
 from apc.compiler.errors import ApcError, Diagnostic, Mistakes, SourceLocation
 
 Assignment = tuple[str, Term]  # an unknown, and the expression that gives it
@@ -35,20 +36,28 @@ class Residual:
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """What equations are solved with: what may be divided by, and where mistakes go.
+    """The context of a solution: the test of divisors, and the collector of errors.
 
-    `where` is what a message calls the equations; `place` is where it points when there are none.
+    `where` is what a message calls the equations; `location` is where it points when there are none.
     """
 
     where: str
-    place: SourceLocation
+    location: SourceLocation
     divisors: Divisors
     mistakes: Mistakes
 
-    def fault(self, code: str, residuals: Sequence[Residual], what: str, hint: str = "") -> ApcError:
-        """Return a mistake where the first of some equations stands."""
-        place = residuals[0].equation.place if residuals else self.place
-        return ApcError(Diagnostic(code, place, what, hint=hint))
+    def fault(self, code: str, residuals: Sequence[Residual], message: str, hint: str = "") -> ApcError:
+        """Return an error located at the first of some equations.
+
+        Parameters
+        ----------
+        code, message, hint
+            The diagnostic's.
+        residuals
+            The equations; without one, the part has the location.
+        """
+        location = residuals[0].equation.location if residuals else self.location
+        return ApcError(Diagnostic(code, location, message, hint=hint))
 
     def no_number(self, residuals: Sequence[Residual]) -> ApcError:
         """Return the mistake E512: equations in which a constant is none, maybe after others are put in."""
@@ -56,9 +65,11 @@ class Problem:
         return self.fault("E512", residuals, f"{holds} a constant that is no number, such as 1/0 or sqrt(-1)")
 
     def no_derivative(self, residual: Residual, missing: NoDerivativeError) -> ApcError:
-        """Return the mistake E508: an equation's derivative is needed, and what it holds has none."""
-        what = f"{residual.shown} needs the derivative of {missing}"
-        return self.fault("E508", [residual], f"{what}; a position follows such a force only through a mass")
+        """Return the error E508: the derivative of an equation is required, but a term has none."""
+        message = f"{residual.shown} needs the derivative of {missing}"
+        return self.fault(
+            "E508", [residual], f"{message}; a position follows such a force only through a mass"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +107,7 @@ Definition = Term | ImplicitBlock  # what gives an unknown its value
 
 
 def listed(texts: Sequence[str | Residual]) -> str:
-    """Join the first few texts, or equations, and say how many more there are."""
+    """Join the first few texts, or equations, with the number of the others."""
     shown = [text.shown if isinstance(text, Residual) else text for text in texts[:MOST_LISTED]]
     more = len(texts) - MOST_LISTED
     return ", ".join(shown) + (f" and {more} more" if more > 0 else "")

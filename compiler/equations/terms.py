@@ -1,14 +1,15 @@
-"""What the compiler thinks in: SymPy's expressions of real symbols and exact numbers.
+"""Symbolic expressions of the compiler: SymPy expressions of real symbols and exact numbers.
 
-Takes: the language's expressions, and names. Gives: `Term`, `to_term`, `text_of`, `symbol`, `derivative`;
-`slope`, `differential`, `linear_form`, `is_no_number` of terms.
-Guarantees: a name has one symbol, and so has each time derivative of it: `x`, `der(x)`, `der(der(x))`; what
-bends or jumps by a choice stays as it is written.
+Takes: the language's expressions, and names. Gives: `Term`, `to_term`, `text_of`, `size`; `symbol`,
+`derivative`, `in_order`; `slope`, `differential`, `linear_form`, `is_no_number` of terms,
+`NoDerivativeError`; `PiecewiseFunction`, `If`, `Abs`.
+Guarantees: a name has one symbol, and so has each time derivative of it: `x`, `der(x)`, `der(der(x))`;
+expressions with a choice (kinks, jumps) are kept as written.
 Does not: simplify anything beyond what SymPy does when an expression is made.
 
-A choice is an application of a function of our own: SymPy's Piecewise, Max and Min ask at every step
-what is larger for all values, which takes milliseconds each. What no number can be, 1/0 or sqrt(-1), is
-SymPy's `zoo` or `nan`, or has an imaginary part.
+A choice is an application of a function of our own: SymPy's Piecewise, Max and Min attempt to decide
+comparisons at every step, which takes milliseconds each. Undefined values, 1/0 or sqrt(-1), are SymPy's `zoo`
+or `nan`, or has an imaginary part.
 """
 
 from __future__ import annotations
@@ -77,11 +78,11 @@ class If(PiecewiseFunction):
 
 
 class Abs(PiecewiseFunction):
-    """The absolute value; SymPy's has no slope of what it doesn't know to be real, such as x/y."""
+    """The absolute value; that of SymPy has no derivative for arguments not known to be real, such as x/y."""
 
     @classmethod
     def eval(cls, value: Term) -> Term | None:
-        """Return the value of a number; None of one that holds a choice, which stays as it is written."""
+        """Return the value of a number; None if it contains a choice, which is kept as written."""
         number = rounded(value)
         if number.is_Rational:
             return -value if number < 0 else value
@@ -180,7 +181,7 @@ def in_order(symbols: Iterable[Symbol]) -> list[Symbol]:
 
 
 def size(term: Term) -> int:
-    """Return how many nodes a term has."""
+    """Return the number of nodes of a term."""
     return sum(1 for _ in sympy.preorder_traversal(term))
 
 
@@ -210,7 +211,7 @@ def to_term(expression: Expr, differentiate: Callable[[Term], Term] | None = Non
 def _short_constant(node: Expr) -> Expr | None:
     """Return a long constant that is not rational as the nearest float, or as 1/0 if it has no real value.
 
-    Also the value of a constant choice. None leaves a node as it is.
+    Also the value of a constant choice. None keeps a node unchanged.
     """
     if not isinstance(node, Call):
         return None

@@ -1,1 +1,1 @@
-"""Equations written as CasADi functions, each computing only what is asked of it."""
+"""CasADi functions of the equations, each computing only its required results."""

@@ -1,1 +1,1 @@
-"""What is written inside the YAML: expressions, units, numbers, tables."""
+"""The texts within the YAML: expressions, units, numbers, tables."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from fractions import Fraction
 
-from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, place_in
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, location_in
 from apc.compiler.language.evaluation import EvaluationError, constant_value
 from apc.compiler.language.expression import Call, Expr, Name, NumberLiteral, children, format_expression
 from apc.compiler.source.reading import brief
@@ -23,14 +23,14 @@ RANGE = "constants between 2.2e-308 and 1.8e308"
 POWERS = ("^", "*", "/", "exp", "sinh", "cosh")
 
 
-def check_constants(expression: Expr, text: str, place: SourceLocation) -> None:
+def check_constants(expression: Expr, text: str, location: SourceLocation) -> None:
     """Refuse constants that are too large, too small or too long.
 
     Parameters
     ----------
     expression
         One side of an equation.
-    text, place
+    text, location
         The equation as written, and its location.
 
     Raises
@@ -40,8 +40,8 @@ def check_constants(expression: Expr, text: str, place: SourceLocation) -> None:
     """
 
     def refuse(node: Expr, why: str) -> None:
-        what = f"{brief(format_expression(node))} {why}"
-        raise ApcError(Diagnostic("E331", place_in(place, text, node.start), what, RANGE))
+        message = f"{brief(format_expression(node))} {why}"
+        raise ApcError(Diagnostic("E331", location_in(location, text, node.start), message, RANGE))
 
     def bits(node: Expr) -> float:
         """Return a bound on the bits of the coefficients of a subexpression."""

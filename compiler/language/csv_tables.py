@@ -1,10 +1,10 @@
 """Tables in CSV files: columns with their units in the headings.
 
-Takes: a path. Gives: `read_table`, a `Table` in SI; `open_table`, `read_bytes`, for files not all of numbers;
-`NamedFiles`.
-Guarantees: every cell is a finite number, or a mistake names its file, line and column; of a file that is no
-table no text is told, as it may be somebody's; a number takes eight bytes.
-Does not: know what a column means.
+Takes: a path. Gives: `read_table`, a `Table` in SI of `CsvColumn`s; `open_table`, `read_bytes`, for files
+with other cells than numbers; `NamedFiles`.
+Guarantees: every cell is a finite number, or an error names its file, line and column. The text of a file
+that is not a table is never printed, as it may be private. A number takes eight bytes.
+Does not: interpret columns.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Mistakes, SourceLocation
 from apc.compiler.files import RefusedError, read_file
 from apc.compiler.language.units import NO_UNIT, Unit, parse_unit
+from apc.compiler.number_parsing import plain_float
 from apc.compiler.source.reading import brief, fault
 
 MAX_BYTES = 1 << 26  # 64 MiB: some eight million numbers, read in a few seconds
 PACKED = ".gz"  # the suffix of what gzip packed
-MOST_COLUMNS = 1000  # more than a scene has parameters that differ from peer to peer
+MOST_COLUMNS = 1000  # more than a topology has parameters that differ from peer to peer
 MOST_MISTAKES = 20  # of one table; a wrong column has as many as rows
 _EXAMPLE = "device.mass [kg]"
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_.\[\]]*\Z")
 # The last bracket holds the unit; those before it, the index of an entry or of an element.
 _HEADING = re.compile(r"(?P<name>[^\[\]]*(\[[0-9]+\][^\[\]]*)*?)(\[(?P<unit>[^\[\]]*)\])?\Z")
 
-Headings = tuple[tuple[str, Unit, SourceLocation], ...]  # name, unit and where it stands
+Headings = tuple[tuple[str, Unit, SourceLocation], ...]  # name, unit and location
 
 
 F = TypeVar("F")
@@ -54,7 +54,7 @@ class NamedFiles:
     names: set[str] = field(default_factory=set)
 
     def read(self, name: str, reader: Callable[[Path], F]) -> F | None:
-        """Return what a reader finds in a file; None, and its mistakes are taken, if that is at fault."""
+        """Return the result of reading a file; None if invalid, with its errors collected."""
         with self.mistakes:
             result = reader(self.folder / name)
             self.names.add(name)
@@ -69,12 +69,12 @@ class CsvColumn:
     name: str
     unit: Unit
     numbers: NDArray[np.float64]
-    place: SourceLocation
+    location: SourceLocation
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A CSV file, whole. `lines` are the lines its rows stand in."""
+    """A complete CSV file. `lines` are the line numbers of its rows."""
 
     file: str
     columns: tuple[CsvColumn, ...]
@@ -94,7 +94,7 @@ def read_table(path: Path, named_at: SourceLocation) -> Table:
     path
         The file.
     named_at
-        Where the topology names it, for a file that can't be read.
+        The location of its reference, for a file that cannot be read.
 
     Raises
     ------
@@ -108,8 +108,8 @@ def read_table(path: Path, named_at: SourceLocation) -> Table:
         )
     numbers = cells.reshape(len(lines), len(headings))
     columns = tuple(
-        CsvColumn(name, unit, numbers[:, i] * float(unit.scale), place)
-        for i, (name, unit, place) in enumerate(headings)
+        CsvColumn(name, unit, numbers[:, i] * float(unit.scale), location)
+        for i, (name, unit, location) in enumerate(headings)
     )
     return Table(opened.file, columns, lines)
 
@@ -126,7 +126,7 @@ class CsvReader:
         self,
         columns: Sequence[int],
         readers: Sequence[Callable[[str], float]],
-        what: str,
+        message: str,
         expected: str,
         *,
         empty_too: bool = False,
@@ -136,11 +136,11 @@ class CsvReader:
         Parameters
         ----------
         columns
-            Which columns, counted from 0.
+            The zero-based column indices.
         readers
             For each of them, what gives the number of a cell, or raises ValueError.
-        what, expected
-            What a cell is and has to be, for messages.
+        message, expected
+            The name and the expected contents of a cell, for messages.
         empty_too
             Read rows whose cells are all empty, too; a line without a character is no row.
 
@@ -153,24 +153,24 @@ class CsvReader:
         begin = self.rows.line_num + 1
         for cells in self.rows:
             # A cell in quotes may go over several lines.
-            place, begin = SourceLocation(self.file, begin, 1), self.rows.line_num + 1
+            location, begin = SourceLocation(self.file, begin, 1), self.rows.line_num + 1
             filled = len(cells) > 1 or (cells and not cells[0].isspace())
             if not (filled if empty_too else any(map(str.strip, cells))):
                 continue
-            lines.append(place.line)
+            lines.append(location.line)
             if len(cells) != len(self.headings):
                 reason = f"the row has {len(cells)} cells and there are {len(self.headings)} headings"
-                mistakes.add("E703", place, reason)
-                faulty.add(place.line)
+                mistakes.add("E703", location, reason)
+                faulty.add(location.line)
             else:
                 for column, number in zip(columns, readers, strict=True):
                     try:
                         numbers.append(number(cells[column]))
                     except ValueError:
-                        at = place.shifted(sum(len(cell) + 1 for cell in cells[:column]))
+                        at = location.shifted(sum(len(cell) + 1 for cell in cells[:column]))
                         got = brief(cells[column]) or "nothing"
-                        mistakes.add("E703", at, what, expected=expected, got=got)
-                        faulty.add(place.line)
+                        mistakes.add("E703", at, message, expected=expected, got=got)
+                        faulty.add(location.line)
             if len(faulty) >= MOST_MISTAKES:
                 break
         mistakes.raise_if_any()
@@ -188,13 +188,14 @@ def open_table(path: Path, named_at: SourceLocation, known: Collection[str] = ()
     path, named_at
         As for `read_table`.
     known
-        Names that are a heading's even without a unit.
+        Names that are valid headings without a unit.
 
     Raises
     ------
     ApcError
-        E701 it can't be read, E702 its headings; E703 its rows are no CSV. What the body raises passes, but
-        of a file that does not begin as a table does only that is told: its text may be somebody's.
+        E701 it cannot be read, E702 its headings; E703 its rows are not CSV. Errors of the body are passed
+        on, except for a file that does not begin as a table: only that is reported, as its text may be
+        private.
     """
     data = read_bytes(path, named_at)
     file = str(path)
@@ -237,23 +238,23 @@ def read_bytes(path: Path, named_at: SourceLocation, *, any_text: bool = False) 
             if not any_text:
                 data.decode("utf-8-sig")  # all of it: what decodes piece by piece counts from where it is
             return data
-        what = f"{path.name} unpacks to more than {MAX_BYTES >> 20} MiB"
+        message = f"{path.name} unpacks to more than {MAX_BYTES >> 20} MiB"
     except RefusedError as refused:
-        what = f"the table {path} {refused.words}"
+        message = f"the table {path} {refused.words}"
     except UnicodeDecodeError as error:
-        what = f"{path.name} is not UTF-8 text (byte {error.start})"
+        message = f"{path.name} is not UTF-8 text (byte {error.start})"
     except (OSError, EOFError, zlib.error):
-        what = f"{path.name} is no whole gzip file"
-    raise fault("E701", named_at, what)
+        message = f"{path.name} is no whole gzip file"
+    raise fault("E701", named_at, message)
 
 
 def _headings(texts: list[str], file: str) -> Headings:
-    place = SourceLocation(file, 1, 1)
+    location = SourceLocation(file, 1, 1)
     if not any(text.strip() for text in texts):
-        raise fault("E702", place, "the table has no headings", hint=_EXAMPLE)
+        raise fault("E702", location, "the table has no headings", hint=_EXAMPLE)
     if len(texts) > MOST_COLUMNS:
-        what = f"the table has {len(texts)} columns, and {MOST_COLUMNS} are the most"
-        raise fault("E702", place, what, hint="several groups, each with a table")
+        message = f"the table has {len(texts)} columns, and {MOST_COLUMNS} are the most"
+        raise fault("E702", location, message, hint="several groups, each with a table")
     mistakes = Mistakes()
     result: dict[str, tuple[str, Unit, SourceLocation]] = {}
     for text in texts:
@@ -261,15 +262,15 @@ def _headings(texts: list[str], file: str) -> Headings:
         unit = NO_UNIT
         if not name:
             expected, got = "a name and its unit", brief(text) or "nothing"
-            mistakes.add("E702", place, "a heading", expected=expected, got=got, hint=_EXAMPLE)
+            mistakes.add("E702", location, "a heading", expected=expected, got=got, hint=_EXAMPLE)
         try:
-            unit = parse_unit(written, place) if written else NO_UNIT
+            unit = parse_unit(written, location) if written else NO_UNIT
         except ApcError as error:
             mistakes.take(error)
         if name in result:
-            mistakes.add("E702", place, f"the heading {brief(name)} is used twice")
-        result[name] = (name, unit, place)
-        place = place.shifted(len(text) + 1)
+            mistakes.add("E702", location, f"the heading {brief(name)} is used twice")
+        result[name] = (name, unit, location)
+        location = location.shifted(len(text) + 1)
     mistakes.raise_if_any()
     return tuple(result.values())
 

@@ -15,15 +15,15 @@ from fractions import Fraction
 class Dimension:
     """A product of powers of SI base units, sorted by name and without zeros; the radian is the number 1.
 
-    `turning` says what a quantity written in it counts, cycles ("Hz") or radians ("rad"), as far as its unit
-    tells: in no comparison, and what is computed of it no longer has it.
+    `turning` is the angle unit of a quantity, cycles ("Hz") or radians ("rad"), if its unit determines it. It
+    is ignored in comparisons, and computed values do not have it.
     """
 
     exponents: tuple[tuple[str, Fraction | int], ...]
     turning: str = field(default="", compare=False)
 
     def clashes(self, other: Dimension) -> bool:
-        """Say whether one counts cycles and the other radians."""
+        """Return whether one counts cycles and the other radians."""
         return {self.turning, other.turning} == {"Hz", "rad"}
 
     def multiply(self, other: Dimension, times: Fraction | int = 1) -> Dimension:

@@ -1,8 +1,8 @@
-"""What expressions of parameters come to: exactly, or in any kind of number.
+"""Evaluation of expressions of parameters: exact, or in any number type.
 
 Takes: an `Expr` tree or a `Formula`, and the values of its names.
-Gives: `formula_of`; `evaluate`, `exact_value`; `exactly` and `computed`, by the rules of another kind of
-number; `EvaluationError`.
+Gives: `formula_of`; `evaluate`, `constant_value`, `exact_value`; `exactly` and `computed`, by the rules of
+another number type; `EvaluationError`.
 Guarantees: exact as long as every operation is rational; exact rationals stay below 2^4096, so that computing
 always ends soon; a value is finite. A branch that is not taken is not evaluated.
 Does not: know units, or values that change with time or with the peers.
@@ -18,6 +18,7 @@ from typing import Any, NoReturn
 
 from apc.compiler.compiled import Formula
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
+from apc.compiler.expression_data import ROUNDED, RULES
 from apc.compiler.language.expression import (
     FUNCTIONS,
     SMOOTH,
@@ -32,8 +33,7 @@ from apc.compiler.language.expression import (
     walk,
 )
 from apc.compiler.language.grammar import parse_expression
-from apc.compiler.plain import ROUNDED, RULES
-from apc.compiler.words import cut
+from apc.compiler.wording import cut
 
 Value = Fraction | float
 Lookup = Callable[[tuple[str, ...]], Any]  # of the parts of a name
@@ -41,7 +41,7 @@ Rule = Callable[[str], Callable[..., Any]]
 
 MAX_BITS = 4096  # of an exact numerator or denominator; beyond it a float takes over
 
-# The operations of `plain` by the operators and functions of the language.
+# The operations of `expression_data` by the operators and functions of the language.
 _OPERATIONS = {
     "+": "add",
     "-": "sub",
@@ -64,7 +64,7 @@ _OPERATIONS = {
 
 
 class EvaluationError(Exception):
-    """A node of an expression has no value: what is wrong with it in words, and why."""
+    """A node of an expression has no value: the error in words, and its reason."""
 
     def __init__(self, node: Expr, cause: Exception) -> None:
         words = "has no real value"
@@ -82,7 +82,7 @@ def formula_of(expr: Expr) -> Formula:
     )
 
 
-def evaluate(expr: Expr, lookup: Lookup, place: SourceLocation) -> Value:
+def evaluate(expr: Expr, lookup: Lookup, location: SourceLocation) -> Value:
     """Return the value of an expression of parameters.
 
     Parameters
@@ -90,9 +90,9 @@ def evaluate(expr: Expr, lookup: Lookup, place: SourceLocation) -> Value:
     expr
         The tree.
     lookup
-        Gives the value of a name's parts.
-    place
-        Where the text of `expr` starts, for messages.
+        Returns the value of a name's parts.
+    location
+        The location of the text of `expr`, for messages.
 
     Returns
     -------
@@ -107,17 +107,17 @@ def evaluate(expr: Expr, lookup: Lookup, place: SourceLocation) -> Value:
     """
     for node in walk(expr):
         if isinstance(node, Call) and node.function in FUNCTIONS.keys() - _OPERATIONS.keys():
-            what = f"{node.function}(…) changes with time or with the peers: a parameter cannot hold it"
-            _fail(place, node, "E332", what)
+            message = f"{node.function}(…) changes with time or with the peers: a parameter cannot hold it"
+            _fail(location, node, "E332", message)
     try:
         value: Value = _exactly(expr, lookup, EXACT.__getitem__)
     except EvaluationError as fault:
-        _fail(place, fault.node, "E331", f"{cut(format_expression(fault.node))} {fault.words}")
+        _fail(location, fault.node, "E331", f"{cut(format_expression(fault.node))} {fault.words}")
     return value
 
 
 def constant_value(expr: Expr) -> Value | None:
-    """Return the value of an expression without names, None if it holds what changes with time or with peers.
+    """Return the value of an expression without names, None if it varies with time or between peers.
 
     Raises
     ------
@@ -133,14 +133,14 @@ def constant_value(expr: Expr) -> Value | None:
 
 
 def exact_value(name: str, formula: Formula, values: Sequence[Fraction]) -> Fraction:
-    """Return what a number comes to; beyond rational operations, the float it was rounded to.
+    """Return the value of a number; beyond rational operations, its rounded float.
 
     Parameters
     ----------
     name
         The number's, for messages.
     formula, values
-        What it follows from, and the values of `Formula.names`.
+        Its formula, and the values of `Formula.names`.
 
     Raises
     ------
@@ -159,7 +159,7 @@ def exactly(formula: Formula, values: Sequence[Any], rule: Rule) -> Any:
     formula, values
         The formula, and the values of `Formula.names`.
     rule
-        What an operation of `plain` is in this kind of number.
+        The operations of `expression_data` for this number type.
 
     Raises
     ------
@@ -177,7 +177,7 @@ def computed(formula: Formula, values: Sequence[Any], rule: Rule) -> Any:
     formula, values
         The formula, and the values of `Formula.names`.
     rule
-        What an operation of `plain` is in this kind of number.
+        The operations of `expression_data` for this number type.
     """
     lookup = _lookup(formula, values)
 
@@ -200,7 +200,7 @@ def _lookup(formula: Formula, values: Sequence[Any]) -> Lookup:
 
 
 def _exactly(expr: Expr, lookup: Lookup, rule: Rule) -> Any:
-    """Return the value of an expression, evaluated only as far as it is needed. Raises FaultError."""
+    """Return the value of an expression, evaluated only as far as needed. Raises FaultError."""
 
     def value(expr: Expr) -> Any:
         match expr:
@@ -221,17 +221,17 @@ def _exactly(expr: Expr, lookup: Lookup, rule: Rule) -> Any:
 
 
 def _apply(word: str, operands: Sequence[Any], rule: Rule) -> Any:
-    """Return what an operator or function comes to."""
+    """Return the value of an operator or function."""
     operation = rule(_OPERATIONS[word])
     if word in ("max", "min"):
         return reduce(operation, operands)
     return operation(*(operands[::-1] if word in (">", ">=") else operands))
 
 
-def _fail(place: SourceLocation, node: Expr, code: str, what: str) -> NoReturn:
+def _fail(location: SourceLocation, node: Expr, code: str, message: str) -> NoReturn:
     # Without the text we can only trust a column that exists.
-    fits = not place.source_line or place.column + node.start <= len(place.source_line)
-    raise ApcError(Diagnostic(code, place.shifted(node.start) if fits else place, what))
+    fits = not location.source_line or location.column + node.start <= len(location.source_line)
+    raise ApcError(Diagnostic(code, location.shifted(node.start) if fits else location, message))
 
 
 @lru_cache(maxsize=1024)
@@ -277,10 +277,10 @@ def _power(base: Value, exponent: Value) -> Value:
     return math.pow(base, power)
 
 
-def _kept_finite(rule: Callable[..., Any]) -> Callable[..., Any]:
+def _require_finite(rule: Callable[..., Any]) -> Callable[..., Any]:
     return lambda *operands: _finite(rule(*operands))
 
 
 # Exact where an operation is rational, and finite.
 _EXACT: dict[str, Callable[..., Any]] = {**RULES, **ROUNDED, "sqrt": _root, "pow": _power}
-EXACT = {word: _kept_finite(rule) for word, rule in _EXACT.items()}
+EXACT = {word: _require_finite(rule) for word, rule in _EXACT.items()}

@@ -1,8 +1,8 @@
 """The nodes of an expression's tree, walking and changing them, and their text.
 
 Takes: `Expr` trees.
-Gives: the node types, `Equation`, `format_expression`, `as_written`, `interval_of`, `children`, `walk`,
-`names`, `transform`, `fold`.
+Gives: the nodes `NumberLiteral`, `Name`, `Call`; `Equation`; `format_expression`, `as_written`,
+`interval_of`; `children`, `walk`, `names`, `transform`, `fold`.
 Guarantees: plain frozen data; the text has no more parentheses than the tree needs.
 Does not: read text (see `grammar`), or know what a name means, or its unit.
 """
@@ -43,7 +43,7 @@ class Name(Spanned):
 
 @dataclass(frozen=True, slots=True)
 class Call(Spanned):
-    """An operator or a function, and what it is applied to.
+    """An operator or a function, with its arguments.
 
     `function` is one of `FUNCTIONS` or an operator: `neg` of -x; ^, whose right side is a `NumberLiteral`,
     maybe negative or a fraction; `if` of a condition, a value and another, where an `elseif` is an `if` in
@@ -65,12 +65,12 @@ Expr = NumberLiteral | Name | Call
 
 @dataclass(frozen=True, slots=True)
 class Equation:
-    """`left = right`; `text` starts at `place`, and the offsets of both sides count from there."""
+    """`left = right`; `text` starts at `location`, and the offsets of both sides count from there."""
 
     left: Expr
     right: Expr
     text: str
-    place: SourceLocation
+    location: SourceLocation
 
 
 # Smooth functions of a number, as Modelica has them (Language Specification 3.6, section 3.7.3).
@@ -95,7 +95,7 @@ KEYWORDS = frozenset(("if", "then", "elseif", "else", "and", "or", "not"))
 COMPARISONS = ("<", "<=", ">", ">=", "==", "!=")
 CONDITIONS = (*COMPARISONS, "and", "or", "not")
 
-# Operators by how tightly they bind: an operand must bind tighter than what it stands in.
+# Operators by precedence: an operand must bind tighter than its operator.
 _BINDING = (("if",), ("or",), ("and",), ("not",), COMPARISONS, ("+", "-"), ("*", "/"), ("neg",), ("^",))
 LEVELS = {word: level for level, words in enumerate(_BINDING) for word in words}
 PRODUCT, SIGN, ATOM = LEVELS["*"], LEVELS["neg"], len(_BINDING)
@@ -113,7 +113,7 @@ def format_expression(expr: Expr) -> str:
 
 
 def as_written(expr: Expr, text: str) -> str:
-    """Return a part as it is written in a text, or as it would be when it comes from somewhere else."""
+    """Return a part as written in a text, or as it would be if from another source."""
     return text[expr.start : expr.end] or format_expression(expr)
 
 
@@ -145,7 +145,7 @@ def _format_number(value: Fraction) -> tuple[str, int]:
         return f"{sign}{abs(value.numerator)}/{value.denominator}", PRODUCT
     _, digits, exponent = number.as_tuple()
     assert isinstance(exponent, int)
-    # An exponent stands for more than four zeros behind the point, and in a number of more than 16 digits.
+    # An exponent is used for more than four zeros after the point, and in a number of more than 16 digits.
     if exponent + len(digits) < -4 or (exponent > 0 and exponent + len(digits) > 16):
         return f"{sign}{''.join(map(str, digits))}e{exponent}", level
     return f"{sign}{number:f}", level
@@ -181,9 +181,9 @@ def transform(expr: Expr, function: Callable[[Expr], Expr | None]) -> Expr:
     Parameters
     ----------
     expr
-        The tree; a part in which nothing is replaced is returned as it is.
+        The tree; a part in which nothing is replaced is returned unchanged.
     function
-        Gives a node's replacement, into which nothing descends, or None to go on with its sub-expressions.
+        Returns a node's replacement, which is final, or None to continue with its sub-expressions.
     """
     replacement = function(expr)
     if replacement is not None or not isinstance(expr, Call):
@@ -194,16 +194,16 @@ def transform(expr: Expr, function: Callable[[Expr], Expr | None]) -> Expr:
 
 
 def fold(expr: Expr, leaf: Callable[[Name | NumberLiteral], V], apply: Callable[..., V]) -> V:
-    """Return what a tree comes to.
+    """Return the value of a tree under a fold.
 
     Parameters
     ----------
     expr
         The tree.
     leaf
-        Gives what a name or a number comes to.
+        Returns the value of a name or a number.
     apply
-        Gives what an operator or function comes to, from its word and what it is applied to.
+        Returns the value of an operator or function, from its name and its arguments.
     """
     if not isinstance(expr, Call):
         return leaf(expr)

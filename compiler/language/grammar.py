@@ -1,9 +1,9 @@
-"""The text of an expression or equation to a tree.
+"""Parser of expressions and equations.
 
-Takes: a text and where it stands. Gives: `parse_expression`, `parse_equation`.
+Takes: a text and its location. Gives: `parse_expression`, `parse_equation`.
 Guarantees: length, depth, digits and exponents are bounded, so parsing always ends soon;
 `parse_expression(format_expression(e)) == e` for every parsed `e`; nothing is ever run as Python.
-Does not: know what a name means, or its unit.
+Does not: resolve names or units.
 
 The grammar is expression.lark; Lark reads it.
 """
@@ -43,14 +43,14 @@ from apc.compiler.language.parsing import (
     ParseError,
     check_size,
     exponent_of,
-    kind_of,
     parser,
     placing,
+    token_type_of,
     unclosed,
 )
-from apc.compiler.words import cut
+from apc.compiler.wording import cut
 
-ALIKE = 0.8  # of the letters of a function's name, for another to be the one that was meant
+SIMILAR = 0.8  # of the letters of a function's name, for another to be the one that was meant
 MAX_LENGTH = 10_000  # characters of an expression
 MAX_DEPTH = 100  # levels of the tree; Python's own stack allows about 300
 TOO_DEEP = f"this is nested or chained more than {MAX_DEPTH} deep: give a part of it a name"
@@ -82,15 +82,15 @@ _STRAY = {
 _OPENED = {"LPAR": "an opened (", "LBRACE": "an opened {", "THEN": "an if … then"}
 
 
-def parse_expression(text: str, place: SourceLocation) -> Expr:
-    """Return the tree of an expression that is a number; a condition stands inside an `if` only.
+def parse_expression(text: str, location: SourceLocation) -> Expr:
+    """Return the tree of an expression that is a number; conditions occur inside an `if` only.
 
     Parameters
     ----------
     text
         One expression.
-    place
-        Where the first character of `text` stands; mistakes are reported that much further right.
+    location
+        The location of the first character of `text`; errors are reported relative to it.
 
     Raises
     ------
@@ -98,15 +98,15 @@ def parse_expression(text: str, place: SourceLocation) -> Expr:
         E321 a character, E322 a wrong or missing token, E323 a number, E324 a name, E325 a function,
         E326 an exponent, E327 a condition where a number is due or the reverse, E328 too long or too deep.
     """
-    with placing(text, place):
+    with placing(text, location):
         expr: Expr = _parsed(text, "expression")[0]
         _check(expr, text)
         return expr
 
 
-def parse_equation(text: str, place: SourceLocation) -> Equation:
+def parse_equation(text: str, location: SourceLocation) -> Equation:
     """Return both sides of `left = right`: as `parse_expression`, and E329 unless there is just one `=`."""
-    with placing(text, place):
+    with placing(text, location):
         left, *others = _parsed(text, "equation")
         if isinstance(left, Call) and left.function == "==" and not others:
             # The usual slip: `a == b` for `a = b`.
@@ -118,12 +118,12 @@ def parse_equation(text: str, place: SourceLocation) -> Equation:
             raise ParseError("E329", others[2], "an equation", "one =", "a second one")
         _check(left, text)
         _check(others[1], text)
-        return Equation(left, others[1], text, place)
+        return Equation(left, others[1], text, location)
 
 
 @lru_cache(maxsize=1024)
 def _parsed(text: str, start: str) -> list[Any]:
-    """Return an expression, or the sides of an equation and between them where its signs stand."""
+    """Return an expression, or the sides of an equation with the positions of the signs between them."""
     if len(text) > MAX_LENGTH:
         expected = f"at most {MAX_LENGTH} characters"
         raise ParseError("E328", 0, "an expression", expected, f"{len(text)}")
@@ -145,7 +145,7 @@ def _grammar() -> Callable[[str, str], Any]:
 
 
 def _refuse_character(text: str, at: int) -> NoReturn:
-    """Raise E321: what the character is, and what was probably meant."""
+    """Raise E321: the invalid character, with the probable intention."""
     character = text[at]
     if character in _UNEXPECTED:
         raise ParseError("E321", at, f"{character} cannot stand here: {_UNEXPECTED[character]}")
@@ -158,17 +158,17 @@ def _refuse_character(text: str, at: int) -> NoReturn:
 
 
 def _refuse_token(text: str, fault: UnexpectedToken) -> NoReturn:
-    """Raise the mistake of a token that cannot follow what the parser has on its stack."""
+    """Raise the error of a token that cannot follow the parser's stack."""
     token, stack = fault.token, fault.state.value_stack
     if token.type == "$END":
         token = Token("$END", "the end of the text", len(text))
     if token.type in ("NAME", "FUNCTION"):
         _check_name(token)
     got, at = "^" if token.type == "POWER" else cut(token), unclosed(stack)
-    opener = kind_of(stack[at]) if at >= 0 else ""
-    called = f"{stack[at - 1]}(" if at > 0 and kind_of(stack[at - 1]) == "FUNCTION" else ""
-    tail = [token, *takewhile(kind_of, reversed(stack))]  # the tokens that are no part of a node yet
-    kinds = [kind_of(value) for value in tail]
+    opener = token_type_of(stack[at]) if at >= 0 else ""
+    called = f"{stack[at - 1]}(" if at > 0 and token_type_of(stack[at - 1]) == "FUNCTION" else ""
+    tail = [token, *takewhile(token_type_of, reversed(stack))]  # the tokens that are no part of a node yet
+    kinds = [token_type_of(value) for value in tail]
     if "POWER" in kinds[1:] and "$END" not in fault.expected:
         start = tail[kinds.index("POWER", 1) - 1]
         raise ParseError("E326", start, "an exponent", "a number written out, as in x^2 or x^(1/2)", got)
@@ -183,9 +183,9 @@ def _refuse_token(text: str, fault: UnexpectedToken) -> NoReturn:
         raise ParseError("E326", token, "a power of a power needs parentheses", hint="(x^2)^3")
     if kinds[1:2] == ["NUMBER"] and "POWER" not in kinds and kinds[0] in ("NAME", "FUNCTION", "NUMBER"):
         number = tail[1]
-        said = text[number.start_pos : token.end_pos]
+        described = text[number.start_pos : token.end_pos]
         if not text[number.end_pos : token.start_pos].strip(" "):
-            what = f"{cut(said)} is not a number, and units stand on parameters only"
+            message = f"{cut(described)} is not a number, and units stand on parameters only"
             factors = re.match(r"[\w.]*(\s*[*/]\s*\w+)*", text[token.start_pos :])
             product = f"{number}*{factors[0] if factors else token}"
             if kinds[0] == "NAME" and token != "pi":
@@ -193,17 +193,17 @@ def _refuse_token(text: str, fault: UnexpectedToken) -> NoReturn:
             hint = product
             hint = hint if Fraction(number) else str(number)  # nothing is nothing in any unit
             with contextlib.suppress(ValueError):
-                hint = str(int(said, 0))  # 0x10 is 16
-            raise ParseError("E323", number, what, hint="" if kinds[0] == "NUMBER" else hint)
+                hint = str(int(described, 0))  # 0x10 is 16
+            raise ParseError("E323", number, message, hint="" if kinds[0] == "NUMBER" else hint)
     if token.type == "COMPARISON":
         raise ParseError("E322", token, "a comparison has two sides", hint="a < b and b < c")
     if opener:
         inside = called or _OPENED.get(opener, "an if")
         raise ParseError("E322", token, inside, _CLOSERS[opener], got)
-    what = _STRAY.get(token, f"an operator was expected here, not {got}")
+    message = _STRAY.get(token, f"an operator was expected here, not {got}")
     if token in KEYWORDS:
-        what = f"{token} belongs to an if … then … else, and none is open here"
-    raise ParseError("E322", token, what)
+        message = f"{token} belongs to an if … then … else, and none is open here"
+    raise ParseError("E322", token, message)
 
 
 def _check(expr: Expr, text: str, depth: int = 1, *, conditional: bool = False) -> None:
@@ -212,16 +212,16 @@ def _check(expr: Expr, text: str, depth: int = 1, *, conditional: bool = False) 
         raise ParseError("E328", expr.start, TOO_DEEP)
     word = expr.function if isinstance(expr, Call) else ""
     condition = word in CONDITIONS
-    # A name may stand for a condition; what it is, only its declaration can tell.
+    # A name may represent a condition; only its declaration determines its type.
     if condition != conditional and not isinstance(expr, Name):
         kinds = "a condition, and a number" if condition else "a number, and a condition"
-        what = f"{cut(text[expr.start : expr.end])} is {kinds} is due here"
-        raise ParseError("E327", expr.start, what)
+        message = f"{cut(text[expr.start : expr.end])} is {kinds} is due here"
+        raise ParseError("E327", expr.start, message)
     parts = children(expr)
-    for place, part in enumerate(parts):
-        due = word in ("and", "or", "not") or (place == 0 and word == "if")
+    for index, part in enumerate(parts):
+        due = word in ("and", "or", "not") or (index == 0 and word == "if")
         # A first operand that is a leaf is read at the level of its operator.
-        deeper = bool(place or len(parts) == 1 or children(part))
+        deeper = bool(index or len(parts) == 1 or children(part))
         _check(part, text, depth + deeper, conditional=due)
 
 
@@ -238,7 +238,7 @@ def _check_name(token: Token) -> None:
 
 
 class _Trees(TREE):
-    """What the rules and tokens of expression.lark come to; a node's text has its parentheses."""
+    """The actions of the rules and tokens of expression.lark; a node's text includes its parentheses."""
 
     def NUMBER(self, token: Token) -> Token:
         if len(token) > MAX_DIGITS:
@@ -254,18 +254,18 @@ class _Trees(TREE):
     def FUNCTION(self, token: Token) -> Token:
         _check_name(token)
         if token not in FUNCTIONS:
-            close = nearest(token, FUNCTIONS, alike=ALIKE)
-            what = f"there is no function {cut(token)}"
+            close = nearest(token, FUNCTIONS, similarity=SIMILAR)
+            message = f"there is no function {cut(token)}"
             if not close:
-                what += f"; there are: {', '.join(sorted(FUNCTIONS))}"
-            raise ParseError("E325", token, what, hint=f"{close}(…)" if close else "")
+                message += f"; there are: {', '.join(sorted(FUNCTIONS))}"
+            raise ParseError("E325", token, message, hint=f"{close}(…)" if close else "")
         return token
 
     def expression(self, parts: list[Any]) -> list[Any]:
         return parts
 
     def equation(self, parts: list[Any]) -> list[Any]:
-        return [part.start_pos if kind_of(part) else part for part in parts]
+        return [part.start_pos if token_type_of(part) else part for part in parts]
 
     def number(self, parts: list[Token]) -> Expr:
         return NumberLiteral(Fraction(parts[0]), **_span(*parts))
@@ -295,8 +295,8 @@ class _Trees(TREE):
         if sign != "+":
             return Call("neg" if sign == "-" else "not", (operand,), **_span(*parts))
         if isinstance(operand, Call) and operand.function in CONDITIONS:
-            what = f"{cut(format_expression(operand))} is a condition, and a number is due here"
-            raise ParseError("E327", operand.start, what)
+            message = f"{cut(format_expression(operand))} is a condition, and a number is due here"
+            raise ParseError("E327", operand.start, message)
         return operand
 
     def parenthesis(self, parts: list[Any]) -> Any:
@@ -304,17 +304,17 @@ class _Trees(TREE):
 
     def vector(self, parts: list[Any]) -> Expr:
         if len(parts) == 2:
-            what = "a vector has entries; one of zeros is {0, 0}"
-            raise ParseError("E322", parts[0], what)
+            message = "a vector has entries; one of zeros is {0, 0}"
+            raise ParseError("E322", parts[0], message)
         return Call("{", tuple(parts[1:-1]), **_span(*parts))
 
     def call(self, parts: list[Any]) -> Expr:
         function, _, *arguments, _ = parts
         least, most = FUNCTIONS[function]
         if not least <= len(arguments) <= most:
-            wanted = f"{least}" if least == most else f"{least} to {most}"
+            requested = f"{least}" if least == most else f"{least} to {most}"
             plural = "argument" if most == 1 else "arguments"
-            raise ParseError("E325", function, function, f"{wanted} {plural}", f"{len(arguments)}")
+            raise ParseError("E325", function, function, f"{requested} {plural}", f"{len(arguments)}")
         if function != "interval":
             return Call(str(function), tuple(arguments), **_span(*parts))
         [clock] = arguments
@@ -329,9 +329,9 @@ class _Trees(TREE):
 
 
 def _span(*parts: Any) -> dict[str, int]:
-    """Return where the first of several tokens or nodes starts, and where the last ends."""
+    """Return the start of the first of several tokens or nodes, and the end of the last."""
     first, last = parts[0], parts[-1]
     return {
-        "start": first.start_pos if kind_of(first) else first.start,
-        "end": last.end_pos if kind_of(last) else last.end,
+        "start": first.start_pos if token_type_of(first) else first.start,
+        "end": last.end_pos if token_type_of(last) else last.end,
     }

@@ -1,9 +1,9 @@
 """The grammars of the language, read by Lark.
 
-Takes: a grammar beside this module, and what its rules build.
-Gives: `parser`, `ParseError`, `placing`, `TREE`, `kind_of`, `unclosed`, `exponent_of`, `check_size`.
-Guarantees: a mistake knows the offset in its text, and its place once it is placed.
-Does not: bound a text: whoever parses it does, before.
+Takes: a grammar in this folder, and the actions of its rules.
+Gives: `parser`, `ParseError`, `placing`, `TREE`, `token_type_of`, `unclosed`, `exponent_of`, `check_size`.
+Guarantees: an error has the offset in its text, and its location after placing.
+Does not: limit the length of a text: callers do.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from typing import Any
 
 from lark import Lark, Token, Transformer
 
-from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, place_in
-from apc.compiler.words import cut
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, location_in
+from apc.compiler.wording import cut
 
 MAX_NUMBER_EXPONENT = 300  # of 1e300: still a float
 TREE = Transformer[Token, Any]
@@ -28,35 +28,35 @@ _OPENERS = ("LPAR", "LBRACE", "IF", "THEN", "ELSEIF")
 
 
 class ParseError(Exception):
-    """A mistake that does not know yet where its text stands, so that results can be kept by text."""
+    """An error without the location of its text yet, so that results can be cached by text."""
 
     def __init__(
         self,
         code: str,
         at: int | Token | None,
-        what: str,
+        message: str,
         expected: str = "",
         got: str = "",
         hint: str = "",
         subject: str = "",
     ) -> None:
-        super().__init__(what)
+        super().__init__(message)
         self.offset = (at.start_pos if isinstance(at, Token) else at) or 0
-        self.mistake = Diagnostic(code, SourceLocation(""), what, expected, got, hint, subject)
+        self.mistake = Diagnostic(code, SourceLocation(""), message, expected, got, hint, subject)
 
 
 @contextmanager
-def placing(text: str, place: SourceLocation) -> Iterator[None]:
-    """Turn a FaultError of a text that starts at `place` into ApcError."""
+def placing(text: str, location: SourceLocation) -> Iterator[None]:
+    """Turn a FaultError of a text that starts at `location` into ApcError."""
     try:
         yield
     except ParseError as fault:
-        at = place_in(place, text, fault.offset)
-        raise ApcError(replace(fault.mistake, place=at)) from None
+        at = location_in(location, text, fault.offset)
+        raise ApcError(replace(fault.mistake, location=at)) from None
 
 
 def parser(grammar: str, starts: list[str], builder: TREE) -> Callable[[str, str], Any]:
-    """Return what parses a text by a grammar's file, from one of several starts.
+    """Return the parser of a grammar's file, with one of several start rules.
 
     Its rules and tokens call the methods of `builder`.
     """
@@ -64,8 +64,8 @@ def parser(grammar: str, starts: list[str], builder: TREE) -> Callable[[str, str
     return Lark(text, start=starts, parser="lalr", lexer="basic", transformer=builder).parse
 
 
-def kind_of(value: object) -> str:
-    """Return the kind of a token on the parser's stack, an empty text for what is built already."""
+def token_type_of(value: object) -> str:
+    """Return the type of a token on the parser's stack, an empty text for a completed node."""
     return value.type if isinstance(value, Token) else ""
 
 
@@ -78,10 +78,10 @@ def check_size(number: str, at: int | Token, code: str) -> None:
 
 
 def unclosed(stack: Sequence[object]) -> int:
-    """Return where on the parser's stack the innermost parenthesis, brace or `if` is open; -1 if none is."""
+    """Return the stack position of the innermost open parenthesis, brace or `if`; -1 if none."""
     awaited = ""
     for at in reversed(range(len(stack))):
-        kind = kind_of(stack[at])
+        kind = token_type_of(stack[at])
         if awaited:
             awaited = "" if kind == awaited else awaited
         elif kind in _OPENERS:

@@ -1,9 +1,9 @@
-"""What was recorded of a quantity or of packets: time tables, traces, what ping and irtt wrote.
+"""Recordings of a quantity or of packets: time tables, traces, output of ping and irtt.
 
-Takes: a path. Gives: `TimeTable`, `Trace`, in SI.
-Guarantees: times rise; a delay is 0 or more, or says that its packet was lost; a mistake names its file, line
-and column.
-Does not: know what reads them.
+Takes: a path. Gives: `read_time_table`, a `TimeTable`; `read_trace`, a `Trace`; both in SI.
+Guarantees: times increase; a delay is 0 or more, or marks a lost packet; an error names its file, line and
+column.
+Does not: interpret them.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.digits import plain_float
 from apc.compiler.errors import SourceLocation
 from apc.compiler.language.csv_tables import Headings, open_table, read_bytes, read_table
 from apc.compiler.language.dimensions import SECOND
-from apc.compiler.language.probes import LATEST_DELAY, read_probe
+from apc.compiler.language.ping_recordings import LATEST_DELAY, read_probe
 from apc.compiler.language.units import NO_UNIT, Unit
+from apc.compiler.number_parsing import plain_float
 from apc.compiler.source.reading import brief, fault
 
 DELAY = "delay"  # the column of a trace that is read
@@ -47,9 +47,9 @@ def read_time_table(path: Path, name: str, unit: Unit, named_at: SourceLocation)
     path
         The CSV file.
     name, unit
-        What the quantity is called, and a unit of its dimension.
+        The name of the quantity, and a unit of its dimension.
     named_at
-        Where the topology names the file.
+        The location of the file's reference in the topology.
 
     Raises
     ------
@@ -60,22 +60,22 @@ def read_time_table(path: Path, name: str, unit: Unit, named_at: SourceLocation)
     first = table.columns[0]
     if len(table.columns) != 2 or first.unit.dimension != SECOND:
         expected = f"two columns, time [s] and {name} [{unit.text}]"
-        raise fault("E702", first.place, "a table over time", expected)
+        raise fault("E702", first.location, "a table over time", expected)
     times, numbers = table.columns
     if numbers.unit.dimension != unit.dimension:
-        raise fault("E702", numbers.place, brief(numbers.name), unit.text, numbers.unit.text)
+        raise fault("E702", numbers.location, brief(numbers.name), unit.text, numbers.unit.text)
     if table.rows < 2 or not (np.diff(times.numbers) > 0).all():
         expected = "two or more rows of rising time"
-        raise fault("E703", times.place, "a table over time", expected)
+        raise fault("E703", times.location, "a table over time", expected)
     return TimeTable(name, times.numbers, numbers.numbers)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trace:
-    """Recorded one-way delays: `delays` (n,) in seconds, one a packet, infinite for one that was lost.
+    """Recorded one-way delays: `delays` (n,) in seconds, one per packet, infinite for a lost one.
 
-    `program` wrote the file, "" for a table; `interval` lies between two packets, in seconds, not a number
-    where the file doesn't say.
+    `program` wrote the file, "" for a table; `interval` is the sending interval in seconds, NaN if the file
+    does not contain it.
     """
 
     delays: NDArray[np.float64]
@@ -84,23 +84,23 @@ class Trace:
 
 
 def read_trace(path: Path, named_at: SourceLocation) -> Trace:
-    """Read the column `delay` of a CSV file: 0 or more a packet; `lost`, or nothing, if it was lost.
+    """Read the column `delay` of a CSV file: 0 or more per packet; `lost`, or empty, if it was lost.
 
-    Other columns may say anything. A line without a character is no packet. What ping or irtt wrote is read
-    as `probes` tells.
+    Other columns are ignored. An empty line is not a packet. Output of ping or irtt is read by
+    `ping_recordings`.
 
     Parameters
     ----------
     path
         The CSV file.
     named_at
-        Where the topology names it, for a file that can't be read.
+        The location of its reference in the topology, for a file that can't be read.
 
     Raises
     ------
     ApcError
-        E701 it can't be read, E702 there is no column `delay` in a unit of time, E703 a row or cell is at
-        fault, or there is none; E704 a recording of ping or irtt contradicts itself, or holds two runs.
+        E701 it cannot be read, E702 there is no column `delay` in a unit of time, E703 a row or cell is
+        invalid, or there is none; E704 a recording of ping or irtt contradicts itself, or holds two runs.
     """
     if path.suffix.lower() != TABLE_SUFFIX:
         data = read_bytes(path, named_at, any_text=True)
@@ -129,12 +129,12 @@ def read_trace(path: Path, named_at: SourceLocation) -> Trace:
 
 
 def _delay_column(names: Headings) -> int:
-    """Return which column is called delay. Raises ApcError if there is none, or it is in no unit of time."""
-    got, place = ", ".join(name for name, _, _ in names), names[0][2]
+    """Return the index of the column named delay."""
+    got, location = ", ".join(name for name, _, _ in names), names[0][2]
     for column, (name, unit, at) in enumerate(names):
         if name == DELAY:
             if unit.dimension == SECOND:
                 return column
-            got, place = f"delay {'without a unit' if unit == NO_UNIT else f'in {unit.text}'}", at
+            got, location = f"delay {'without a unit' if unit == NO_UNIT else f'in {unit.text}'}", at
     expected = "a column delay in a unit of time"
-    raise fault("E702", place, "a trace", expected, brief(got), "delay [ms]")
+    raise fault("E702", location, "a trace", expected, brief(got), "delay [ms]")

@@ -1,6 +1,7 @@
 """Units checked through expressions and equations.
 
-Takes: `Expr` and `Equation`, and the dimension of every name. Gives: the dimension of an expression.
+Takes: `Expr` and `Equation`, and the dimension of every name.
+Gives: `dimension_of`, the dimension of an expression; `check_equation`.
 Guarantees: every term of an expression that does not fit is reported, each once, at its own column; a part
 whose dimension is unknown complains about nothing.
 Does not: know scales (all is SI by now), or look names up.
@@ -12,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from fractions import Fraction
 
-from apc.compiler.errors import Mistakes, SourceLocation, place_in
+from apc.compiler.errors import Mistakes, SourceLocation, location_in
 from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND, Dimension
 from apc.compiler.language.expression import (
     CONDITIONS,
@@ -37,7 +38,7 @@ _TIMES = {"hold": "s, as a delay", "interpolate": "s, as tables are over time"}
 Lookup = Callable[[Name], Dimension | None]
 
 
-def dimension_of(expr: Expr, lookup: Lookup, text: str, place: SourceLocation) -> Dimension | None:
+def dimension_of(expr: Expr, lookup: Lookup, text: str, location: SourceLocation) -> Dimension | None:
     """Return the dimension of an expression.
 
     Parameters
@@ -45,14 +46,14 @@ def dimension_of(expr: Expr, lookup: Lookup, text: str, place: SourceLocation) -
     expr
         The tree; its offsets count in `text`.
     lookup
-        Gives the dimension of a name, None when it isn't known.
-    text, place
-        The text, and where it starts.
+        Returns the dimension of a name, None if unknown.
+    text, location
+        The text, and its location.
 
     Returns
     -------
     Dimension or None
-        `ANY` for a literal 0, `DIMENSIONLESS` for every other literal and for a condition; None when it hangs
+        `ANY` for a literal 0, `DIMENSIONLESS` for every other literal and for a condition; None if it depends
         on a name without a dimension. A sum with one known term has that term's.
 
     Raises
@@ -61,7 +62,7 @@ def dimension_of(expr: Expr, lookup: Lookup, text: str, place: SourceLocation) -
         E402 a term that doesn't fit its sum, E403 an argument that has to be a plain number, E404 branches,
         arguments or sides of a comparison that differ, E405 a delay that is no time.
     """
-    checker = _Checker(lookup, text, place)
+    checker = _Checker(lookup, text, location)
     dimension = checker.dimension(expr)
     checker.mistakes.raise_if_any()
     return dimension
@@ -78,37 +79,39 @@ def check_equation(equation: Equation, lookup: Lookup) -> None:
     ApcError
         E401 a term that doesn't fit the equation; and those of `dimension_of`.
     """
-    checker = _Checker(lookup, equation.text, equation.place)
+    checker = _Checker(lookup, equation.text, equation.location)
     checker.agree("E401", [*_terms(equation.left), *_terms(equation.right)])
     checker.mistakes.raise_if_any()
 
 
 def _terms(expr: Expr) -> list[Expr]:
-    """Return what a sum adds up, signs and parentheses taken apart."""
+    """Return the operands of a sum, with signs and parentheses resolved."""
     match expr:
         case Call("+" | "-" | "neg", parts):
             return [term for part in parts for term in _terms(part)]
     return [expr]
 
 
-def _said(dimension: Dimension) -> str:
+def _dimension_text(dimension: Dimension) -> str:
     return "a plain number" if dimension == DIMENSIONLESS else format_dimension(dimension)
 
 
 class _Checker:
-    """Finds dimensions and collects mistakes; a part with a mistake counts as unknown, to say it once."""
+    """Determines dimensions and collects errors; a part with an error is unknown, to report it once."""
 
-    def __init__(self, lookup: Lookup, text: str, place: SourceLocation) -> None:
-        self.lookup, self.text, self.place = lookup, text, place
+    def __init__(self, lookup: Lookup, text: str, location: SourceLocation) -> None:
+        self.lookup, self.text, self.location = lookup, text, location
         self.mistakes = Mistakes()
 
-    def said(self, expr: Expr) -> str:
+    def expression_text(self, expr: Expr) -> str:
         written = as_written(expr, self.text)
         return written if len(written) <= 60 else written[:57] + "…"
 
     def add(self, code: str, expr: Expr, expected: str, got: Dimension) -> None:
-        place = place_in(self.place, self.text, expr.start)
-        self.mistakes.add(code, place, self.said(expr), expected=expected, got=_said(got))
+        location = location_in(self.location, self.text, expr.start)
+        self.mistakes.add(
+            code, location, self.expression_text(expr), expected=expected, got=_dimension_text(got)
+        )
 
     def agree(self, code: str, parts: Sequence[Expr]) -> Dimension | None:
         """Return the dimension most parts have, the first of them in a tie; report the others."""
@@ -116,12 +119,14 @@ class _Checker:
         known = [(part, dimension) for part, dimension in pairs if dimension not in (None, ANY)]
         if not known:
             return None if any(dimension is None for _, dimension in pairs) else ANY
-        usual = Counter(dimension for _, dimension in known).most_common(1)[0][0]
-        like = next(part for part, dimension in known if dimension == usual)
+        typical = Counter(dimension for _, dimension in known).most_common(1)[0][0]
+        like = next(part for part, dimension in known if dimension == typical)
         for part, dimension in known:
-            if dimension and usual and (dimension != usual or dimension.clashes(usual)):
-                self.add(code, part, f"{_said(usual)} like {self.said(like)}", dimension)
-        return usual
+            if dimension and typical and (dimension != typical or dimension.clashes(typical)):
+                self.add(
+                    code, part, f"{_dimension_text(typical)} like {self.expression_text(like)}", dimension
+                )
+        return typical
 
     def fits(self, expr: Expr, due: Dimension, code: str, expected: str) -> None:
         """Report an argument that has to be of one dimension and is not."""

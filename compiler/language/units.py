@@ -1,12 +1,12 @@
-"""The text of a unit or of a quantity to exact SI numbers.
+"""Conversion of units and quantities to exact SI numbers.
 
-Takes: a text (`N*s/m`, `500 N/m`), and where it stands.
-Gives: `Unit`, `Quantity`; `parse_unit`, `parse_quantity`, and `quantity`, which has to fit a unit; `COMMON`.
+Takes: a text (`N*s/m`, `500 N/m`), and its location. Gives: `Unit`, `Quantity`; `parse_unit`,
+`parse_quantity`, and `quantity`, which must match a unit; `COMMON`.
 Guarantees: values are exact rationals (0.1 kg is 1/10, an angle in degrees uses π to 50 digits); the cost of
-a text is bounded; a unit that is not in units.txt, as a grain, is not taken for one that is meant.
-Does not: know which quantity wants which unit, or check expressions (see `unit_check`).
+a text is bounded; a unit that is not in units.txt, such as the grain, is not accepted.
+Does not: define units of parameters, or check expressions (see `unit_check`).
 
-A quantity is `number ["/" number] [unit]`; unit.lark is the grammar of a unit, Pint knows what its names are.
+A quantity is `number ["/" number] [unit]`; unit.lark is the grammar of a unit, Pint defines its names.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ from apc.compiler.language.parsing import (
     ParseError,
     check_size,
     exponent_of,
-    kind_of,
     parser,
     placing,
+    token_type_of,
     unclosed,
 )
-from apc.compiler.words import cut
+from apc.compiler.wording import cut
 
 TURN = 2 * PI  # a cycle in radians
 MAX_LENGTH = 200  # characters of a quantity
 MAX_EXPONENT = 9  # of a unit: m^9
 
-# What a scene is likely to use: proposed for a misspelt name, and told apart by case.
+# Common units: suggested for a misspelt name, and distinguished by case.
 COMMON = (
     "N",
     "mN",
@@ -128,7 +128,7 @@ class Quantity:
 NO_UNIT = Unit("1", Fraction(1), DIMENSIONLESS)
 
 
-def parse_unit(text: str, place: SourceLocation) -> Unit:
+def parse_unit(text: str, location: SourceLocation) -> Unit:
     """Read a unit; `1` is the unit of a plain number.
 
     Raises
@@ -137,11 +137,11 @@ def parse_unit(text: str, place: SourceLocation) -> Unit:
         E222 not the text of a unit, E223 no such unit, E224 a unit with an offset or a logarithm,
         E225 an exponent or scale that is too large.
     """
-    with placing(text, place):
+    with placing(text, location):
         return _unit(text)
 
 
-def parse_quantity(text: str, place: SourceLocation) -> Quantity:
+def parse_quantity(text: str, location: SourceLocation) -> Quantity:
     """Read a number and its unit, if it has one.
 
     Raises
@@ -149,82 +149,84 @@ def parse_quantity(text: str, place: SourceLocation) -> Quantity:
     ApcError
         E221 not the text of a quantity, E226 a number that is too large; and those of `parse_unit`.
     """
-    with placing(text, place):
+    with placing(text, location):
         return _quantity(text)
 
 
 def quantity(
     text: str,
-    place: SourceLocation,
+    location: SourceLocation,
     *,
-    what: str,
+    subject: str,
     unit: str,
     before: str | None = None,
     one_fix: bool = False,
 ) -> Quantity:
-    """Read a quantity that has to fit a unit.
+    """Read a quantity that must match a unit.
 
     Parameters
     ----------
     text
         The quantity as written.
-    place
-        Where it stands.
-    what
-        The name it is given to, for messages.
+    location
+        Its location.
+    subject
+        Its name, for messages.
     unit
-        A unit that fits; `1` for a plain number.
+        A valid unit; `1` for a plain number.
     before
-        What stands before the value in a fix, the name and a colon by default.
+        Text before the value in a fix; the name and a colon by default.
     one_fix
-        Whether a fix is one quantity, where two may be meant.
+        Whether the fix is a single quantity.
 
     Raises
     ------
     ApcError
         E204 a unit that does not fit, or none; and those of `parse_quantity`.
     """
-    wanted = parse_unit(unit, place)
+    requested = parse_unit(unit, location)
     named = "a plain number" if unit == "1" else unit
-    before = f"{what}: " if before is None else before
+    before = f"{subject}: " if before is None else before
     try:
-        parsed = parse_quantity(text, place)
+        parsed = parse_quantity(text, location)
     except ApcError as error:
         [mistake] = error.mistakes
         alone = not set("*/^") & set(text)  # it is all there is of the unit
         if mistake.code == "E223" and mistake.hint:
-            meant = unit if alone and not _is_of(mistake.hint, wanted.dimension) else mistake.hint
-            if not place.line:  # of an option, whose value is written anew
+            meant = unit if alone and not _is_of(mistake.hint, requested.dimension) else mistake.hint
+            if not location.line:  # of an option, whose value is written anew
                 meant = f"{before}{text.strip().replace(mistake.subject, meant)}"
             raise ApcError(replace(mistake, hint=meant)) from None
         if mistake.code != "E221" or mistake.hint:
             raise
         example = f"{before}1 {unit}".removesuffix(" 1")
-        raise ApcError(Diagnostic("E221", place, what, named, cut(text) or "nothing", example)) from None
-    actual, due = parsed.unit.dimension, wanted.dimension
+        raise ApcError(
+            Diagnostic("E221", location, subject, named, cut(text) or "nothing", example)
+        ) from None
+    actual, due = parsed.unit.dimension, requested.dimension
     got, right = cut(text.strip()), unit
     if actual == due:
         if not actual.clashes(due):
             return parsed
         # 20 Hz are 125.66 rad/s.
         turns = TURN if due.turning == "rad" else 1 / TURN
-        same = f"{float(parsed.value * turns / wanted.scale):.9g} {unit}"
+        same = f"{float(parsed.value * turns / requested.scale):.9g} {unit}"
         got += f", which is {same}"
         hint = f"{before}{same}" + f", or {before}{parsed.number} {unit}" * (not one_fix)
     else:
         if parsed.unit == NO_UNIT:
             got += " (no unit)"
         else:
-            right, slip = _meant(parsed.unit, wanted)
+            right, slip = _meant(parsed.unit, requested)
             got += f" ({slip} is {_long_name(slip)}: case matters)" if slip else ""
         hint = f"{before}{parsed.number} {right}".removesuffix(" 1") if right else ""
         # A rate in the place of a time, or the other way round; radians don't say how long a turn takes.
         if actual == due.power(-1) and actual.turning != "rad" and parsed.value:
-            hint = f"{before}{float(1 / (parsed.value * wanted.scale)):.9g} {unit}"
-    raise ApcError(Diagnostic("E204", place, what, named, got, hint))
+            hint = f"{before}{float(1 / (parsed.value * requested.scale)):.9g} {unit}"
+    raise ApcError(Diagnostic("E204", location, subject, named, got, hint))
 
 
-def _meant(unit: Unit, wanted: Unit) -> tuple[str, str]:
+def _meant(unit: Unit, requested: Unit) -> tuple[str, str]:
     """Return a unit of the dimension that is wanted in which the number as written may be meant.
 
     That is the unit with a name in another case, which is returned as well, MS for ms; without one of its
@@ -237,14 +239,14 @@ def _meant(unit: Unit, wanted: Unit) -> tuple[str, str]:
     texts += [(text[: match.start()] + text[match.end() :], "") for match in _EXPONENT.finditer(text)]
     longer = ((name, other) for name, other in others if other[:-1] == name)
     texts += [(re.sub(rf"\b{re.escape(name)}\b", other, text), "") for name, other in longer]
-    fitting = (candidate for candidate in texts if _is_of(candidate[0], wanted.dimension))
-    return next(fitting, (wanted.text if unit.scale == wanted.scale else "", ""))
+    fitting = (candidate for candidate in texts if _is_of(candidate[0], requested.dimension))
+    return next(fitting, (requested.text if unit.scale == requested.scale else "", ""))
 
 
-def _is_of(text: str, wanted: Dimension) -> bool:
-    """Say whether a text is a unit of a dimension; made from another unit it may be none, as a root of mm."""
+def _is_of(text: str, requested: Dimension) -> bool:
+    """Return whether a text is a unit of a dimension; a derived unit may not be, as a root of mm."""
     try:
-        return _unit(text).dimension == wanted
+        return _unit(text).dimension == requested
     except ParseError:
         return False
 
@@ -302,8 +304,8 @@ def _unit(text: str) -> Unit:
         _refuse(text, fault)
     dimensions = registry().get_dimensionality(powers)
     if any(abs(power) > MAX_EXPONENT for power in (*powers.values(), *dimensions.values())):
-        what = f"{cut(text.strip())} is no unit of this world: an exponent or its scale is too large"
-        raise ParseError("E225", 0, what)
+        message = f"{cut(text.strip())} is no unit of this world: an exponent or its scale is too large"
+        raise ParseError("E225", 0, message)
     # The square of the scale, so that the root of a square is exact; Pint's unit of mass is the gram.
     square, _ = registry().get_root_units(powers**2)
     square = square / Fraction(1000) ** (2 * dimensions["[mass]"])
@@ -334,7 +336,7 @@ def _refuse(text: str, fault: UnexpectedToken) -> NoReturn:
 
 
 def _turning(text: str) -> str:
-    """Return whether a unit counts cycles ("Hz") or radians ("rad"); an empty text if it tells of neither."""
+    """Return whether a unit counts cycles ("Hz") or radians ("rad"); an empty text if neither."""
     for name in map(_long_name, NAME.findall(text)):
         if name.endswith("hertz"):
             return "Hz"
@@ -344,12 +346,12 @@ def _turning(text: str) -> str:
 
 
 class _Units(TREE):
-    """What the rules of unit.lark come to: Pint's products of powers of names."""
+    """The actions of the rules of unit.lark: Pint's products of powers of names."""
 
     def NAME(self, token: Token) -> Any:
-        return registry().UnitsContainer({_looked_up(token): Fraction(1)})
+        return registry().UnitsContainer({_in_catalogue(token): Fraction(1)})
 
-    def one(self, parts: list[Token]) -> Any:
+    def unity(self, parts: list[Token]) -> Any:
         if parts[0] != "1":
             expected = "a name such as N, m or s"
             raise ParseError("E222", parts[0], "a unit", expected, str(parts[0]))
@@ -363,7 +365,7 @@ class _Units(TREE):
 
     def raised(self, parts: list[Any]) -> Any:
         exponent = parts[-1]
-        return parts[0] ** (Fraction(2 + "²³".index(exponent)) if kind_of(exponent) else exponent)
+        return parts[0] ** (Fraction(2 + "²³".index(exponent)) if token_type_of(exponent) else exponent)
 
     def exponent(self, parts: list[Token]) -> Fraction:
         for part in parts:
@@ -390,7 +392,7 @@ def registry() -> Any:
 
 @cache
 def _everything() -> Any:
-    """Return Pint's registry of every unit it knows, for messages: it takes a third of a second to build."""
+    """Return Pint's registry of all its units, for messages: creation takes a third of a second."""
     return pint.UnitRegistry(non_int_type=Fraction)
 
 
@@ -403,7 +405,7 @@ def _long_name(name: str) -> str:
     return ""
 
 
-def _looked_up(name: Token) -> str:
+def _in_catalogue(name: Token) -> str:
     """Return the long name of a unit. Raises FaultError: E223 no such unit, E224 no multiple of SI."""
     if long_name := _long_name(name):
         return long_name
@@ -416,19 +418,19 @@ def _looked_up(name: Token) -> str:
     spelled = f"{prefix}{unit}".replace("_", " ")
     roots = every.get_root_units(unit)[1]._units
     if not every._units[unit].is_multiplicative or any(root not in registry() for root in roots):
-        what = f"{name} ({prefix}{unit}) is no multiple of an SI unit"
-        raise ParseError("E224", name, what, hint="K" if "degree_" in unit else "")
+        message = f"{name} ({prefix}{unit}) is no multiple of an SI unit"
+        raise ParseError("E224", name, message, hint="K" if "degree_" in unit else "")
     dimension = every.get_dimensionality(unit)
     like = [other for other in COMMON if registry().get_dimensionality(other) == dimension]
     proposed = f"; there are {', '.join(like[:3])}" if like else ""
-    what = f"there is no unit {name} here: {spelled} is out of use{proposed}"
+    message = f"there is no unit {name} here: {spelled} is out of use{proposed}"
     lower = name.lower()
     similar = (other for other in like if lower == other.lower() or lower.startswith(other))
-    raise ParseError("E223", name, what, hint=next(similar, ""), subject=name)
+    raise ParseError("E223", name, message, hint=next(similar, ""), subject=name)
 
 
 def _proposal(name: str) -> str:
-    """Return what was probably meant: another case, an exponent, a product, or the nearest common name."""
+    """Return the probable intention: another case, an exponent, a product, or the nearest common name."""
     for other in COMMON:
         if other.lower() == name.lower():
             return other

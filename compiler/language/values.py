@@ -1,8 +1,10 @@
-"""Numbers in the text: quantities, words that stand for numbers, and expressions over named numbers.
+"""Numbers in the text: quantities, words that represent numbers, and expressions over named numbers.
 
-Takes: scalars of YAML. Gives: `ValueBinding` (what was written) and `ScalarValue` (what it comes to).
-Guarantees: dimensions agree and bounds hold, or a mistake says so at its place.
-Does not: know sections, parts or peers.
+Takes: scalars of YAML. Gives: `ValueBinding`, the value as written, by `read_binding` or `read_free`;
+`ScalarValue`, the number, by `settle`; `resolve_in_order`, `renamed`; `Bounds`, `is_quantity`,
+`text_location`; `AlreadyReportedError`.
+Guarantees: dimensions agree and bounds hold, or an error reports it with its location.
+Does not: handle sections, parts or peers.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from graphlib import CycleError, TopologicalSorter
 
-from apc.compiler.errors import ApcError, Mistakes, SourceLocation, place_in
+from apc.compiler.errors import ApcError, Mistakes, SourceLocation, location_in
 from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension
 from apc.compiler.language.evaluation import evaluate
 from apc.compiler.language.expression import FUNCTIONS, Expr, Name, format_expression, names, transform
@@ -24,7 +26,7 @@ from apc.compiler.language.units import parse_quantity, parse_unit, quantity
 from apc.compiler.language.vectors import number_of
 from apc.compiler.source.nodes import Node, Scalar
 from apc.compiler.source.reading import brief, either_comma, fault, text_of, unknown
-from apc.compiler.words import with_unit
+from apc.compiler.wording import with_unit
 
 PEERS = ("peers",)
 
@@ -50,7 +52,7 @@ class ValueBinding:
     number: Fraction | None
     expression: Expr | None
     dimension: Dimension
-    place: SourceLocation
+    location: SourceLocation
     unit: str = ""
 
 
@@ -63,14 +65,14 @@ class ScalarValue:
     number: Fraction
     dimension: Dimension
     expression: Expr | None
-    place: SourceLocation
+    location: SourceLocation
     unit: str = ""
 
     def __str__(self) -> str:
         """Return the number in the unit in which it was written, without one in SI."""
         if not self.unit:
             return format_si(float(self.number), self.dimension)
-        return with_unit(f"{float(self.number / parse_unit(self.unit, self.place).scale):.6g}", self.unit)
+        return with_unit(f"{float(self.number / parse_unit(self.unit, self.location).scale):.6g}", self.unit)
 
 
 class AlreadyReportedError(ApcError):
@@ -83,29 +85,29 @@ class AlreadyReportedError(ApcError):
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """Where a number must lie, in SI; `unit` is the one its messages use."""
+    """The range of a number, in SI; `unit` is the one for its messages."""
 
     unit: str
     scale: Fraction
     minimum: Fraction | None = None
-    open_minimum: bool = False
+    exclusive_minimum: bool = False
     maximum: Fraction | None = None
 
     def fault(self, number: Fraction) -> str:
-        """Return what the bounds ask for if the number breaks them, else an empty text."""
+        """Return the violated bounds in words, else an empty text."""
         least = self.minimum
-        if least is not None and (number < least or (self.open_minimum and number == least)):
+        if least is not None and (number < least or (self.exclusive_minimum and number == least)):
             shown = f"{self._shown(least)} {self.unit}"
-            return f"more than {shown}" if self.open_minimum else f"{shown} or more"
+            return f"more than {shown}" if self.exclusive_minimum else f"{shown} or more"
         if self.maximum is not None and number > self.maximum:
             return f"{self._shown(self.maximum)} {self.unit} or less"
         return ""
 
-    def check(self, value: ScalarValue, what: str, mistakes: Mistakes) -> None:
+    def check(self, value: ScalarValue, message: str, mistakes: Mistakes) -> None:
         """Record a number that breaks the bounds."""
         if expected := self.fault(value.number):
             got = f"{self._shown(value.number)} {self.unit}"
-            mistakes.add("E207", value.place, what, expected=expected, got=got)
+            mistakes.add("E207", value.location, message, expected=expected, got=got)
 
     def _shown(self, number: Fraction) -> str:
         return f"{float(number / self.scale):.12g}"
@@ -116,120 +118,124 @@ def is_quantity(text: str) -> bool:
     return bool(_QUANTITY.match(text) or _WORD_NUMBER.match(text))
 
 
-def text_place(node: Node) -> SourceLocation:
-    """Return where a scalar's text starts: behind the opening quote, if it has one."""
+def text_location(node: Node) -> SourceLocation:
+    """Return the start of a scalar's text: after the opening quote, if any."""
     quoted = isinstance(node, Scalar) and not node.plain
-    return node.place.shifted(1) if quoted else node.place
+    return node.location.shifted(1) if quoted else node.location
 
 
 def read_binding(
     node: Node,
-    what: str,
+    message: str,
     dimension: Dimension,
     unit: str,
     known: Callable[[tuple[str, ...]], Dimension | None],
     names_known: Collection[str],
     words: Collection[tuple[str, Fraction]] = (),
 ) -> ValueBinding:
-    """Read a number: a quantity, a word that stands for one, or an expression.
+    """Read a number: a quantity, a word that represents one, or an expression.
 
     Parameters
     ----------
     node
-        Where it stands.
-    what
-        What it is, for messages.
+        The YAML node.
+    message
+        Its name, for messages.
     dimension, unit
-        What it must be in.
+        The required dimension and unit.
     known
         The dimension of a name an expression may use, or None.
     names_known
         All these names, for messages.
     words
-        Words that stand for numbers.
+        Words that represent numbers.
 
     Raises
     ------
     ApcError
-        E203 no single value, E204 a unit that does not fit, E206 for every name that isn't known; and those
-        of `quantity`, `parse_expression` and `dimension_of`.
+        E203 not a single value, E204 a unit that does not match, E206 for every unknown name; and those of
+        `quantity`, `parse_expression` and `dimension_of`.
     """
-    text, place = text_of(node, what, f"{what}: 1 {unit}"), node.place
-    number, own = dict(words).get(text), ""
+    text, location = text_of(node, message, f"{message}: 1 {unit}"), node.location
+    number, local = dict(words).get(text), ""
     if number is None:
-        _refuse_marks(text, place, what)
-        _refuse_computed(text, place, what, unit)
+        _refuse_marks(text, location, message)
+        _refuse_computed(text, location, message, unit)
         if not is_quantity(text):
-            place = text_place(node)
-            tree = _tree(text, place)
-            actual = _dimension(tree, text, place, what, known, names_known)
+            location = text_location(node)
+            tree = _tree(text, location)
+            actual = _dimension(tree, text, location, message, known, names_known)
             if actual is not None and actual != ANY and (actual != dimension or actual.clashes(dimension)):
                 got, hint = _misfit(tree, actual, dimension, unit)
-                raise fault("E204", place, what, unit, f"{brief(text)}, which {got}", f"{what}: {hint}")
-            return ValueBinding(None, tree, dimension, place)
-        _refuse_beside(text, place, what, names_known)
-        _refuse_mixture(text, place, what, names_known)
-        read = quantity(text, place, what=what, unit=unit)
-        number, own = read.value, read.unit.text
-    return ValueBinding(number, None, dimension, place, own)
+                raise fault(
+                    "E204", location, message, unit, f"{brief(text)}, which {got}", f"{message}: {hint}"
+                )
+            return ValueBinding(None, tree, dimension, location)
+        _refuse_trailing(text, location, message, names_known)
+        _refuse_mixture(text, location, message, names_known)
+        read = quantity(text, location, subject=message, unit=unit)
+        number, local = read.value, read.unit.text
+    return ValueBinding(number, None, dimension, location, local)
 
 
-def _refuse_marks(text: str, place: SourceLocation, what: str) -> None:
-    """Raise ApcError for a number with a decimal comma, or whose thousands are set apart."""
+def _refuse_marks(text: str, location: SourceLocation, message: str) -> None:
+    """Raise ApcError for a number with a decimal comma, or with thousands separators."""
     bare = text.strip()
     if (match := _COMMA.fullmatch(bare)) is not None:
-        raise fault("E221", place, what, "a decimal point", brief(text), either_comma(what, *match.groups()))
+        raise fault(
+            "E221", location, message, "a decimal point", brief(text), either_comma(message, *match.groups())
+        )
     if (match := _SPACED.match(bare)) is not None:
         joined = re.sub(r"[^0-9+-]", "", match[0]) + bare[match.end() :]
         expected = "a number without spaces or marks inside"
-        raise fault("E221", place, what, expected, brief(text), f"{what}: {joined}")
+        raise fault("E221", location, message, expected, brief(text), f"{message}: {joined}")
 
 
-def _refuse_computed(text: str, place: SourceLocation, what: str, unit: str) -> None:
+def _refuse_computed(text: str, location: SourceLocation, message: str, unit: str) -> None:
     """Raise ApcError for numbers that are computed and have a unit behind them, as 2*pi*100 N/m."""
     match = _COMPUTED.fullmatch(text.strip())
     if match is None or is_quantity(text) or not match["numbers"].strip():
         return
     hint = ""
     with Mistakes():
-        number = evaluate(parse_expression(match["numbers"], place), lambda _: 0, place)
-        if parse_unit(match["unit"], place).dimension == parse_unit(unit, place).dimension:
-            hint = f"{what}: {float(number):.9g} {match['unit']}"
+        number = evaluate(parse_expression(match["numbers"], location), lambda _: 0, location)
+        if parse_unit(match["unit"], location).dimension == parse_unit(unit, location).dimension:
+            hint = f"{message}: {float(number):.9g} {match['unit']}"
     if hint:
-        raise fault("E204", place, what, _NO_UNITS, brief(text), hint)
+        raise fault("E204", location, message, _NO_UNITS, brief(text), hint)
 
 
-# A number beside a word, and no sign between them.
+# A number next to a word, without a sign between them.
 _BESIDE = re.compile(r"(?P<number>[+-]?[\d.]+(?:[eE][+-]?\d+)?)\s*(?P<rest>\(*(?P<word>[A-Za-z]\w*))")
 
 
-def _refuse_beside(text: str, place: SourceLocation, what: str, names_known: Collection[str]) -> None:
-    """Raise ApcError for a number beside a name, with no sign between them, as 2pi*f."""
-    beside = _BESIDE.match(text.strip())
-    if beside is None or beside["word"] not in {*names_known, "pi", *FUNCTIONS}:
+def _refuse_trailing(text: str, location: SourceLocation, message: str, names_known: Collection[str]) -> None:
+    """Raise ApcError for a number next to a name without a sign between them, as 2pi*f."""
+    alongside = _BESIDE.match(text.strip())
+    if alongside is None or alongside["word"] not in {*names_known, "pi", *FUNCTIONS}:
         return
     with Mistakes():
-        parse_unit(beside["word"], place)
+        parse_unit(alongside["word"], location)
         return
-    hint = f"{what}: {beside['number']}*{text.strip()[beside.start('rest') :]}"
-    raise fault("E204", place, what, _NO_UNITS, brief(text), hint)
+    hint = f"{message}: {alongside['number']}*{text.strip()[alongside.start('rest') :]}"
+    raise fault("E204", location, message, _NO_UNITS, brief(text), hint)
 
 
-def _refuse_mixture(text: str, place: SourceLocation, what: str, names_known: Collection[str]) -> None:
+def _refuse_mixture(text: str, location: SourceLocation, message: str, names_known: Collection[str]) -> None:
     """Raise ApcError for a quantity with a unit that goes on as an expression, as 500 N/m/(peers - 1)."""
     for word in re.finditer(r"[A-Za-z]\w*", text):
         before = text[: word.start()].rstrip(" (")
         if word.group() in names_known and before[-1:] in ("*", "/", "+", "-"):
             with Mistakes():
-                parse_unit(word.group(), place)
+                parse_unit(word.group(), location)
                 return
             number, rest = before[:-1].strip(), text[len(before) - 1 :].strip()
-            hint = f"{what}: total{rest}, with parameters: {{total: {number}}}"
-            raise fault("E204", place, what, _NO_UNITS, brief(text), hint)
+            hint = f"{message}: total{rest}, with parameters: {{total: {number}}}"
+            raise fault("E204", location, message, _NO_UNITS, brief(text), hint)
 
 
 def _misfit(tree: Expr, actual: Dimension, due: Dimension, unit: str) -> tuple[str, str]:
-    """Return what is wrong with an expression of another dimension than is due, and what to write."""
+    """Return the error for an expression of a wrong dimension, with a suggestion."""
     if actual != due:
         got = "has no unit" if actual == DIMENSIONLESS else f"is in {format_dimension(actual)}"
         return got, f"1 {unit}".removesuffix(" 1")
@@ -240,15 +246,15 @@ def _misfit(tree: Expr, actual: Dimension, due: Dimension, unit: str) -> tuple[s
     return f"is in {format_dimension(actual)}", hint
 
 
-def _tree(text: str, place: SourceLocation) -> Expr:
-    return number_of(parse_expression(text, place), text, place)
+def _tree(text: str, location: SourceLocation) -> Expr:
+    return number_of(parse_expression(text, location), text, location)
 
 
 def _dimension(
     tree: Expr,
     text: str,
-    place: SourceLocation,
-    what: str,
+    location: SourceLocation,
+    subject: str,
     known: Callable[[tuple[str, ...]], Dimension | None],
     names_known: Collection[str],
 ) -> Dimension | None:
@@ -257,48 +263,48 @@ def _dimension(
     for node in names(tree):
         if known(node.parts) is None:
             shown = ".".join(node.parts)
-            got = f"{what} names {brief(shown)}, which is no parameter here"
-            mistakes.take(unknown("E206", place_in(place, text, node.start), got, shown, names_known))
+            got = f"{subject} names {brief(shown)}, which is no parameter here"
+            mistakes.take(unknown("E206", location_in(location, text, node.start), got, shown, names_known))
     mistakes.raise_if_any()
-    return dimension_of(tree, lambda name: known(name.parts), text, place)
+    return dimension_of(tree, lambda name: known(name.parts), text, location)
 
 
 def settle(binding: ValueBinding, number_of: Callable[[tuple[str, ...]], Fraction]) -> ScalarValue:
-    """Return what a binding comes to, given what its names come to. Raises ApcError if it has no value."""
+    """Return the value of a binding, given the values of its names."""
     if binding.expression is None:
         assert binding.number is not None
-        return ScalarValue(binding.number, binding.dimension, None, binding.place, binding.unit)
-    number = Fraction(evaluate(binding.expression, number_of, binding.place))
-    return ScalarValue(number, binding.dimension, binding.expression, binding.place)
+        return ScalarValue(binding.number, binding.dimension, None, binding.location, binding.unit)
+    number = Fraction(evaluate(binding.expression, number_of, binding.location))
+    return ScalarValue(number, binding.dimension, binding.expression, binding.location)
 
 
-def read_free(node: Node, what: str, others: Collection[str]) -> ValueBinding:
+def read_free(node: Node, subject: str, others: Collection[str]) -> ValueBinding:
     """Read a number of any unit: a quantity, or an expression over others whose names are checked later."""
-    text, place = text_of(node, what, f"{what}: 2000 N/m"), text_place(node)
+    text, location = text_of(node, subject, f"{subject}: 2000 N/m"), text_location(node)
     if not is_quantity(text):
-        return ValueBinding(None, _tree(text, place), DIMENSIONLESS, place)
-    _refuse_beside(text, place, what, others)
-    parsed = parse_quantity(text, node.place)
-    return ValueBinding(parsed.value, None, parsed.unit.dimension, node.place, parsed.unit.text)
+        return ValueBinding(None, _tree(text, location), DIMENSIONLESS, location)
+    _refuse_trailing(text, location, subject, others)
+    parsed = parse_quantity(text, node.location)
+    return ValueBinding(parsed.value, None, parsed.unit.dimension, node.location, parsed.unit.text)
 
 
 def resolve_in_order(
     waiting: Mapping[str, ValueBinding], peers: int | None, mistakes: Mistakes
 ) -> dict[str, ScalarValue]:
-    """Settle named numbers that depend on each other, in the order in which they can be known.
+    """Evaluate named numbers that depend on each other, in order of dependence.
 
     Parameters
     ----------
     waiting
         The numbers as written, by name.
     peers
-        What the name `peers` stands for; None where that was reported as faulty.
+        The value of the name `peers`; None if its error was reported.
     mistakes
-        Takes E206 a name that isn't known, E209 a circle, and those of evaluating.
+        Collects E206 an unknown name, E209 a cycle, and errors of evaluation.
 
     Returns
     -------
-    The values, in the order of `waiting`; the fault of one that isn't there was reported once, where it is.
+    The values, in the order of `waiting`; the error of a missing one was reported once, at its location.
     """
     needs = {
         name: {".".join(node.parts) for node in names(binding.expression)} if binding.expression else set()
@@ -310,7 +316,9 @@ def resolve_in_order(
         chain = error.args[1][:0:-1]
         first = min(range(len(chain)), key=lambda k: [*waiting].index(chain[k]))
         chain = [*chain[first:], *chain[:first], chain[first]]
-        mistakes.add("E209", waiting[chain[0]].place, f"parameters depend in a circle: {' → '.join(chain)}")
+        mistakes.add(
+            "E209", waiting[chain[0]].location, f"parameters depend in a circle: {' → '.join(chain)}"
+        )
         return {}
     settled = {"peers": ScalarValue(Fraction(peers or 0), DIMENSIONLESS, None, SourceLocation(""))}
     if peers is None:
@@ -328,7 +336,7 @@ def _settled(name: str, binding: ValueBinding, settled: Mapping[str, ScalarValue
         return None if value is None else value.dimension
 
     if (tree := binding.expression) is not None:
-        actual = _dimension(tree, format_expression(tree), binding.place, name, dimension, settled)
+        actual = _dimension(tree, format_expression(tree), binding.location, name, dimension, settled)
         binding = replace(binding, dimension=DIMENSIONLESS if actual in (None, ANY) else actual)
     return settle(binding, lambda parts: settled[".".join(parts)].number)
 

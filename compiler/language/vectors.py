@@ -23,7 +23,7 @@ from itertools import islice
 from operator import attrgetter
 from typing import NoReturn, TypeVar
 
-from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, place_in
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, location_in
 from apc.compiler.language.expression import (
     CONDITIONS,
     FUNCTIONS,
@@ -72,7 +72,7 @@ def whole_and_index(name: str) -> tuple[str, int]:
 
 
 def by_vector(items: Iterable[T], name: Callable[[T], str] = attrgetter("name")) -> dict[str, list[T]]:
-    """Return items by the vectors whose entries their names are of; what is of a number stands alone."""
+    """Return items grouped by the vectors of their entries; items of scalars are separate."""
     vectors: dict[str, list[T]] = {}
     for item in items:
         vectors.setdefault(whole_and_index(name(item))[0], []).append(item)
@@ -89,7 +89,7 @@ def sizes_of(names: Iterable[tuple[str, ...]]) -> dict[tuple[str, ...], int]:
     return sizes
 
 
-def written_out(expr: Expr, size_of: SizeOf, text: str, place: SourceLocation) -> Written:
+def written_out(expr: Expr, size_of: SizeOf, text: str, location: SourceLocation) -> Written:
     """Return an expression for each entry of a vector, one for a number; None if its size isn't known yet.
 
     Parameters
@@ -97,8 +97,8 @@ def written_out(expr: Expr, size_of: SizeOf, text: str, place: SourceLocation) -
     expr
         The tree; its offsets count in `text`.
     size_of
-        Gives the size of a name, None when it isn't known.
-    text, place
+        Returns the size of a name, None if unknown.
+    text, location
         The text, and where it starts.
 
     Raises
@@ -106,39 +106,42 @@ def written_out(expr: Expr, size_of: SizeOf, text: str, place: SourceLocation) -
     ApcError
         E328 it gets too long, E406 sizes that differ, E407 a vector where a number is due or the reverse.
     """
-    written = _VectorWriter(size_of, text, place).written(expr)
+    written = _VectorWriter(size_of, text, location).written(expr)
     for tree in written or (expr,):
         if len(list(islice(walk(tree), MAX_LENGTH + 1))) > MAX_LENGTH:
-            what = f"entry by entry this has more than {MAX_LENGTH} terms: give a part of it a name"
-            raise ApcError(Diagnostic("E328", place_in(place, text, expr.start), what))
+            message = f"entry by entry this has more than {MAX_LENGTH} terms: give a part of it a name"
+            raise ApcError(Diagnostic("E328", location_in(location, text, expr.start), message))
     return written
 
 
 def written_equation(equation: Equation, size_of: SizeOf) -> tuple[Equation, ...]:
     """Return an equation for each entry; raises as `written_out`, also where its sides differ in size."""
-    writer = _VectorWriter(size_of, equation.text, equation.place)
+    writer = _VectorWriter(size_of, equation.text, equation.location)
     sides = (equation.left, equation.right)
-    written = [written_out(side, size_of, equation.text, equation.place) or (side,) for side in sides]
+    written = [written_out(side, size_of, equation.text, equation.location) or (side,) for side in sides]
     writer.agree(sides, written)
     return tuple(replace(equation, left=lhs, right=rhs) for lhs, rhs in zip(*written, strict=True))
 
 
-def number_of(expr: Expr, text: str, place: SourceLocation) -> Expr:
+def number_of(expr: Expr, text: str, location: SourceLocation) -> Expr:
     """Return an expression over numbers without `dot`, `norm` and the like. Raises E407 if it is a vector."""
-    return _VectorWriter(lambda _: 0, text, place).number(expr)
+    return _VectorWriter(lambda _: 0, text, location).number(expr)
 
 
 class _VectorWriter:
     """Writes one text out; the first mistake is raised."""
 
-    def __init__(self, size_of: SizeOf, text: str, place: SourceLocation) -> None:
-        self.size_of, self.text, self.place = size_of, text, place
+    def __init__(self, size_of: SizeOf, text: str, location: SourceLocation) -> None:
+        self.size_of, self.text, self.location = size_of, text, location
 
     def fail(
         self, code: str, at: Expr, expected: str, got: str = "", hint: str = "", within: str = ""
     ) -> NoReturn:
-        what, place = as_written(at, self.text) + within, place_in(self.place, self.text, at.start)
-        raise ApcError(Diagnostic(code, place, what, expected, got, hint))
+        message, location = (
+            as_written(at, self.text) + within,
+            location_in(self.location, self.text, at.start),
+        )
+        raise ApcError(Diagnostic(code, location, message, expected, got, hint))
 
     def written(self, expr: Expr) -> Written:
         match expr:
@@ -169,7 +172,7 @@ class _VectorWriter:
             return (replace(expr, arguments=(written[0] or parts)[:1]),)
         is_vector = [_is_vector(part) for part in written]
         if word != "*":
-            # A function takes numbers beside vectors.
+            # A function has scalar arguments in addition to vectors.
             equal = [k for k in range(len(parts)) if k not in (*numbers, *skipped)]
             equal = [k for k in equal if is_vector[k] or word not in FUNCTIONS]
             self.agree([parts[k] for k in equal], [written[k] for k in equal])
@@ -179,7 +182,7 @@ class _VectorWriter:
         return self.each(expr, written)
 
     def product(self, expr: Call) -> Written:
-        """Write out `dot`, `cross` and `norm`, each piece of which stands where the whole does."""
+        """Expand `dot`, `cross` and `norm`, each part at the location of the expression."""
         word, vectors = expr.function, list[tuple[Expr, ...]]()
         for argument in expr.arguments:
             if (written := self.written(argument)) is None:

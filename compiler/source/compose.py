@@ -17,10 +17,10 @@ import yaml
 from apc.compiler.errors import ApcError, Mistakes, SourceLocation, nearest
 from apc.compiler.source.nodes import Lines, Mapping, Node, Scalar, Sequence
 from apc.compiler.source.reading import either_comma, fault
-from apc.compiler.source.yaml_faults import NO_COLON, not_yaml, with_colon
-from apc.compiler.words import cut
+from apc.compiler.source.yaml_errors import NO_COLON, not_yaml, with_colon
+from apc.compiler.wording import cut
 
-MAX_DEPTH = 64  # levels of nesting; a scene needs about six
+MAX_DEPTH = 64  # levels of nesting; a topology needs about six
 MAX_NODES = 100_000  # after aliases are expanded
 MAX_NUMBER = 400  # characters of a scalar still tried as a number: Python refuses an integer of 4300 digits
 
@@ -63,8 +63,8 @@ def compose(text: str, lines: Lines) -> Node:
         for event in composer.events:
             if isinstance(event, yaml.DocumentStartEvent):
                 if root is not None:
-                    place, got = lines.of(event.start_mark), "the start of a second one"
-                    composer.mistakes.add("E110", place, "a file", expected="one YAML document", got=got)
+                    location, got = lines.of(event.start_mark), "the start of a second one"
+                    composer.mistakes.add("E110", location, "a file", expected="one YAML document", got=got)
                     break
                 root = composer.tree(next(composer.events), 1).node
     except yaml.MarkedYAMLError as error:
@@ -79,10 +79,10 @@ def compose(text: str, lines: Lines) -> Node:
 
 @dataclass(frozen=True, slots=True)
 class _Tree:
-    """A node, where it or the alias of it stands, how many nodes it holds, and how many levels."""
+    """A node, the location of it or its alias, its number of nodes, and its depth."""
 
     node: Node
-    place: SourceLocation
+    location: SourceLocation
     size: int = 1
     height: int = 1
 
@@ -100,52 +100,54 @@ class _Composer:
 
     def tree(self, event: Any, depth: int) -> _Tree:
         """Return the tree that starts with an event, at a depth counted from 1."""
-        place = self.lines.of(event.start_mark)
+        location = self.lines.of(event.start_mark)
         if isinstance(event, yaml.AliasEvent):
-            tree = self.alias(event.anchor or "", place, depth)
-            self.count(tree.size, place)
+            tree = self.alias(event.anchor or "", location, depth)
+            self.count(tree.size, location)
             return tree
         if isinstance(event, yaml.ScalarEvent):
-            tree = _Tree(Scalar(event.value, self.value(event, place), not event.style, place), place)
+            tree = _Tree(
+                Scalar(event.value, self.value(event, location), not event.style, location), location
+            )
         else:
-            tree = self.collection(event, place, depth)
-        self.count(1, place)
+            tree = self.collection(event, location, depth)
+        self.count(1, location)
         if event.anchor is not None:
             self.anchors[event.anchor] = tree
         return tree
 
-    def count(self, nodes: int, place: SourceLocation) -> None:
+    def count(self, nodes: int, location: SourceLocation) -> None:
         self.nodes += nodes
         if self.nodes > MAX_NODES:
-            self.give_up("E117", place, f"this file has more than {MAX_NODES} nodes, aliases written out")
+            self.give_up("E117", location, f"this file has more than {MAX_NODES} nodes, aliases written out")
 
-    def collection(self, event: Any, place: SourceLocation, depth: int) -> _Tree:
+    def collection(self, event: Any, location: SourceLocation, depth: int) -> _Tree:
         is_mapping = isinstance(event, yaml.MappingStartEvent)
         if event.tag not in (None, "!", _CORE + ("map" if is_mapping else "seq")):
-            self.refuse_tag(event.tag, place)
-        self.check_depth(depth, place)
+            self.refuse_tag(event.tag, location)
+        self.check_depth(depth, location)
         if event.anchor is not None:
             self.anchors[event.anchor] = None
         trees: list[_Tree] = []  # of a mapping: key, value, key, value, …
-        seen: dict[str, SourceLocation] = {}
+        observed: dict[str, SourceLocation] = {}
         while not isinstance(event := next(self.events), yaml.CollectionEndEvent):
             tree = self.tree(event, depth + 1)
             if is_mapping and len(trees) % 2 == 0:
-                self.check_key(tree.node, seen, tree.place)
+                self.check_key(tree.node, observed, tree.location)
             trees.append(tree)
         nodes = tuple(tree.node for tree in trees)
-        node: Node = Sequence(nodes, place)
+        node: Node = Sequence(nodes, location)
         if is_mapping:
             # A key that is no scalar has been reported; it is left out so that the rest can be read.
             pairs = zip(nodes[::2], nodes[1::2], strict=True)
-            node = Mapping(tuple((key, value) for key, value in pairs if isinstance(key, Scalar)), place)
+            node = Mapping(tuple((key, value) for key, value in pairs if isinstance(key, Scalar)), location)
             self.check_entries(node)
         size = 1 + sum(tree.size for tree in trees)
-        return _Tree(node, place, size, 1 + max((tree.height for tree in trees), default=0))
+        return _Tree(node, location, size, 1 + max((tree.height for tree in trees), default=0))
 
-    def check_depth(self, depth: int, place: SourceLocation) -> None:
+    def check_depth(self, depth: int, location: SourceLocation) -> None:
         if depth > MAX_DEPTH:
-            self.give_up("E115", place, f"this is nested deeper than {MAX_DEPTH} levels")
+            self.give_up("E115", location, f"this is nested deeper than {MAX_DEPTH} levels")
 
     def check_entries(self, mapping: Mapping) -> None:
         """Record a decimal comma, which ends a value, and a key without its colon."""
@@ -156,56 +158,56 @@ class _Composer:
                 if before and given and (number := _COMMA.fullmatch(f"{given.text},{key.text}")):
                     name, hint = before[0].text, either_comma(before[0].text, *number.groups())
                     expected, got = "a decimal point", number[0]
-                    self.mistakes.add("E203", given.place, name, expected=expected, got=got, hint=hint)
+                    self.mistakes.add("E203", given.location, name, expected=expected, got=got, hint=hint)
                 elif line := with_colon(key.text):
-                    self.mistakes.add("E109", key.place, NO_COLON, hint=line)
+                    self.mistakes.add("E109", key.location, NO_COLON, hint=line)
             before = key, node
 
-    def alias(self, name: str, place: SourceLocation, depth: int) -> _Tree:
+    def alias(self, name: str, location: SourceLocation, depth: int) -> _Tree:
         if name not in self.anchors:
             close = nearest(name, self.anchors)
-            self.give_up("E114", place, f"*{name} has no &{name} before it", f"*{close}" if close else "")
+            self.give_up("E114", location, f"*{name} has no &{name} before it", f"*{close}" if close else "")
         tree = self.anchors[name]
         if tree is None:
-            self.give_up("E114", place, f"*{name} stands inside what it repeats: it would never end")
-        self.check_depth(depth + tree.height - 2, place)
-        return _Tree(tree.node, place, tree.size, tree.height)
+            self.give_up("E114", location, f"*{name} stands inside what it repeats: it would never end")
+        self.check_depth(depth + tree.height - 2, location)
+        return _Tree(tree.node, location, tree.size, tree.height)
 
-    def check_key(self, key: Node, seen: dict[str, SourceLocation], place: SourceLocation) -> None:
+    def check_key(self, key: Node, observed: dict[str, SourceLocation], location: SourceLocation) -> None:
         if not isinstance(key, Scalar) or not key.text:
             got = "nothing" if isinstance(key, Scalar) else "a list"
             got = "a mapping" if isinstance(key, Mapping) else got
-            self.mistakes.add("E112", place, "a key", expected="a name", got=got)
+            self.mistakes.add("E112", location, "a key", expected="a name", got=got)
         elif key.plain and key.text == "<<":
             hint = "the keys themselves, or an alias as the value of a key"
-            self.mistakes.add("E116", place, "the merge key << is not part of this language", hint=hint)
-        elif key.text in seen:
-            first = seen[key.text].line
-            self.mistakes.add("E111", place, f"{cut(key.text)!r} stands twice, first in line {first}")
+            self.mistakes.add("E116", location, "the merge key << is not part of this language", hint=hint)
+        elif key.text in observed:
+            first = observed[key.text].line
+            self.mistakes.add("E111", location, f"{cut(key.text)!r} stands twice, first in line {first}")
         else:
-            seen[key.text] = place
+            observed[key.text] = location
 
-    def value(self, event: Any, place: SourceLocation) -> bool | int | float | str | None:
+    def value(self, event: Any, location: SourceLocation) -> bool | int | float | str | None:
         tag = event.tag
         if tag in (None, "!", _CORE + "str"):
-            # "!" and !!str say: text, whatever it looks like.
+            # "!" and !!str declare text, independent of the contents.
             text_only = tag is not None or bool(event.style)
             return str(event.value) if text_only else _core_value(event.value)
         value = _core_value(event.value)
         name = tag.removeprefix(_CORE)
         if name not in _TAGGED or name == tag:
-            self.refuse_tag(tag, place)
+            self.refuse_tag(tag, location)
         elif type(value) not in _TAGGED[name]:
             got = repr(cut(event.value))
-            self.mistakes.add("E113", place, f"!!{name}", expected="such a value", got=got)
+            self.mistakes.add("E113", location, f"!!{name}", expected="such a value", got=got)
         return float(value) if name == "float" and type(value) is int else value
 
-    def refuse_tag(self, tag: str, place: SourceLocation) -> None:
+    def refuse_tag(self, tag: str, location: SourceLocation) -> None:
         shown = "!!" + tag.removeprefix(_CORE) if tag.startswith(_CORE) else tag
-        self.mistakes.add("E113", place, f"the tag {cut(shown)!r} is not part of this language")
+        self.mistakes.add("E113", location, f"the tag {cut(shown)!r} is not part of this language")
 
-    def give_up(self, code: str, place: SourceLocation, what: str, hint: str = "") -> NoReturn:
-        """Raise at once, with what was found before: reading on would mislead, or not end."""
-        self.mistakes.add(code, place, what, hint=hint)
+    def give_up(self, code: str, location: SourceLocation, message: str, hint: str = "") -> NoReturn:
+        """Raise immediately, with earlier errors: further reading would mislead, or not end."""
+        self.mistakes.add(code, location, message, hint=hint)
         self.mistakes.raise_if_any()
         raise AssertionError("a mistake was added")

@@ -1,8 +1,8 @@
-"""What a YAML text is made of: nodes that know where they stand, and the lines they stand in.
+"""The nodes of a YAML text with their locations, and its lines.
 
 Takes: nothing (data types). Gives: `Scalar`, `Sequence`, `Mapping`, their union `Node`; `Lines`, `MAX_BYTES`.
 Guarantees: plain frozen data; every place on a line shares the line's string.
-Does not: read YAML (see `compose`), or know what any key means.
+Does not: read YAML (see `compose`), or interpret keys.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 from apc.compiler.errors import SourceLocation
 
-MAX_BYTES = 1 << 20  # 1 MiB; the largest scene we know of is a hundredth of it
+MAX_BYTES = 1 << 20  # 1 MiB; the largest topology we know of is a hundredth of it
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +23,7 @@ class Scalar:
     text: str
     value: bool | int | float | str | None
     plain: bool
-    place: SourceLocation
+    location: SourceLocation
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ class Sequence:
     """A list of nodes."""
 
     items: tuple[Node, ...]
-    place: SourceLocation
+    location: SourceLocation
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class Mapping:
     """Keys and nodes in the order of the text; no two keys have the same text."""
 
     entries: tuple[tuple[Scalar, Node], ...]
-    place: SourceLocation
+    location: SourceLocation
 
     def get(self, key: str) -> Node | None:
         """Return the node of a key, or None when the key is not there."""
@@ -60,11 +60,11 @@ class Lines:
         self.file = file
         self.lines = re.split(r"\r\n|\n|\r", text)
 
-    def place(self, line: int, column: int) -> SourceLocation:
+    def location(self, line: int, column: int) -> SourceLocation:
         """Return a place; `line` and `column` count from 0, as YAML's marks do."""
         source_line = self.lines[line] if line < len(self.lines) else ""
         return SourceLocation(self.file, line + 1, column + 1, source_line)
 
     def of(self, mark: Any) -> SourceLocation:
         """Return the place of a YAML mark."""
-        return self.place(mark.line, mark.column)
+        return self.location(mark.line, mark.column)

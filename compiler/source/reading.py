@@ -1,7 +1,8 @@
-"""Reads typed values out of YAML nodes; a node that is not what it should be raises what to write instead.
+"""Reads typed values from YAML nodes; a node of the wrong type raises an error with a suggestion.
 
-Takes: nodes of the stage `source`. Gives: texts, names, numbers and lists of nodes; `MappingReader`, a
-mapping that is read key by key.
+Takes: nodes of the stage `source`. Gives: `MappingReader`, a mapping that is read key by key; `mapping_of`,
+`list_of`, `text_of`, `name_of`, `whole_number`, `among`; for messages `fault`, `unknown`, `form`, `brief`,
+`either_comma`.
 Guarantees: a node of the wrong form is one mistake, an `ApcError` that `with mistakes:` records, so that
 reading goes on behind it.
 Does not: know any section, component or unit.
@@ -23,7 +24,7 @@ IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,62}\Z")
 
 
 def form(node: Node) -> str:
-    """Return what a node is, in words, for a message."""
+    """Return the type of a node, in words, for a message."""
     if isinstance(node, Mapping):
         return "a mapping"
     if isinstance(node, Sequence):
@@ -34,7 +35,7 @@ def form(node: Node) -> str:
 
 
 def either_comma(key: str, whole: str, digits: str, rest: str | None) -> str:
-    """Return what to write for a number with a comma: 0,5 is 0.5, and 1,500 may be 1500 as well."""
+    """Return the suggestion for a number with a comma: 0,5 is 0.5, and 1,500 may be 1500 as well."""
     decimal = f"{key}: {whole}.{digits}{rest or ''}"
     thousands = len(digits) == 3 and whole.lstrip("+-0")
     return f"{decimal}, or {key}: {whole}{digits}{rest or ''}" if thousands else decimal
@@ -47,21 +48,27 @@ def brief(text: str) -> str:
 
 
 def fault(
-    code: str, place: SourceLocation, what: str, expected: str = "", got: str = "", hint: str = ""
+    code: str, location: SourceLocation, message: str, expected: str = "", got: str = "", hint: str = ""
 ) -> ApcError:
-    """Return one mistake to raise, its parts as `Diagnostic` has them."""
-    return ApcError(Diagnostic(code, place, what, expected, got, hint))
+    """Return an error with one diagnostic, for the caller to raise.
+
+    Parameters
+    ----------
+    code, location, message, expected, got, hint
+        The fields of the `Diagnostic`.
+    """
+    return ApcError(Diagnostic(code, location, message, expected, got, hint))
 
 
-def mapping_of(node: Node, what: str, hint: str = "") -> Mapping:
+def mapping_of(node: Node, message: str, hint: str = "") -> Mapping:
     """Return a node that is a mapping.
 
     Parameters
     ----------
     node
-        What to read.
-    what
-        What it is the value of, for a message.
+        The node.
+    message
+        The name of its value, for a message.
     hint
         The line to write instead.
 
@@ -72,23 +79,23 @@ def mapping_of(node: Node, what: str, hint: str = "") -> Mapping:
     """
     if isinstance(node, Mapping):
         return node
-    raise fault("E203", node.place, what, "a mapping of keys to values", form(node), hint)
+    raise fault("E203", node.location, message, "a mapping of keys to values", form(node), hint)
 
 
-def text_of(node: Node, what: str, hint: str = "") -> str:
+def text_of(node: Node, message: str, hint: str = "") -> str:
     """Return the text of a scalar that isn't empty; arguments and error as for `mapping_of`."""
     if isinstance(node, Scalar) and node.text.strip() and node.value is not None:
         return node.text
-    raise fault("E203", node.place, what, "a single value", form(node), hint)
+    raise fault("E203", node.location, message, "a single value", form(node), hint)
 
 
-def list_of(node: Node, what: str, size: int, item: str) -> tuple[Node, ...]:
+def list_of(node: Node, message: str, size: int, item: str) -> tuple[Node, ...]:
     """Return the items of a list with `size` of them; `item` is one to show in a message. Raises E203."""
     if isinstance(node, Sequence) and len(node.items) == size:
         return node.items
     got = f"{len(node.items)}" if isinstance(node, Sequence) else form(node)
-    hint = f"{what}: [{', '.join([item] * size)}]"
-    raise fault("E203", node.place, what, f"a list of {size} values", got, hint)
+    hint = f"{message}: [{', '.join([item] * size)}]"
+    raise fault("E203", node.location, message, f"a list of {size} values", got, hint)
 
 
 def whole_number(node: Node) -> int | None:
@@ -98,15 +105,15 @@ def whole_number(node: Node) -> int | None:
 
 
 def name_of(
-    key: Scalar, what: str, taken: Container[str] = (), whole: str = "", words: Container[str] = ()
+    key: Scalar, subject: str, used: Container[str] = (), whole: str = "", words: Container[str] = ()
 ) -> str:
     """Return the text of a scalar that can serve as a name: a letter, then letters, digits, underscores.
 
     Parameters
     ----------
-    key, what
+    key, subject
         The scalar, and what it names, for a message.
-    taken, whole
+    used, whole
         The names that are used already, and in what.
     words
         The words of the language, which can't be names.
@@ -119,11 +126,11 @@ def name_of(
     name = key.text
     if not IDENTIFIER.match(name):
         expected = "a letter followed by letters, digits or underscores (63 at most)"
-        raise fault("E205", key.place, f"the name of {what}", expected, brief(name) or "nothing")
+        raise fault("E205", key.location, f"the name of {subject}", expected, brief(name) or "nothing")
     if name in words:
-        raise fault("E205", key.place, f"{name} is a word of the language and can't be a name")
-    if name in taken:
-        raise fault("E205", key.place, f"the name {name} is used twice in {whole}")
+        raise fault("E205", key.location, f"{name} is a word of the language and can't be a name")
+    if name in used:
+        raise fault("E205", key.location, f"the name {name} is used twice in {whole}")
     return name
 
 
@@ -134,22 +141,22 @@ class MappingReader:
     be, so that one slip is not reported a second time as something missing.
     """
 
-    def __init__(self, node: Mapping, allowed: Collection[str], what: str, mistakes: Mistakes) -> None:
-        """Take a mapping, the keys it may have, what it is, for messages, and what takes E202 for others."""
-        self.place = node.place
+    def __init__(self, node: Mapping, allowed: Collection[str], subject: str, mistakes: Mistakes) -> None:
+        """Initialize with a mapping, its valid keys, its name for messages, and the collector of E202."""
+        self.location = node.location
         self.mistakes = mistakes
         self.nodes = {key.text: value for key, value in node.entries}
         for key, value in node.entries:
             if key.text not in allowed:
                 left = [known for known in allowed if known not in self.nodes]  # what is there was meant
                 close = nearest(key.text, left)
-                text = f"{what} has no key {brief(key.text)}"
-                mistakes.take(unknown("E202", key.place, text, close, [close] if close else allowed))
+                text = f"{subject} has no key {brief(key.text)}"
+                mistakes.take(unknown("E202", key.location, text, close, [close] if close else allowed))
                 if close:
                     self.nodes.setdefault(close, value)
 
     def read(self, key: str, reader: Callable[[Node, str], T], default: D) -> T | D:
-        """Return what a reader makes of the value of a key, which it takes with the key."""
+        """Return the result of a reader for the value of a key; the reader also gets the key."""
         if (node := self.nodes.get(key)) is not None:
             with self.mistakes:
                 return reader(node, key)
@@ -160,11 +167,11 @@ class MappingReader:
         return self.read(key, lambda node, _: text_of(node, key, hint), "")
 
     def section(self, key: str, hint: str) -> tuple[tuple[Scalar, Node], ...]:
-        """Return the entries of the mapping that a key has; `hint` is what to write instead of another."""
+        """Return the entries of the mapping of a key; `hint` is the suggestion otherwise."""
         return self.read(key, lambda node, _: mapping_of(node, key, f"{key}: {hint}").entries, ())
 
     def each(self, key: str, hint: str, reader: Callable[[Scalar, Node], T]) -> list[T]:
-        """Return what a reader makes of the entries of a section, each its key and value."""
+        """Return the results of a reader for the entries of a section, each with its key."""
         result = []
         for name, node in self.section(key, hint):
             with self.mistakes:
@@ -172,12 +179,12 @@ class MappingReader:
         return result
 
 
-def unknown(code: str, place: SourceLocation, what: str, name: str, texts: Collection[str]) -> ApcError:
+def unknown(code: str, location: SourceLocation, subject: str, name: str, texts: Collection[str]) -> ApcError:
     """Return the mistake of an unknown name, with the nearest known one or, failing that, a list of them.
 
     Parameters
     ----------
-    code, place, what
+    code, location, subject
         The mistake's code, where it is, and its first words.
     name
         The name as written.
@@ -186,20 +193,22 @@ def unknown(code: str, place: SourceLocation, what: str, name: str, texts: Colle
     """
     close = nearest(name, texts)
     if close:
-        return fault(code, place, f"{what}; the nearest is {close}", hint=close)
+        return fault(code, location, f"{subject}; the nearest is {close}", hint=close)
     listed = ", ".join(list(texts)[:12]) + (", …" if len(texts) > 12 else "")
-    return fault(code, place, f"{what}; there are: {listed}" if listed else f"{what}; there is none")
+    return fault(code, location, f"{subject}; there are: {listed}" if listed else f"{subject}; there is none")
 
 
-def among(name: str, texts: Collection[str], place: SourceLocation, what: str, code: str = "E206") -> str:
-    """Return a name that is known.
+def among(
+    name: str, texts: Collection[str], location: SourceLocation, subject: str, code: str = "E206"
+) -> str:
+    """Return a known name.
 
     Parameters
     ----------
     name, texts
-        The name as written, and the names there are.
-    place, what, code
-        Where it stands, what is wrong with another, whose name takes the place of `{}`, and the code of that.
+        The name as written, and the known names.
+    location, subject, code
+        Its location, the message for an unknown name (inserted for `{}`), and its code.
 
     Raises
     ------
@@ -208,4 +217,4 @@ def among(name: str, texts: Collection[str], place: SourceLocation, what: str, c
     """
     if name in texts:
         return name
-    raise unknown(code, place, what.replace("{}", brief(name)), name, texts)
+    raise unknown(code, location, subject.replace("{}", brief(name)), name, texts)

@@ -1,6 +1,7 @@
 """A file, or its bytes, to the YAML nodes in it.
 
-Takes: a path, or bytes. Gives: `Source`: the text and its tree of nodes (see `nodes`).
+Takes: a path, or bytes.
+Gives: `read_source`, `parse_source`: a `Source`, the text and its tree of nodes.
 Guarantees: a regular file of bounded size (see `files`), UTF-8 without control characters, one YAML document.
 Does not: know what a topology is, or what any key means.
 """
@@ -52,21 +53,21 @@ def read_source(path: Path, *, shown: str | None = None) -> Source:
     return parse_source(data, file=file, path=path)
 
 
-def _not_read(path: Path, place: SourceLocation, refused: RefusedError) -> Diagnostic:
+def _not_read(path: Path, location: SourceLocation, refused: RefusedError) -> Diagnostic:
     match refused.why:
         case "missing":
-            return Diagnostic("E101", place, _missing(path))
+            return Diagnostic("E101", location, _missing(path))
         case "folder" | "special":
             code = "E102" if refused.why == "folder" else "E104"
-            return Diagnostic(code, place, "this", "a YAML file", refused.words.removeprefix("is "))
+            return Diagnostic(code, location, "this", "a YAML file", refused.words.removeprefix("is "))
         case "large":
-            return _too_large(place)
-    return Diagnostic("E103", place, f"this file {refused.words}")
+            return _too_large(location)
+    return Diagnostic("E103", location, f"this file {refused.words}")
 
 
-def _too_large(place: SourceLocation) -> Diagnostic:
-    what = f"this file is larger than {MAX_BYTES} bytes, the most a YAML file may have here"
-    return Diagnostic("E105", place, what)
+def _too_large(location: SourceLocation) -> Diagnostic:
+    message = f"this file is larger than {MAX_BYTES} bytes, the most a YAML file may have here"
+    return Diagnostic("E105", location, message)
 
 
 def parse_source(data: bytes, *, file: str, path: Path | None = None) -> Source:
@@ -79,7 +80,7 @@ def parse_source(data: bytes, *, file: str, path: Path | None = None) -> Source:
     file
         The name shown in messages.
     path
-        Where it came from, if from a file.
+        The path of the file, if any.
 
     Raises
     ------
@@ -99,7 +100,7 @@ def parse_source(data: bytes, *, file: str, path: Path | None = None) -> Source:
 
 
 def _missing(path: Path) -> str:
-    """Say that a file is not there, with the nearest name in its folder."""
+    """Report a missing file, with the nearest name in its folder."""
     folder = path.parent
     try:
         known = sorted(entry.name for entry in folder.iterdir())
@@ -112,7 +113,7 @@ def _missing(path: Path) -> str:
 
 
 def _decode(data: bytes, file: str) -> str:
-    """Return the text without its byte order mark, or say which byte is not UTF-8."""
+    """Return the text without its byte order mark, or report the byte that is not UTF-8."""
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -138,5 +139,5 @@ def _refuse_control_characters(text: str, lines: Lines) -> None:
     character = search.group()
     name = unicodedata.name(character, "a control character")
     got = f"U+{ord(character):04X} ({name})" + (", as in a binary file" if character == "\0" else "")
-    place = lines.place(len(before) - 1, len(before[-1]))
-    raise ApcError(Diagnostic("E107", place, "a YAML file", "visible text", got))
+    location = lines.location(len(before) - 1, len(before[-1]))
+    raise ApcError(Diagnostic("E107", location, "a YAML file", "visible text", got))

@@ -1,1 +1,1 @@
-"""What a person or an editor is shown of a scene: listing, diagram, picture, schema."""
+"""Views of a topology for users and editors: listing, diagram, picture, schema."""

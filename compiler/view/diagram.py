@@ -1,9 +1,11 @@
-"""A scene as a graph: parts joined within a peer, peers joined over links; as text for Graphviz and Mermaid.
+"""A topology as a graph: parts joined within a peer, peers joined over links; as text for Graphviz and
+Mermaid.
 
 Takes: `Topology`. Gives: `Diagram` of `Box` and `DiagramEdge`, `build_diagram`; `draw_dot`, `draw_mermaid`;
-`one_of`, `shape_of`, `seconds`.
-Guarantees: every part of the topology is in it, a long array as one box; the same scene gives the same text.
-Does not: place anything on a page: `present.graph` does, or Graphviz, or Mermaid.
+`node_of`, `shape_of`, `seconds`.
+Guarantees: every part of the topology is in it, a long array as one box; the same topology gives the same
+text.
+Does not: place anything on a page: `output.graph` does, or Graphviz, or Mermaid.
 """
 
 from __future__ import annotations
@@ -21,10 +23,10 @@ from apc.compiler.language.dimensions import SECOND
 from apc.compiler.language.expression import format_expression
 from apc.compiler.language.values import ScalarValue
 from apc.compiler.language.vectors import by_vector, whole_and_index
-from apc.compiler.scene.instances import PartInstance
-from apc.compiler.scene.links import SceneLink
-from apc.compiler.scene.scene import Topology
-from apc.compiler.words import counted
+from apc.compiler.topology.instances import PartInstance
+from apc.compiler.topology.links import LinkDeclaration
+from apc.compiler.topology.topology import Topology
+from apc.compiler.wording import counted
 
 ROLES = {"masses": "mass", "couplers": "coupler", "hands": "hand"}
 LONGEST_ARRAY = 4  # with more elements an array is one box
@@ -35,7 +37,7 @@ LONGEST_EXPRESSION = 27  # characters shown behind its value, with the sign betw
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """What is drawn of a part, a link or a group: its `lines`, of which the first is its name.
+    """A box of a part, a link or a group: its `lines`, with its name first.
 
     `role` is mass, coupler, hand, ground, joint, link or group; `clock` is the one a part or link ticks on.
     """
@@ -48,25 +50,27 @@ class Box:
 
 @dataclass(frozen=True, slots=True)
 class DiagramEdge:
-    """What joins two boxes, by their keys; `sent` if it is a link that does."""
+    """A line between two boxes, by their keys; `sent` if over a link."""
 
-    one: str
+    item: str
     two: str
     sent: bool
 
 
 @dataclass(frozen=True, slots=True)
 class Diagram:
-    """What is drawn of a scene: one peer's parts, the links, and of many groups the first."""
+    """The graph of a topology: one peer's parts, the links, and the first of several groups."""
 
-    scene: Topology
+    topology: Topology
     boxes: tuple[Box, ...]
     edges: tuple[DiagramEdge, ...]
 
 
-def build_diagram(scene: Topology) -> Diagram:
-    """Return the graph of a scene."""
-    by_name = {part.name: part for part in scene.parts if "." not in part.name}  # the last: as it usually is
+def build_diagram(topology: Topology) -> Diagram:
+    """Return the graph of a topology."""
+    by_name = {
+        part.name: part for part in topology.parts if "." not in part.name
+    }  # the last: as it usually is
     parts = [*by_name.values()]
     sizes = Counter(_array(part.name) for part in parts)
     boxes: dict[str, Box] = {}
@@ -83,12 +87,12 @@ def build_diagram(scene: Topology) -> Diagram:
                 for parameter in part.component.parameters
                 if isinstance(parameter, Reference)
             }
-            named = [(roles[own], word) for own, word in part.references]
+            named = [(roles[local], word) for local, word in part.references]
             clock = next((word for role, word in named if role == "clock"), "")
-            lines = _part_lines(scene, part, sizes[name] if name != part.name else 1)
+            lines = _part_lines(topology, part, sizes[name] if name != part.name else 1)
             boxes[name] = Box(name, ROLES[part.section], (name, *lines), clock)
-            heard = dict.fromkeys(word for role, word in named if role == "link")
-            sent += [DiagramEdge(name, f"link {link}", sent=True) for link in heard]
+            received = dict.fromkeys(word for role, word in named if role == "link")
+            sent += [DiagramEdge(name, f"link {link}", sent=True) for link in received]
     for part in parts:
         for _, other, _ in part.connections:
             text, two = shown(part.name), shown(other.partition(".")[0])
@@ -102,17 +106,17 @@ def build_diagram(scene: Topology) -> Diagram:
                 joined[DiagramEdge(middle, text, sent=False)] = None
                 text = middle
             joined[DiagramEdge(two, text, sent=False)] = None
-    links, groups = [*map(_link_box, scene.links)], [*_group_boxes(scene)]
+    links, groups = [*map(_link_box, topology.links)], [*_group_boxes(topology)]
     sent += [DiagramEdge(link.key, group.key, sent=True) for link in links for group in groups]
-    return Diagram(scene, (*boxes.values(), *links, *groups), (*joined, *sent))
+    return Diagram(topology, (*boxes.values(), *links, *groups), (*joined, *sent))
 
 
 def _array(name: str) -> str:
     return name.partition("[")[0]
 
 
-def _part_lines(scene: Topology, part: PartInstance, count: int) -> Iterator[str]:
-    """Yield what is told of a part, or of an array of so many: its type, then its numbers."""
+def _part_lines(topology: Topology, part: PartInstance, count: int) -> Iterator[str]:
+    """Yield the text of a part, or of an array of parts: its type, then its values."""
     component = part.component
     if count > 1:
         yield f"{count} of them"
@@ -125,28 +129,28 @@ def _part_lines(scene: Topology, part: PartInstance, count: int) -> Iterator[str
     }
     if part.section == "masses" and 2 in axes:
         yield "in space" if 3 in axes else "in a plane"
-    if part.groups != tuple(group.name for group in scene.groups):
+    if part.groups != tuple(group.name for group in topology.groups):
         yield f"only at {', '.join(part.groups)}"
-    numbers = list(_numbers(scene, part))
+    numbers = list(_numbers(topology, part))
     if len(numbers) > MOST_LINES:
         numbers[MOST_LINES - 1 :] = [f"… and {len(numbers) - MOST_LINES + 1} more"]
     yield from numbers
 
 
-def _numbers(scene: Topology, part: PartInstance) -> Iterator[str]:
+def _numbers(topology: Topology, part: PartInstance) -> Iterator[str]:
     """Yield a part's numbers, those that are zero left out, and its words that are no default."""
     for name, entries in by_vector(part.values, itemgetter(0)).items():
         if any(value.number for _, value in entries):
             yield f"{name} {_quantities(part, entries)}"
-        for own, value in entries:
-            if part.shared and getattr(part.component.parameter(own), "divided", False):
-                each = replace(value, number=value.number / scene.peers)
-                yield f"shared: {_quantity(part, own, each)} a copy"
+        for local, value in entries:
+            if part.shared and getattr(part.component.parameter(local), "divided", False):
+                each = replace(value, number=value.number / topology.peers)
+                yield f"shared: {_quantity(part, local, each)} a copy"
     for name, entries in by_vector(part.starts, itemgetter(0)).items():
         yield f"{name} starts at {_quantities(part, entries)}"
-    for own, word in part.options:
-        if word != getattr(part.component.parameter(own), "default", None):
-            yield f"{own} {word}"
+    for local, word in part.options:
+        if word != getattr(part.component.parameter(local), "default", None):
+            yield f"{local} {word}"
     yield from (f"{table.name}: a table of {len(table.times)} rows" for table in part.tables)
 
 
@@ -161,7 +165,7 @@ def _quantities(part: PartInstance, entries: list[tuple[str, ScalarValue]]) -> s
 
 
 def _quantity(part: PartInstance, name: str, value: ScalarValue) -> str:
-    """Return a number as the scene or its component writes it, or the word that stands for it."""
+    """Return a number as written in the topology or its component, or the word that represents it."""
     declared = part.component.parameter(name) or part.component.variable(name)
     assert isinstance(declared, NumberParameter | ComponentVariable)
     for word, number in declared.words if isinstance(declared, NumberParameter) else ():
@@ -177,7 +181,7 @@ def seconds(number: Fraction) -> str:
     return f"{float(number) * 1e3:.6g} ms" if abs(number) < 1 else f"{float(number):.6g} s"
 
 
-def _link_box(link: SceneLink) -> Box:
+def _link_box(link: LinkDeclaration) -> Box:
     delay, remarks = link.delay.number, () if link.channel is None else link.channel.remarks
     later = f"available {seconds(delay)} later" if delay else "available at once"
     lines = (link.name, shape_of(link), f"a packet each tick of {link.clock}", later)
@@ -185,27 +189,27 @@ def _link_box(link: SceneLink) -> Box:
     return Box(f"link {link.name}", "link", (*lines, *delays, *remarks), link.clock)
 
 
-def _group_boxes(scene: Topology) -> Iterator[Box]:
-    for group in scene.groups[:MOST_GROUPS]:
+def _group_boxes(topology: Topology) -> Iterator[Box]:
+    for group in topology.groups[:MOST_GROUPS]:
         lines = [f"{name}.type {word}" for name, word in group.types]
         for name, value in group.values:
-            part, _, own = name.rpartition(".")
-            lines.append(f"{name} {_quantities(scene.part(part), [(own, value)])}")
+            part, _, local = name.rpartition(".")
+            lines.append(f"{name} {_quantities(topology.part(part), [(local, value)])}")
         lines += [f"{name} {word}" for name, word in group.words]
         lines += [f"{name} of its own for each peer" for name, _ in group.columns]
         title = f"{group.name}: {counted(group.count, 'peer', ',')}"
         yield Box(f"group {group.name}", "group", (title, *lines[:MOST_LINES]))
-    if (more := len(scene.groups) - MOST_GROUPS) > 0:
+    if (more := len(topology.groups) - MOST_GROUPS) > 0:
         yield Box("groups", "group", (f"and {more} more groups",))
 
 
-def one_of(scene: Topology) -> str:
-    """Return what the peer drawn is, in words."""
-    return "the only peer" if scene.peers == 1 else f"one of {scene.peers} peers"
+def node_of(topology: Topology) -> str:
+    """Return the description of the drawn peer."""
+    return "the only peer" if topology.peers == 1 else f"one of {topology.peers} peers"
 
 
-def shape_of(link: SceneLink) -> str:
-    """Return who hears whom over a link, in words."""
+def shape_of(link: LinkDeclaration) -> str:
+    """Return the communication graph of a link, in words."""
     graph = link.graph
     return counted(len(graph.arcs), "arc") if graph.shape == "arcs" else f"{graph.shape} graph"
 
@@ -215,24 +219,26 @@ _DOT = {"hand": "cds", GROUND: "underline", "joint": "point", "link": "ellipse",
 
 def draw_dot(diagram: Diagram) -> str:
     """Return a diagram in Graphviz's language."""
-    scene = diagram.scene
-    lines = [f"digraph {_quoted(scene.name)} {{", "  rankdir=LR; edge [dir=none]"]
-    lines.append(f"  label={_quoted(f'{scene.name}, {one_of(scene)}. {scene.about}')}; labelloc=t")
+    topology = diagram.topology
+    lines = [f"digraph {_quoted(topology.name)} {{", "  rankdir=LR; edge [dir=none]"]
+    lines.append(
+        f"  label={_quoted(f'{topology.name}, {node_of(topology)}. {topology.description}')}; labelloc=t"
+    )
     for box in diagram.boxes:
         label, shape = _quoted("\n".join(box.lines)), _DOT.get(box.role, "box")
         lines.append(f"  {_quoted(box.key)} [label={label}, shape={shape}]")
     for edge in diagram.edges:
         style = " [dir=both, style=dashed]" if edge.sent else ""
-        lines.append(f"  {_quoted(edge.one)} -> {_quoted(edge.two)}{style}")
+        lines.append(f"  {_quoted(edge.item)} -> {_quoted(edge.two)}{style}")
     return "\n".join([*lines, "}"])
 
 
 def draw_mermaid(diagram: Diagram) -> str:
     """Return a diagram in Mermaid's language."""
-    number = {box.key: f"n{place}" for place, box in enumerate(diagram.boxes)}
+    number = {box.key: f"n{index}" for index, box in enumerate(diagram.boxes)}
     boxes = [f'  {number[box.key]}["{"<br>".join(map(escape, box.lines))}"]' for box in diagram.boxes]
     edges = [
-        f"  {number[edge.one]} {'-.-' if edge.sent else '---'} {number[edge.two]}" for edge in diagram.edges
+        f"  {number[edge.item]} {'-.-' if edge.sent else '---'} {number[edge.two]}" for edge in diagram.edges
     ]
     return "\n".join(["flowchart LR", *boxes, *edges])
 

@@ -1,10 +1,10 @@
-"""What a scene is made of, as text for a person to read: what `apc show` tells.
+"""The contents of a topology as text for the user: the output of `apc show`.
 
 Takes: a topology's path.
 Gives: `show_text` and `show_document` (for JSON); `diagram_of`.
-Guarantees: `show_text` has at most 80 columns wherever a name allows it; the same topology gives the same
-bytes.
-Does not: analyse, or compute anything new.
+Guarantees: `show_text` has at most 80 columns unless a name is longer; the output is reproducible to the
+byte.
+Does not: analyze, or compute new values.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from pathlib import Path
 from typing import Any
 
 from apc.compiler.compiled import Model
+from apc.compiler.equations.causalization import SortedPeerType
 from apc.compiler.equations.clocks import ClockedPeerType
 from apc.compiler.equations.flatten import FlatPeerType
 from apc.compiler.equations.solution import Assignment, ImplicitBlock
-from apc.compiler.equations.structure import SortedPeerType
 from apc.compiler.equations.terms import text_of
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.multiples import common_multiple
 from apc.compiler.pipeline import each_stage, run_stages
-from apc.compiler.scene.scene import Topology
-from apc.compiler.view.diagram import Diagram, build_diagram, one_of, seconds, shape_of
+from apc.compiler.topology.topology import Topology
+from apc.compiler.view.diagram import Diagram, build_diagram, node_of, seconds, shape_of
 from apc.compiler.view.stages import describe
-from apc.compiler.words import wrapped
+from apc.compiler.wording import wrapped
 
 PAIRWISE = ("max", "min")
 
@@ -37,9 +37,9 @@ PAIRWISE = ("max", "min")
 def show_text(path: Path) -> str:
     """Return graph, equations and schedule of a topology as text."""
     stages: dict[str, Any] = dict(each_stage(path))
-    scene: Topology = stages["scene"]
-    lines = [scene.name, *wrapped(scene.about)]
-    lines += ["", f"GRAPH of {one_of(scene)}", *_graph_lines(build_diagram(scene))]
+    topology: Topology = stages["topology"]
+    lines = [topology.name, *wrapped(topology.description)]
+    lines += ["", f"GRAPH of {node_of(topology)}", *_graph_lines(build_diagram(topology))]
     for title, stage in (("EQUATIONS", "flat"), ("COMPUTED", "sorted")):
         lines += ["", title]
         for line in describe(stages[stage]).splitlines():
@@ -51,29 +51,33 @@ def show_text(path: Path) -> str:
 def show_document(path: Path) -> dict[str, Any]:
     """Return graph, equations and schedule of a topology as plain data."""
     stages: dict[str, Any] = dict(each_stage(path))
-    scene, compiled = stages["scene"], stages["compiled"]
-    diagram = build_diagram(scene)
-    kinds = zip(stages["flat"].kinds, stages["clocked"].kinds, stages["sorted"].kinds, strict=True)
+    topology, compiled = stages["topology"], stages["compiled"]
+    diagram = build_diagram(topology)
+    peer_types = zip(
+        stages["flat"].peer_types, stages["clocked"].peer_types, stages["sorted"].peer_types, strict=True
+    )
     return {
-        "topology": scene.name,
-        "about": scene.about,
-        "peers": scene.peers,
+        "topology": topology.name,
+        "description": topology.description,
+        "peers": topology.peers,
         "graph": {
             "boxes": [asdict(box) for box in diagram.boxes],
             "edges": [asdict(edge) for edge in diagram.edges],
             "links": [
                 {"name": k.name, "clock": k.clock, "shape": shape_of(k), "arcs": k.graph.arcs.tolist()}
-                for k in scene.links
+                for k in topology.links
             ],
-            "groups": [{"name": group.name, "count": group.count} for group in scene.groups],
+            "groups": [{"name": group.name, "count": group.count} for group in topology.groups],
         },
-        "kinds": [_kind_document(*kind) for kind in kinds],
+        "kinds": [_peer_type_document(*peer_type) for peer_type in peer_types],
         "schedule": schedule(compiled),
         "dropped": [{"name": name, "reason": reason} for name, reason in compiled.dropped],
     }
 
 
-def _kind_document(flat: FlatPeerType, clocked: ClockedPeerType, ordered: SortedPeerType) -> dict[str, Any]:
+def _peer_type_document(
+    flat: FlatPeerType, clocked: ClockedPeerType, ordered: SortedPeerType
+) -> dict[str, Any]:
     """Return the equations of the peers of one structure, as they are written and as they are computed."""
     return {
         "name": flat.name,
@@ -106,19 +110,19 @@ def _computed(values: Iterable[Assignment]) -> list[dict[str, str]]:
 
 def diagram_of(path: Path) -> Diagram:
     """Return the graph of a topology."""
-    scene = run_stages(path, until="scene")
-    assert isinstance(scene, Topology)
-    return build_diagram(scene)
+    topology = run_stages(path, until="topology")
+    assert isinstance(topology, Topology)
+    return build_diagram(topology)
 
 
 def _graph_lines(diagram: Diagram) -> Iterator[str]:
-    """Yield each part, link and group, and what it is joined to."""
+    """Yield each part, link and group, with its connections."""
     titles = {box.key: box.lines[0] for box in diagram.boxes}
     for box in diagram.boxes:
         ticks = [f"at each tick of {box.clock}"] if box.clock and box.role != "link" else []
-        about = ", ".join((*box.lines[1:], *ticks))
-        yield from wrapped(": ".join(filter(None, (box.lines[0], about))), "  ", "    ")
-        ends = ({edge.one, edge.two} for edge in diagram.edges)
+        description = ", ".join((*box.lines[1:], *ticks))
+        yield from wrapped(": ".join(filter(None, (box.lines[0], description))), "  ", "    ")
+        ends = ({edge.item, edge.two} for edge in diagram.edges)
         joined = ", ".join(titles[other] for pair in ends if box.key in pair for other in pair - {box.key})
         yield from wrapped(f"joined to {joined}" if joined else "", "    ", "      ")
 
@@ -127,10 +131,10 @@ def _graph_lines(diagram: Diagram) -> Iterator[str]:
 
 
 def schedule(system: Model) -> dict[str, Any]:
-    """Return what happens in one frame: clocks, holds, links, and what is heard; times in seconds.
+    """Return the events of one frame: clocks, holds, links, and received values; times in seconds.
 
-    `on_the_way` is the largest number of a sender's packets that have left and not arrived; the newest one
-    delivered is `age_s` old, from its arrival to that of the next.
+    `in_flight` is the largest number of a sender's packets in transit; the newest delivered one has the age
+    `age_s` between its arrival and that of the next.
     """
     timings = {timing.name: timing.value for timing in system.timings}
     periods = {clock.name: timings[clock.period] for clock in system.clocks}
@@ -146,8 +150,8 @@ def schedule(system: Model) -> dict[str, Any]:
                 "computes": [
                     *dict.fromkeys(
                         name
-                        for kind in system.kinds
-                        for item in kind.clocks
+                        for peer_type in system.peer_types
+                        for item in peer_type.clocks
                         if item.clock == clock.name
                         for name in item.outputs
                     )
@@ -158,14 +162,14 @@ def schedule(system: Model) -> dict[str, Any]:
         ],
         "holds": [
             {
-                "kind": kind.name,
+                "kind": peer_type.name,
                 "hold": hold.name,
                 "clock": hold.clock,
                 "delay_s": float(timings[hold.delay]),
                 "held_s": float(periods[hold.clock]),
             }
-            for kind in system.kinds
-            for hold in kind.holds
+            for peer_type in system.peer_types
+            for hold in peer_type.holds
         ],
         "links": [
             {
@@ -175,8 +179,8 @@ def schedule(system: Model) -> dict[str, Any]:
                 "sends": [
                     *dict.fromkeys(
                         name
-                        for kind in system.kinds
-                        for send in kind.sends
+                        for peer_type in system.peer_types
+                        for send in peer_type.sends
                         if send.link == link.name
                         for name in send.channels
                     )
@@ -194,21 +198,21 @@ def schedule(system: Model) -> dict[str, Any]:
         ],
         "receives": [
             {
-                "kind": kind.name,
+                "kind": peer_type.name,
                 "receive": receive.name,
                 "clock": clock.clock,
                 "link": receive.link,
                 "pairwise": receive.edge is not None or receive.operator in PAIRWISE,
             }
-            for kind in system.kinds
-            for clock in kind.clocks
+            for peer_type in system.peer_types
+            for clock in peer_type.clocks
             for receive in clock.receives
         ],
     }
 
 
 def _schedule_lines(facts: dict[str, Any]) -> Iterator[str]:
-    """Yield clocks, holds, links and receives, each with what is said of it; what is nothing is left out."""
+    """Yield clocks, holds, links and receives, each with its description; empty sections are omitted."""
     frame, *tables = facts.values()
     if frame is None:
         yield "  No clock ticks: everything is continuous."

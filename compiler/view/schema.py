@@ -31,12 +31,12 @@ from apc.compiler.errors import SourceLocation
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.units import Unit, parse_unit
 from apc.compiler.language.vectors import by_vector, whole_and_index
-from apc.compiler.scene.scene import SECTIONS
+from apc.compiler.topology.topology import SECTIONS
 
 Schema = dict[str, Any]
 
 BASE = Path(__file__).with_suffix(".yaml")
-# Any unit may be written; of these an editor can say at once that one does not fit, or propose one that does.
+# Any unit is valid; for these an editor can check or suggest immediately.
 EVERYDAY_UNITS = (
     *("kg", "g", "mg", "m", "mm", "cm", "um", "s", "ms", "us", "min", "h", "Hz", "kHz"),
     *("N", "mN", "kN", "N/m", "N/mm", "kN/m", "N*s/m", "m/s", "mm/s", "rad", "deg"),
@@ -73,7 +73,7 @@ def topology_schema(library: Library) -> Schema:
 
 
 def _by_type(choices: dict[str, Schema]) -> Schema:
-    """Return the schema that asks of an object what the choice of its type asks."""
+    """Return the schema with conditions on an object by its type."""
     return {
         "allOf": [
             {"if": {"properties": {"type": {"const": name}}, "required": ["type"]}, "then": schema}
@@ -87,8 +87,8 @@ def _quantity(unit: Unit, quantities: dict[str, Schema], *, or_rate: bool = Fals
     plain = format_dimension(unit.dimension).replace("*", "_").replace("/", "_per_")
     name = f"quantity_{re.sub(r'[^a-zA-Z0-9_]', '', plain)}{'_or_rate' if or_rate else ''}"
     if name not in quantities and unit.text == "1":
-        about = "a number without a unit, or an expression"
-        quantities[name] = {"type": ["number", "string"], "description": about}
+        description = "a number without a unit, or an expression"
+        quantities[name] = {"type": ["number", "string"], "description": description}
     elif name not in quantities:
         dimensions = {text: parse_unit(text, SourceLocation("schema")).dimension for text in EVERYDAY_UNITS}
         fits = {unit.dimension, unit.dimension.power(-1)} if or_rate else {unit.dimension}
@@ -111,13 +111,13 @@ def _part(component: Component, quantities: dict[str, Schema]) -> Schema:
         **{key: {"$ref": f"#/$defs/{key}"} for key in PART_KEYS},
     }
     for name, connector in component.connectors:
-        about = f"the part, or its connector, that this {connector.name} is joined to"
-        properties[name] = {"$ref": "#/$defs/joined", "description": about}
+        description = f"the part, or its connector, that this {connector.name} is joined to"
+        properties[name] = {"$ref": "#/$defs/joined", "description": description}
     starts = (variable for variable in component.variables if variable.start is not None)
     for name, items in by_vector((*component.parameters, *starts)).items():
         schemas = [_settable(name, item, quantities) for item in items]
-        size, about = len(schemas), schemas[0].get("description", "")
-        vector = {"type": "array", "description": about, "prefixItems": schemas}
+        size, description = len(schemas), schemas[0].get("description", "")
+        vector = {"type": "array", "description": description, "prefixItems": schemas}
         properties[name] = schemas[0] if size == 1 else vector | {"minItems": size, "maxItems": size}
     if any(
         isinstance(parameter, Reference) and parameter.role == "delays" for parameter in component.parameters
@@ -127,7 +127,7 @@ def _part(component: Component, quantities: dict[str, Schema]) -> Schema:
         properties["delay"] = {"anyOf": [delay, ends]}
     required = dict.fromkeys(whole_and_index(p.name)[0] for p in component.parameters if is_required(p))
     return {
-        "description": component.about,
+        "description": component.description,
         "type": "object",
         "properties": properties,
         "required": list(required),
@@ -138,26 +138,32 @@ def _part(component: Component, quantities: dict[str, Schema]) -> Schema:
 def _settable(name: str, parameter: Settable, quantities: dict[str, Schema]) -> Schema:
     """Return the schema of a parameter or a start value; `name` is that of the vector it is an entry of."""
     if isinstance(parameter, ComponentVariable):
-        about = f"start value of the {parameter.about or name}"
-        return _quantity(parameter.unit, quantities) | {"description": about}
+        description = f"start value of the {parameter.description or name}"
+        return _quantity(parameter.unit, quantities) | {"description": description}
     if isinstance(parameter, Option):
-        facts = {"enum": list(parameter.words), "default": parameter.default, "description": parameter.about}
+        facts = {
+            "enum": list(parameter.words),
+            "default": parameter.default,
+            "description": parameter.description,
+        }
         return {key: fact for key, fact in facts.items() if fact}
     if isinstance(parameter, Reference):
         role = {"clock": "name"}.get(parameter.role, parameter.role)
-        return {"$ref": f"#/$defs/{role}", "description": parameter.about or f"a {parameter.role}"}
+        return {"$ref": f"#/$defs/{role}", "description": parameter.description or f"a {parameter.role}"}
     schema = _quantity(parameter.unit, quantities)
     if parameter.words:
         schema = {"anyOf": [{"enum": [word for word, _ in parameter.words]}, schema]}
-    limits = [f"{parameter.about or parameter.name} [{parameter.unit.text}]", *limits_of(parameter)]
+    limits = [f"{parameter.description or parameter.name} [{parameter.unit.text}]", *limits_of(parameter)]
     limits += [] if is_required(parameter) else [f"{in_unit(parameter, parameter.default)} if not given"]
     return {**schema, "description": ", ".join(limits)}
 
 
 def limits_of(parameter: NumberParameter) -> list[str]:
-    """Return where a parameter's values must lie, in its unit."""
+    """Return the range of a parameter's values, in its unit."""
     low, high = parameter.minimum, parameter.maximum
-    limits = [] if low is None else [f"{'>' if parameter.open_minimum else '≥'} {in_unit(parameter, low)}"]
+    limits = (
+        [] if low is None else [f"{'>' if parameter.exclusive_minimum else '≥'} {in_unit(parameter, low)}"]
+    )
     return limits if high is None else [*limits, f"≤ {in_unit(parameter, high)}"]
 
 

@@ -9,16 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from apc.compiler.equations.causalization import SortedSystem
 from apc.compiler.equations.clocks import ClockedSystem
 from apc.compiler.equations.flatten import FlatSend, FlatSystem
 from apc.compiler.equations.solution import Assignment, ImplicitBlock
-from apc.compiler.equations.structure import SortedSystem
 from apc.compiler.equations.terms import text_of
 from apc.compiler.language.expression import format_expression
 from apc.compiler.language.unit_text import format_dimension
-from apc.compiler.scene.scene import Topology
 from apc.compiler.source.nodes import Mapping, Node, Scalar
 from apc.compiler.source.source import Source
+from apc.compiler.topology.topology import Topology
 from apc.compiler.view.diagram import build_diagram
 
 
@@ -28,7 +28,7 @@ def describe(value: Source | Topology | FlatSystem | ClockedSystem | SortedSyste
         case Source():
             lines = _nodes(value.root, "")
         case Topology():
-            lines = _scene(value)
+            lines = _topology(value)
         case FlatSystem():
             lines = _flat(value)
         case ClockedSystem():
@@ -39,37 +39,40 @@ def describe(value: Source | Topology | FlatSystem | ClockedSystem | SortedSyste
 
 
 def _nodes(node: Node, indent: str) -> Iterator[str]:
-    place = f"{node.place.line}:{node.place.column}"
+    location = f"{node.location.line}:{node.location.column}"
     if isinstance(node, Scalar):
-        yield f"{indent}{node.text!r}  ({type(node.value).__name__}, {place})"
+        yield f"{indent}{node.text!r}  ({type(node.value).__name__}, {location})"
     elif isinstance(node, Mapping):
         for key, value in node.entries:
-            yield f"{indent}{key.text}:  ({key.place.line}:{key.place.column})"
+            yield f"{indent}{key.text}:  ({key.location.line}:{key.location.column})"
             yield from _nodes(value, indent + "  ")
     else:
         for item in node.items:
-            yield f"{indent}-  ({place})"
+            yield f"{indent}-  ({location})"
             yield from _nodes(item, indent + "  ")
 
 
-def _scene(scene: Topology) -> Iterator[str]:
-    yield f"topology {scene.name}: {scene.about}"
-    yield from (f"clock {c.name}: every {c.period}, first at {c.phase}" for c in scene.clocks)
-    for name, value in scene.parameters:
+def _topology(topology: Topology) -> Iterator[str]:
+    yield f"topology {topology.name}: {topology.description}"
+    yield from (f"clock {c.name}: every {c.period}, first at {c.phase}" for c in topology.clocks)
+    for name, value in topology.parameters:
         expression = f"{format_expression(value.expression)} = " if value.expression else ""
         yield f"parameter {name} = {expression}{value}"
-    diagram = build_diagram(scene)
+    diagram = build_diagram(topology)
     for box in diagram.boxes:
         yield "\n  ".join((f"{box.role} {box.lines[0]}", *box.lines[1:]))
-    yield from (f"{edge.one} joins {edge.two}" for edge in diagram.edges if not edge.sent)
+    yield from (f"{edge.item} joins {edge.two}" for edge in diagram.edges if not edge.sent)
 
 
 def _flat(flat: FlatSystem) -> Iterator[str]:
-    for kind in flat.kinds:
-        yield f"kind {kind.name}: {len(kind.equations)} equations, {len(kind.variables)} unknowns"
-        yield from (f"  unknown {v.name} [{format_dimension(v.dimension)}]" for v in kind.variables)
-        yield from (f"  {e.text}    # {e.origin}" for e in kind.equations)
-        yield from map(_sent, kind.sends)
+    for peer_type in flat.peer_types:
+        yield (
+            f"kind {peer_type.name}: {len(peer_type.equations)} equations, {len(peer_type.variables)} "
+            "unknowns"
+        )
+        yield from (f"  unknown {v.name} [{format_dimension(v.dimension)}]" for v in peer_type.variables)
+        yield from (f"  {e.text}    # {e.origin}" for e in peer_type.equations)
+        yield from map(_sent, peer_type.sends)
 
 
 def _sent(send: FlatSend) -> str:
@@ -77,34 +80,34 @@ def _sent(send: FlatSend) -> str:
 
 
 def _clocked(clocked: ClockedSystem) -> Iterator[str]:
-    for kind in clocked.kinds:
-        yield f"kind {kind.flat.name}"
-        for partition in kind.partitions:
+    for peer_type in clocked.peer_types:
+        yield f"kind {peer_type.flat.name}"
+        for partition in peer_type.partitions:
             yield f"  {partition.clock}: {', '.join(partition.variables)}"
             yield from (f"    {equation.text}" for equation in partition.equations)
-        yield from (f"  sample on {s.clock}: {format_expression(s.expression)}" for s in kind.samples)
-        for h in kind.holds:
+        yield from (f"  sample on {s.clock}: {format_expression(s.expression)}" for s in peer_type.samples)
+        for h in peer_type.holds:
             yield f"  hold of {h.clock}: {h.variable}, after {format_expression(h.delay)} s"
-        yield from (f"  previous on {p.clock}: {p.variable}" for p in kind.previous)
-        for r in kind.receives:
+        yield from (f"  previous on {p.clock}: {p.variable}" for p in peer_type.previous)
+        for r in peer_type.receives:
             yield f"  receive on {r.clock} over {r.link}: {r.operator} of {format_expression(r.argument)}"
-        yield from map(_sent, kind.flat.sends)
+        yield from map(_sent, peer_type.flat.sends)
 
 
 def _sorted(system: SortedSystem) -> Iterator[str]:
-    for kind in system.kinds:
-        yield f"kind {kind.clocked.flat.name}: states {', '.join(kind.states)}"
-        yield from (f"  alias {name} = {text_of(expression)}" for name, expression in kind.aliases)
-        for partition in kind.partitions:
+    for peer_type in system.peer_types:
+        yield f"kind {peer_type.clocked.flat.name}: states {', '.join(peer_type.states)}"
+        yield from (f"  alias {name} = {text_of(expression)}" for name, expression in peer_type.aliases)
+        for partition in peer_type.partitions:
             yield f"  {partition.clock}:"
             for step in partition.assignments:
                 yield from _step(step)
-        yield from (f"  {name} := {text_of(expression)}" for name, expression in kind.samples)
-        yield from (f"  send over {s.link}: {s.name} := {text_of(s.expression)}" for s in kind.sends)
+        yield from (f"  {name} := {text_of(expression)}" for name, expression in peer_type.samples)
+        yield from (f"  send over {s.link}: {s.name} := {text_of(s.expression)}" for s in peer_type.sends)
 
 
 def _step(step: Assignment | ImplicitBlock) -> Iterator[str]:
-    """Yield an assignment, or a nonlinear loop: its chain, then what is computed on the way round."""
+    """Yield an assignment, or a nonlinear loop: its iteration chain, then the values computed in it."""
     if not isinstance(step, ImplicitBlock):
         yield f"    {step[0]} := {text_of(step[1])}"
         return

@@ -1,1 +1,1 @@
-"""The analysis of a scene: which route, its verdict, proofs over boxes, the paper's route, other readings."""
+"""The analysis of a model: choice of method, verdict, proofs over boxes, the paper's method, contacts."""

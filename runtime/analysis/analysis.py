@@ -1,10 +1,10 @@
-"""Is it stable, and by how much: the whole road from a compiled system to its spectrum.
+"""Stability analysis: from a compiled model to its spectrum and verdict.
 
 Takes: a `Model`.
-Gives: `Analysis`, `analyze`; `prepare_at_start` for many analyses of one system; `lifted_groups`;
-`near_start`.
-Guarantees: the cost grows with the number of different peers, not of peers, and not with the length of a
-delay; of equal input comes equal output.
+Gives: `Analysis`, `analyze`; `prepare_at_start` for many analyses of one model; `lifted_groups`;
+`near_start`; `analyze_sides`.
+Guarantees: the cost grows with the number of different peers, not of all, and not with the length of a delay;
+equal input gives equal output.
 Does not: read files, or draw.
 """
 
@@ -18,25 +18,32 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from apc.analysis.elements import replaced_elements
-from apc.analysis.plan import cannot_serve, make_plan, refuse_varying
-from apc.analysis.sides import Side, SideVerdict, sides, worst_side
+from apc.analysis.method_selection import cannot_serve, make_plan, refuse_varying
+from apc.analysis.nonlinear_elements import replaced_elements
+from apc.analysis.one_sided_slopes import Side, SideVerdict, sides, worst_side
 from apc.compiler.compiled import LENGTH, Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.timings import part
-from apc.eigen.closing import ModalSystem, close_loop
-from apc.eigen.modes import arrange
-from apc.eigen.peers import MOST_STATES, PeerClass, peer_groups, representatives, states_of, used_ways
-from apc.eigen.rest import unrest
-from apc.eigen.rigid import NeutralModes, what_stands
+from apc.eigen.equilibrium import equilibrium_residual
+from apc.eigen.interconnection import ModalSystem, close_loop
+from apc.eigen.modes import decompose
+from apc.eigen.peer_classes import (
+    MOST_STATES,
+    PeerClass,
+    peer_groups,
+    representatives,
+    states_of,
+    used_coupling_terms,
+)
+from apc.eigen.rigid_modes import NeutralModes, classify_neutral_modes
 from apc.eigen.spectrum import Mode, Spectrum, solve_spectrum, up_to
-from apc.frame.ages import linear_sites
+from apc.frame.communication_graph import CommunicationGraph
+from apc.frame.data_age import linear_subsystems
 from apc.frame.discretize import TOO_LARGE
-from apc.frame.exchange import CommunicationGraph
-from apc.frame.finite_equations import finite_equations
-from apc.frame.instance import Instance, Prepared, instance, prepare, starting
-from apc.frame.names import ParameterRef
-from apc.network.nominal import left_out, unreliable
+from apc.frame.evaluation_errors import finite_equations
+from apc.frame.numeric_model import Instance, Prepared, instance, linearized_at_start, prepare
+from apc.frame.parameter_names import ParameterRef
+from apc.network.nominal_criterion import limitations, unreliable
 from apc.result import PlotStyle, Result
 from apc.threads import single_threaded
 from apc.verdict import (
@@ -51,25 +58,25 @@ from apc.verdict import (
 )
 
 NOT_LINEAR = (
-    "left out: the scene is not linear, and this holds near its start values only: of contacts and limits "
+    "left out: the topology is not linear, and this holds near its start values only: of contacts and limits "
     "those that act there"
 )
 
-SETTLED = 0.02  # of where it began: a motion counts as settled
+SETTLED = 0.02  # of the start: a motion counts as settled
 
 
 @dataclass(frozen=True, slots=True)
 class Analysis(Result):
-    """The answer of an analysis; `spectral_radius` is per frame, rigid modes removed.
+    """The result of an analysis; `spectral_radius` is per frame, rigid modes removed.
 
-    `states_per_peer` is that of the largest kind of peer in the scene. `method` is one of `methods.METHODS`.
-    `linearized` says that some site is not affine: the answer then holds near its start values only. `notes`
-    say why it was analysed as it was; `proof` is what ball arithmetic proved, false where floats decided;
-    `left_out` says what of the scene the answer does not look at. Of the rigid modes
-    `translations` and `rotations` move something; the others are of what `unfelt` names, memories that
-    nothing reads at these values. `beyond` is how much larger than 1 the radius is, at least and at most,
-    where that was proved: closer to 1, maybe, than two floats. `sides` are the verdicts of all sides of the
-    kinks at which peers start, none where nothing has a kink; the analysis is that of the worst side.
+    `states_per_peer` is that of the largest peer type in the model. `method` is one of `methods.METHODS`.
+    `linearized` states that some subsystem is not affine: the result then holds near its start values only.
+    `notes` are the reasons for the method; `proof` is the result of ball arithmetic, "" where floats decided;
+    `limitations` are the limitations. Of the rigid modes `translations` and `rotations` move something; the
+    others are those of the unobservable memories that `unobservable` names. `radius_excess` bounds the excess
+    of the radius over 1 from below and above, where that was proved: possibly closer to 1 than two floats.
+    `sides` are the verdicts of all sides of the kinks at which peers start, empty without kinks; the analysis
+    is that of the worst side.
     """
 
     shown_by = "analysis_output:analysis"
@@ -88,22 +95,22 @@ class Analysis(Result):
     linearized: bool
     notes: tuple[Note, ...]
     proof: StabilityProof = NO_PROOF
-    left_out: tuple[str, ...] = ()
+    limitations: tuple[str, ...] = ()
     translations: int = 0
     rotations: int = 0
-    unfelt: tuple[str, ...] = ()
-    beyond: tuple[float, float] | None = None
+    unobservable: tuple[str, ...] = ()
+    radius_excess: tuple[float, float] | None = None
     sides: tuple[SideVerdict, ...] = ()
 
-    def plot(self, ax: Any = None, **look: Unpack[PlotStyle]) -> Any:
-        """Draw the eigenvalues over the unit circle into a matplotlib Axes, or a figure's, as `look` says."""
-        return self._drawn(ax, look=look)
+    def plot(self, ax: Any = None, **style: Unpack[PlotStyle]) -> Any:
+        """Draw the eigenvalues over the unit circle into matplotlib Axes, or a figure's, in style `look`."""
+        return self._plotted(ax, style=style)
 
     @property
     def settling_s(self) -> float | None:
-        """Seconds after which the slowest motion is down to `SETTLED`; None if it doesn't die out.
+        """Settling time of the slowest mode to `SETTLED`, in seconds; None if it does not decay.
 
-        frame · ln(`SETTLED`)/ln(spectral radius): frames of different length can be compared by it.
+        frame · ln(`SETTLED`)/ln(spectral radius): independent of the length of the frame.
         """
         if self.stable is not True or self.spectral_radius >= 1:
             return None
@@ -115,56 +122,55 @@ class Analysis(Result):
 def prepare_at_start(
     system: Model, prepared: Prepared, varied: Sequence[ParameterRef] = ()
 ) -> Prepared | None:
-    """Return what was prepared with every kind linearized where it starts, as its parameters say.
+    """Return the prepared data with every peer type linearized at its start, over its parameters.
 
-    None where that can't be: see `instance.starting`; and where peers start at a kink: each point is then
-    analyzed on all sides.
+    None where that is impossible: see `numeric_model.linearized_at_start`; and where peers start at a kink:
+    each point is then analyzed on all sides.
 
     Parameters
     ----------
     system
-        The compiled scene.
+        The compiled model.
     prepared
-        From `prepare`, of this system.
+        From `prepare`, of this model.
     varied
         The parameters that will have other values.
 
     Raises
     ------
     ApcError
-        As `plan.refuse_varying` and `sides.sides`.
+        As `method_selection.refuse_varying` and `one_sided_slopes.sides`.
     """
     refuse_varying(system, prepared.jacobians)
     if sides(system, prepared)[0].system is not system:
         return None
-    return starting(system, prepared, varied)
+    return linearized_at_start(system, prepared, varied)
 
 
 def near_start(system: Model, prepared: Prepared | None = None) -> tuple[str, ...]:
-    """Return what an answer says of a scene that it linearizes: what is not at rest where it starts, and that
-    it holds there only; nothing of a linear scene.
+    """Return the limitations of a linearized result, empty for a linear model.
 
     Parameters
     ----------
     system
-        The compiled scene.
+        The compiled model.
     prepared
-        From `prepare`, of this system with any numbers.
+        From `prepare`, of this model with any parameter values.
     """
-    sites = prepared.jacobians if prepared else linear_sites(system)
+    subsystems = prepared.jacobians if prepared else linear_subsystems(system)
     elements = replaced_elements(system)
-    if all(sites[group.kind].affine for group in system.groups):
+    if all(subsystems[group.peer_type].affine for group in system.groups):
         return elements
     try:
         listed = sides(system, prepared or prepare(system))
         groups, _ = lifted_groups(listed[0].system, prepared=listed[0].prepared)
-    except ApcError:  # at these values there is no answer
+    except ApcError:  # no result with these values
         return (*elements, NOT_LINEAR)
     return (*_of_sides([side.name for side in listed]), *elements, *_near_start(groups))
 
 
 def _of_sides(names: Sequence[str]) -> tuple[str, ...]:
-    """Return the limitation of an answer at a kink."""
+    """Return the limitation of a result at a kink."""
     if len(names) < 2:
         return ()
     shown = " or ".join(names) if len(names) == 2 else f"{len(names)} combinations of sides"
@@ -172,7 +178,7 @@ def _of_sides(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _near_start(groups: Sequence[PeerClass]) -> tuple[str, ...]:
-    moves = unrest(groups)
+    moves = equilibrium_residual(groups)
     return (*([f"{moves}; what happens is played: apc simulate"] if moves else []), NOT_LINEAR)
 
 
@@ -184,29 +190,29 @@ def analyze(
     prepared: Prepared | None = None,
     certify: bool = False,
 ) -> Analysis:
-    """Analyze a system by the method that serves it, or by one that is asked for.
+    """Analyze a model by the method that suits it, or by the requested one.
 
     Where peers start at a kink every side is analyzed, and the result is that of the worst one.
 
     Parameters
     ----------
     system
-        The compiled scene, with the numbers to analyse (see `overrides.apply`).
+        The compiled model, with the parameter values to analyse (see `overrides.apply`).
     method
         One of `methods.METHODS`. "modes": a few small systems, where equal peers and the graph allow that;
-        "dense": all peers as one matrix, the check on all else, at the cost of N³; "determinant": the
-        zeros of a small characteristic function, for peers that all differ on complete graphs and for delays
-        of any length.
+        "dense": all peers as one matrix, the reference, at the cost of N³; "determinant": the zeros of a
+        small characteristic function, for different peers on complete graphs and for delays of any length.
     prepared
-        From `prepare`, of this system with any numbers; saves building the Jacobians again.
+        From `prepare`, of this model with any parameter values; avoids building the Jacobians again.
     certify
-        Prove the verdict in ball arithmetic, whether or not floats leave it open.
+        Prove the verdict in ball arithmetic, also where floats decide it.
 
     Raises
     ------
     ApcError
-        E804 a system of too many states for its matrix, E806 numbers beyond floats, E850 a method that can't
-        serve this scene; and those of `sides.sides`, `plan.refuse_varying` and `peers.peer_groups`.
+        E804 a system of too many states for its matrix, E806 an overflow, E850 a method that is not
+        applicable; and those of `one_sided_slopes.sides`, `method_selection.refuse_varying` and
+        `peer_classes.peer_groups`.
     """
     return analyze_sides(system, method=method, prepared=prepared, certify=certify)[0]
 
@@ -224,32 +230,32 @@ def analyze_sides(
     listed = sides(system, prepared or prepare(system))
     each = [_analyze(side.system, method=method, prepared=side.prepared, certify=certify) for side in listed]
     verdicts = tuple(
-        SideVerdict(side.name, one.verdict, one.stable, one.spectral_radius, one.spectral_radius_error)
-        for side, one in zip(listed, each, strict=True)
+        SideVerdict(side.name, item.verdict, item.stable, item.spectral_radius, item.spectral_radius_error)
+        for side, item in zip(listed, each, strict=True)
     )
     worst = worst_side(verdicts)
     if len(listed) == 1:
         return each[0], listed[0]
-    limitations = (*_of_sides([side.name for side in listed]), *each[worst].left_out)
-    return replace(each[worst], sides=verdicts, left_out=limitations), listed[worst]
+    limitations = (*_of_sides([side.name for side in listed]), *each[worst].limitations)
+    return replace(each[worst], sides=verdicts, limitations=limitations), listed[worst]
 
 
 def _analyze(system: Model, *, method: str, prepared: Prepared, certify: bool) -> Analysis:
-    """Analyze a system without kinks."""
+    """Return the analysis of a model without kinks."""
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        scene = instance(system, prepared)
-        plan = make_plan(scene, method)
+        topology = instance(system, prepared)
+        plan = make_plan(topology, method)
         notes: tuple[Note, ...]
         if not plan.groups:
-            spectrum, notes = _solve_populations(scene)
+            spectrum, notes = _solve_populations(topology)
         elif plan.method == "determinant":
             spectrum, notes = _solve_determinant(plan.loops), ()
             small = all(loop.states <= MOST_STATES for loop in plan.loops)
             if (
                 method == "auto" and spectrum.stable is None and small
-            ):  # matrices bound what the determinant leaves open
-                arranged = arrange(plan.groups, scene.exchange)
-                plan = replace(plan, method=arranged.method, notes=arranged.notes)
+            ):  # matrices bound an undecided determinant
+                decomposed = decompose(plan.groups, topology.exchange)
+                plan = replace(plan, method=decomposed.method, notes=decomposed.notes)
                 spectrum = _solve_closed(system, plan.loops, certify=certify)
         else:
             spectrum, notes = _solve_closed(system, plan.loops, certify=certify), ()
@@ -257,15 +263,17 @@ def _analyze(system: Model, *, method: str, prepared: Prepared, certify: bool) -
             raise cannot_serve(system, method, "what a frame's ticks round hides the peers' own eigenvalues")
         if certify and (not plan.groups or plan.method == "determinant"):
             notes = (*notes, Limitation(LimitationCode.NO_BALLS, (plan.method,)))
-        nonlinear = not scene.affine
+        nonlinear = not topology.affine
         elements = replaced_elements(system)
         linearized = nonlinear or bool(elements)
-        population = () if plan.loops else representatives(scene)
-        stands = _what_stands(spectrum, plan.loops, population)
+        population = () if plan.loops else representatives(topology)
+        neutral_modes = _neutral_modes(spectrum, plan.loops, population)
         verdict, stable = spectrum.verdict, spectrum.stable
         if verdict in (StabilityVerdict.STABLE_TRANSLATING, StabilityVerdict.DRIFTS):
             verdict = (
-                StabilityVerdict.DRIFTS if stands.drifts else up_to(stands.translations, stands.rotations)
+                StabilityVerdict.DRIFTS
+                if neutral_modes.drifts
+                else up_to(neutral_modes.translations, neutral_modes.rotations)
             )
             stable = verdict.stable
         proof = spectrum.proof
@@ -276,9 +284,9 @@ def _analyze(system: Model, *, method: str, prepared: Prepared, certify: bool) -
             proof = replace(proof, scope=tuple(scope for scope, is_so in of if is_so))
     return Analysis(
         topology=system.name,
-        peers=scene.exchange.peers,
-        frame_s=float(scene.schedules[0].frame_s),
-        states_per_peer=max(map(states_of, scene.schedules, scene.sites)),
+        peers=topology.exchange.peers,
+        frame_s=float(topology.schedules[0].frame_s),
+        states_per_peer=max(map(states_of, topology.schedules, topology.subsystems)),
         method=plan.method,
         verdict=verdict,
         stable=stable,
@@ -289,55 +297,57 @@ def _analyze(system: Model, *, method: str, prepared: Prepared, certify: bool) -
         linearized=linearized,
         notes=(*plan.notes, *notes, *spectrum.notes),
         proof=proof,
-        left_out=(*elements, *(_near_start(plan.groups) if nonlinear else ()), *left_out(system)),
-        unfelt=stands.names,
-        translations=stands.translations,
-        rotations=stands.rotations,
-        beyond=spectrum.beyond,
+        limitations=(*elements, *(_near_start(plan.groups) if nonlinear else ()), *limitations(system)),
+        unobservable=neutral_modes.names,
+        translations=neutral_modes.translations,
+        rotations=neutral_modes.rotations,
+        radius_excess=spectrum.radius_excess,
     )
 
 
-def _what_stands(
+def _neutral_modes(
     spectrum: Spectrum, loops: Sequence[ModalSystem], population: Sequence[PeerClass]
 ) -> NeutralModes:
-    """Return what neither grows nor dies out.
+    """Return the neutral modes.
 
-    Where the loops are not at hand, of a large population, what is not felt is that of peers by themselves,
-    and what moves counts as a translation.
+    For a large population without loops, unobservable modes are those of single peers, and every other mode
+    counts as a translation.
     """
     if not spectrum.rigid_modes or not any(
-        map(_remembers, (*population, *(g for loop in loops for g in loop.sites)))
+        map(_remembers, (*population, *(g for loop in loops for g in loop.subsystems)))
     ):
         return NeutralModes(spectrum.rigid_modes, 0, spectrum.drifts, 0, ())
     listed: Sequence[tuple[ModalSystem, int]] = [(loop, loop.multiplicity) for loop in loops]
     for group in population:
-        anyhow = {way: ((Fraction(-1, 3),),) for way in used_ways([group.schedule])}
+        anyhow = {
+            coupling_term: ((Fraction(-1, 3),),) for coupling_term in used_coupling_terms([group.schedule])
+        }
         listed = [*listed, (ModalSystem(group.name, 1, (group,), anyhow), group.count)]
     with_drifts = bool(spectrum.drifts and loops)
-    pairs = [(what_stands(loop, with_drifts=with_drifts), many) for loop, many in listed]
-    names = tuple(dict.fromkeys(name for standing, _ in pairs for name in standing.names))
-    unfelt = sum(standing.unfelt * many for standing, many in pairs)
+    pairs = [(classify_neutral_modes(loop, with_drifts=with_drifts), many) for loop, many in listed]
+    names = tuple(dict.fromkeys(name for neutral, _ in pairs for name in neutral.names))
+    unobservable = sum(neutral.unobservable * many for neutral, many in pairs)
     if not loops:
-        return NeutralModes(spectrum.rigid_modes - unfelt, 0, spectrum.drifts, unfelt, names)
+        return NeutralModes(spectrum.rigid_modes - unobservable, 0, spectrum.drifts, unobservable, names)
     return NeutralModes(
-        translations=sum(standing.translations * many for standing, many in pairs),
-        rotations=sum(standing.rotations * many for standing, many in pairs),
-        drifts=sum(standing.drifts * many for standing, many in pairs),
-        unfelt=unfelt,
+        translations=sum(neutral.translations * many for neutral, many in pairs),
+        rotations=sum(neutral.rotations * many for neutral, many in pairs),
+        drifts=sum(neutral.drifts * many for neutral, many in pairs),
+        unobservable=unobservable,
         names=names,
     )
 
 
 def _remembers(group: PeerClass) -> bool:
-    """Say whether peers keep more than lengths with their rates."""
-    kind = group.jacobians.kind
-    return any(clock.memories for clock in kind.clocks) or any(
-        state.unit.partition("/")[0] != LENGTH for state in kind.states
+    """Return whether peers have states other than lengths and their rates."""
+    peer_type = group.jacobians.peer_type
+    return any(clock.memories for clock in peer_type.clocks) or any(
+        state.unit.partition("/")[0] != LENGTH for state in peer_type.states
     )
 
 
 def _solve_closed(system: Model, loops: Sequence[ModalSystem], *, certify: bool) -> Spectrum:
-    """Solve loops by their matrices."""
+    """Return the spectrum of loops from their matrices."""
     closed = tuple(close_loop(loop) for loop in loops)
     if not all(
         np.isfinite(closed_system.matrix).all() and np.isfinite(closed_system.error).all()
@@ -348,22 +358,22 @@ def _solve_closed(system: Model, loops: Sequence[ModalSystem], *, certify: bool)
 
 
 def _solve_determinant(loops: Sequence[ModalSystem]) -> Spectrum:
-    """Solve loops by the zeros of their characteristic functions."""
-    # What serves large scenes is imported when one comes: all of it would cost every scene 30 ms.
-    from apc.large.determinant_spectrum import solve_loops
+    """Return the spectrum of loops from the zeros of their characteristic functions."""
+    # Modules for large models are imported when needed: importing them costs 30 ms.
+    from apc.large_scale.determinant_spectrum import solve_loops
 
     return solve_loops(loops)
 
 
-def _solve_populations(scene: Instance) -> tuple[Spectrum, tuple[Note, ...]]:
-    """Solve peers that all differ."""
-    from apc.large.determinant_spectrum import solve_populations
-    from apc.large.populations import populations
-    from apc.large.translation import count_translations
+def _solve_populations(topology: Instance) -> tuple[Spectrum, tuple[Note, ...]]:
+    """Return the spectrum of peers that all differ."""
+    from apc.large_scale.determinant_spectrum import solve_populations
+    from apc.large_scale.heterogeneous_peers import populations
+    from apc.large_scale.translation import count_translations
 
-    peers = populations(scene)
-    rigid = count_translations(scene, peers)
-    spectrum = solve_populations(peers, scene.exchange, rigid=rigid or 0)
+    peers = populations(topology)
+    rigid = count_translations(topology, peers)
+    spectrum = solve_populations(peers, topology.exchange, rigid=rigid or 0)
     free = "the first peer moves freely in a way that not all others do: left open"
     return spectrum, () if rigid is not None else (free,)
 
@@ -371,13 +381,13 @@ def _solve_populations(scene: Instance) -> tuple[Spectrum, tuple[Note, ...]]:
 def lifted_groups(
     system: Model, *, prepared: Prepared | None = None
 ) -> tuple[tuple[PeerClass, ...], CommunicationGraph]:
-    """Return the peers of a system in groups of equal dynamics, lifted, and the exchange between them.
+    """Return the peers of a model in groups of equal dynamics, lifted, and the links between them.
 
     Raises
     ------
     ApcError
-        As `plan.refuse_varying` and `peers.peer_groups`.
+        As `method_selection.refuse_varying` and `peer_classes.peer_groups`.
     """
-    scene = instance(system, prepared)
-    refuse_varying(system, scene.jacobians)
-    return peer_groups(scene), scene.exchange
+    topology = instance(system, prepared)
+    refuse_varying(system, topology.jacobians)
+    return peer_groups(topology), topology.exchange

@@ -1,13 +1,13 @@
-"""Which contact makes it unstable: the analysis of a scene in each of its modes.
+"""Contact modes: the analysis of a model with each combination of contacts on or off.
 
-Takes: a `Model` whose peers have parts that switch (see `switches`).
-Gives: `ContactMode`, `ContactModes`, `contact_modes`.
-Guarantees: in each mode every such part is wholly on or wholly off, and the rest is as in the scene; where a
-piece is linear, so is the answer, wherever the motion is.
-Does not: prove that a motion which changes from mode to mode stays bounded, or try peers of one group apart.
+Takes: a `Model` whose peers have switching parts (see `switches`).
+Gives: `ContactMode`, `ContactModes`, `contact_modes`; `parts_of_peer_types`, `settings`.
+Guarantees: in each mode every switching part is fully on or off, and the other parts are unchanged; where a
+piece is linear, the result holds globally.
+Does not: prove boundedness of a motion that changes between modes, or distinguish peers of one group.
 
-The modes: every switching part on at every peer; none on; each group alone with all of its own on; and where
-several parts switch, each part alone on at every peer.
+The modes: every switching part on at every peer; none on; each group separately with all of its own on; and
+where several parts switch, each part on at every peer.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from apc.analysis.switches import SwitchingPart, bind, switching_parts
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.compiler.timings import part
-from apc.frame.decisions import SwitchedPeerType, find_switches
-from apc.frame.instance import Prepared, prepare
+from apc.frame.branch_conditions import SwitchedPeerType, find_switches
 from apc.frame.jacobians import SubsystemJacobians
 from apc.frame.linearize import linearize
+from apc.frame.numeric_model import Prepared, prepare
 from apc.frame.parameters import ResolvedNumbers, resolve
 from apc.result import Result
 from apc.verdict import StabilityVerdict
@@ -33,7 +33,7 @@ from apc.verdict import StabilityVerdict
 EVERYONE = "on at every peer"
 NOBODY = "on at no peer"
 
-# For each group of the scene, the names of the parts that are on.
+# For each group of the model, the names of the parts that are on.
 _Setting = tuple[frozenset[str], ...]
 
 
@@ -41,9 +41,9 @@ _Setting = tuple[frozenset[str], ...]
 class ContactMode:
     """One mode: `on` lists (group, its parts that are on).
 
-    The spectral radius is per frame; `frequency_hz` is that of the mode of motion with it. `linearized` says
-    that some piece is not linear, so that the answer holds near the start values only. Where a mode can't be
-    analysed, `verdict` is None and `refusal` is the reason.
+    The spectral radius is per frame; `frequency_hz` is that of its mode. `linearized` states that some piece
+    is not linear, so that the result holds near the start values only. Where a mode cannot be analysed,
+    `verdict` is "" and `refusal` is the reason.
     """
 
     name: str
@@ -55,14 +55,14 @@ class ContactMode:
     frequency_hz: float
     linearized: bool
     refusal: str
-    beyond: tuple[float, float] | None = None  # of 1, see `Analysis`
+    radius_excess: tuple[float, float] | None = None  # of 1, see `Analysis`
 
 
 @dataclass(frozen=True, slots=True)
 class ContactModes(Result):
-    """Every mode of a scene; none where nothing switches.
+    """Every contact mode of a model; empty where nothing switches.
 
-    `parts` are the switching parts by name; `notes` say what was not looked into.
+    `parts` are the switching parts by name; `notes` are the limitations.
     """
 
     shown_by = "analysis_output:contact_modes"
@@ -79,7 +79,7 @@ class ContactModes(Result):
 
     @property
     def summary(self) -> str:
-        """Which mode is unstable, in one sentence; "" where nothing switches."""
+        """The unstable modes, in one sentence; "" where nothing switches."""
         if not self.modes:
             return ""
         unstable = self.unstable
@@ -97,55 +97,57 @@ class ContactModes(Result):
 
 @part("contact modes")
 def contact_modes(system: Model, *, prepared: Prepared | None = None) -> ContactModes:
-    """Analyse a scene in each mode of its contacts, walls and limits.
+    """Analyse a model in each mode of its contacts, walls and limits.
 
     Parameters
     ----------
     system
-        The compiled scene, with the numbers to analyse.
+        The compiled model, with the parameter values to analyse.
     prepared
-        From `instance.prepare`, of this system with these timings; saves building the Jacobians again.
+        From `numeric_model.prepare`, of this model with these timings; avoids building the Jacobians again.
 
     Raises
     ------
     ApcError
-        E863 a part that takes too many decisions.
+        E863 a part with too many decisions.
     """
     prepared = prepared or prepare(system)
-    switched = [find_switches(site.kind) for site in prepared.jacobians]
+    switched = [find_switches(subsystem.peer_type) for subsystem in prepared.jacobians]
     hidden = dict.fromkeys(
-        switched_kind.kind.name for switched_kind in switched if not switched_kind.walkable
+        switched_peer_type.peer_type.name
+        for switched_peer_type in switched
+        if not switched_peer_type.walkable
     )
     notes = tuple(f"not looked into: {name}, which has a nonlinear loop" for name in hidden)
     with np.errstate(all="ignore"):
-        parts = parts_of_kinds(system, switched, resolve(system))
+        parts = parts_of_peer_types(system, switched, resolve(system))
     names = tuple(dict.fromkeys(part.name for listed in parts for part in listed))
-    has = [frozenset(part.name for part in parts[group.kind]) for group in system.groups]
+    has = [frozenset(part.name for part in parts[group.peer_type]) for group in system.groups]
 
-    def site(kind: int, on: frozenset[str]) -> SubsystemJacobians:
-        """Return the Jacobians of a kind with these parts on and all others off."""
-        if not switched[kind].decisions:
-            return prepared.jacobians[kind]
-        setting = settings((part for part in parts[kind] if part.name in on), on=True)
-        setting |= settings((part for part in parts[kind] if part.name not in on), on=False)
-        return bind(switched[kind], prepared.jacobians[kind], setting)
+    def subsystem(peer_type: int, on: frozenset[str]) -> SubsystemJacobians:
+        """Return the Jacobians of a peer type with these parts on and all others off."""
+        if not switched[peer_type].decisions:
+            return prepared.jacobians[peer_type]
+        setting = settings((part for part in parts[peer_type] if part.name in on), on=True)
+        setting |= settings((part for part in parts[peer_type] if part.name not in on), on=False)
+        return bind(switched[peer_type], prepared.jacobians[peer_type], setting)
 
     def mode(name: str, setting: _Setting) -> ContactMode:
-        """Analyse the scene with these parts on."""
-        # Groups of one kind with other parts on are of two kinds now.
+        """Return the analysis of the model with these parts on."""
+        # Groups of one peer type with different parts on have two types now.
         numbers: dict[tuple[int, frozenset[str]], int] = {}
         groups = tuple(
-            replace(group, kind=numbers.setdefault((group.kind, own), len(numbers)))
-            for group, own in zip(system.groups, setting, strict=True)
+            replace(group, peer_type=numbers.setdefault((group.peer_type, local), len(numbers)))
+            for group, local in zip(system.groups, setting, strict=True)
         )
-        sites = tuple(site(*number) for number in numbers)
-        kinds = tuple(system.kinds[kind] for kind, _ in numbers)
-        changed = replace(system, kinds=kinds, groups=groups)
-        on = tuple((group.name, tuple(sorted(own))) for group, own in zip(groups, setting, strict=True))
-        analysis, refusal = None, _no_slope(changed, sites)
+        subsystems = tuple(subsystem(*number) for number in numbers)
+        peer_types = tuple(system.peer_types[peer_type] for peer_type, _ in numbers)
+        changed = replace(system, peer_types=peer_types, groups=groups)
+        on = tuple((group.name, tuple(sorted(local))) for group, local in zip(groups, setting, strict=True))
+        analysis, refusal = None, _no_slope(changed, subsystems)
         if not refusal:
             try:
-                analysis = analyze(changed, prepared=replace(prepared, jacobians=sites))
+                analysis = analyze(changed, prepared=replace(prepared, jacobians=subsystems))
             except ApcError as error:
                 refusal = error.mistakes[0].sentence
         if analysis is None:
@@ -161,60 +163,60 @@ def contact_modes(system: Model, *, prepared: Prepared | None = None) -> Contact
             frequency_hz=analysis.modes[0].frequency_hz if analysis.modes else 0.0,
             linearized=analysis.linearized,
             refusal="",
-            beyond=analysis.beyond,
+            radius_excess=analysis.radius_excess,
         )
 
     modes = tuple(mode(name, setting) for setting, name in _settings(system, names, has).items())
     return ContactModes(system.name, names, modes, notes)
 
 
-def parts_of_kinds(
+def parts_of_peer_types(
     system: Model, switched: Sequence[SwitchedPeerType], numbers: ResolvedNumbers
 ) -> list[tuple[SwitchingPart, ...]]:
-    """Return the switching parts of each kind, as they are of the first of its peers.
+    """Return the switching parts of each peer type, at the parameters of its first peer.
 
     Raises
     ------
     ApcError
-        E863 a part that takes too many decisions.
+        E863 a part with too many decisions.
     """
     parts: list[tuple[SwitchingPart, ...]] = []
-    for index, switched_kind in enumerate(switched):
-        rows = [numbers.parameters[g][0] for g, group in enumerate(system.groups) if group.kind == index]
-        parts.append(switching_parts(switched_kind, rows[0]) if rows else ())
+    for index, switched_peer_type in enumerate(switched):
+        rows = [numbers.parameters[g][0] for g, group in enumerate(system.groups) if group.peer_type == index]
+        parts.append(switching_parts(switched_peer_type, rows[0]) if rows else ())
     return parts
 
 
 def settings(parts: Iterable[SwitchingPart], *, on: bool) -> dict[int, bool]:
-    """Return the settings of all decisions of some parts, each wholly on or wholly off."""
+    """Return the settings of all decisions of some parts, each fully on or off."""
     return {
-        place: value
+        index: value
         for part in parts
-        for place, value in zip(part.decisions, part.on if on else part.off, strict=True)
+        for index, value in zip(part.decisions, part.on if on else part.switched_off, strict=True)
     }
 
 
 def _settings(system: Model, names: Sequence[str], has: Sequence[frozenset[str]]) -> dict[_Setting, str]:
-    """Return the modes of a scene with their names, each once; none where nothing switches."""
+    """Return the modes of a model with their names, each once; empty where nothing switches."""
     nothing: frozenset[str] = frozenset()
     result = {tuple(has): EVERYONE, tuple(nothing for _ in has): NOBODY} if names else {}
-    for place, group in enumerate(system.groups if names else ()):
-        alone = tuple(texts if g == place else nothing for g, texts in enumerate(has))
+    for index, group in enumerate(system.groups if names else ()):
+        alone = tuple(texts if g == index else nothing for g, texts in enumerate(has))
         result.setdefault(alone, f"on at {group.name} alone")
     for name in names:
         result.setdefault(tuple(texts & {name} for texts in has), f"{name} on alone")
     return result
 
 
-def _no_slope(system: Model, sites: Sequence[SubsystemJacobians]) -> str:
-    """Say which peers' pieces have no slopes at the start values, "" if all have."""
+def _no_slope(system: Model, subsystems: Sequence[SubsystemJacobians]) -> str:
+    """Return a note on peers whose pieces have no slopes at the start values, "" if all have."""
     numbers = resolve(system)
     for group, rows in zip(system.groups, numbers.parameters, strict=True):
-        site = sites[group.kind]
-        if site.affine or site.edges:  # slopes everywhere, or found with those who are heard
+        subsystem = subsystems[group.peer_type]
+        if subsystem.affine or subsystem.edges:  # slopes everywhere, or linearized with their senders
             continue
         try:
-            linearize(site, rows[0])
+            linearize(subsystem, rows[0])
         except ApcError:
             return f"this piece of {group.name} is not linear and has no slope at the start values"
     return ""

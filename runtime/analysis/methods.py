@@ -1,8 +1,8 @@
-"""The methods of analysis by name: the one list of them.
+"""The methods of analysis by name: the single list of them.
 
 Takes: nothing. Gives: `Method`, `METHODS`, `AUTO`, `PAPER`.
-Guarantees: what the command line offers, the Python function takes and the benchmark measures is one list.
-Does not: know how a method works (see `plan`, `paper`), or load anything.
+Guarantees: the command line, the Python function and the benchmark use this list.
+Does not: implement a method (see `method_selection`, `paper_method`), or load anything.
 """
 
 from __future__ import annotations
@@ -12,5 +12,5 @@ from typing import Literal, get_args
 Method = Literal["auto", "modes", "dense", "determinant", "paper"]
 METHODS: tuple[Method, ...] = get_args(Method)
 
-AUTO: Method = "auto"  # that which serves the scene
-PAPER: Method = "paper"  # has a route of its own
+AUTO: Method = "auto"  # the one that suits the model
+PAPER: Method = "paper"  # has an implementation of its own

@@ -1,9 +1,9 @@
-"""Where a peer's equations switch between linear pieces: contacts, walls, limits.
+"""Switching parts: groups of decisions between linear pieces, such as contacts, walls, limits.
 
-Takes: a kind of a `Model` with its decisions.
+Takes: a peer type of a `Model` with its decisions.
 Gives: `SwitchingPart`, `switching_parts`; `bind`, `varying_slopes`.
-Guarantees: decisions that change something in common are one part.
-Does not: find the decisions (see `frame.decisions`).
+Guarantees: decisions that change a common output are one part.
+Does not: find the decisions (see `frame.branch_conditions`).
 """
 
 from __future__ import annotations
@@ -20,37 +20,37 @@ from scipy.sparse.csgraph import connected_components
 
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.interpolation import jacobian
-from apc.frame.decisions import Decision, SwitchedPeerType, bound_kind, find_switches
+from apc.frame.branch_conditions import Decision, SwitchedPeerType, bound_peer_type, find_switches
 from apc.frame.jacobians import SubsystemJacobians, jacobians, with_equations
 from apc.frame.linearize import start_values
 
-# A part with more decisions than this is refused: its pieces are as many as 2 to that power.
+# The limit of decisions of a part: its pieces are 2 to that power.
 MOST_DECISIONS = 6
 
 
 @dataclass(frozen=True, slots=True)
 class SwitchingPart:
-    """What switches as one: on, its force follows the motion; off, it does not, or less.
+    """A switching part: its force depends on the motion if on; if off, less or not at all.
 
-    `name` is what it computes, such as `contact.push`; `on` and `off` are settings, decision by decision, of
-    `decisions` (their places in the kind).
+    `name` is its output, such as `contact.push`; `on` and `switched_off` are settings, decision by decision,
+    of `decisions` (their indices in the peer type).
     """
 
     name: str
     decisions: tuple[int, ...]
     on: tuple[bool, ...]
-    off: tuple[bool, ...]
+    switched_off: tuple[bool, ...]
 
 
 def switching_parts(switched: SwitchedPeerType, parameters: NDArray[np.float64]) -> tuple[SwitchingPart, ...]:
-    """Group a kind's decisions by what they change, and find each group's pieces "on" and "off".
+    """Return a peer type's decisions grouped by the outputs that they change, with pieces "on" and "off".
 
     Parameters
     ----------
     switched
-        The kind.
+        The peer type.
     parameters
-        A vector (n_p,) of this kind: where two pieces depend on the same motions, the steeper is "on".
+        Parameters (n_p,) of this type: where two pieces depend on the same motions, the steeper is "on".
 
     Raises
     ------
@@ -58,31 +58,31 @@ def switching_parts(switched: SwitchedPeerType, parameters: NDArray[np.float64])
         E863 a part with too many decisions.
     """
     parts = []
-    for places in _together(switched.decisions):
-        names = list(dict.fromkeys(name for place in places for name in switched.decisions[place].changes))
+    for indices in _together(switched.decisions):
+        names = list(dict.fromkeys(name for index in indices for name in switched.decisions[index].changes))
         owners = {name.rpartition(".")[0] or name for name in names}
         name = owners.pop() if len(names) > 1 and len(owners) == 1 else ", ".join(names)
-        if len(places) > MOST_DECISIONS:
-            what = (
-                f"{name} of {switched.kind.name} takes {len(places)} decisions; "
+        if len(indices) > MOST_DECISIONS:
+            message = (
+                f"{name} of {switched.peer_type.name} takes {len(indices)} decisions; "
                 f"at most {MOST_DECISIONS} are analysed piece by piece"
             )
-            raise ApcError(Diagnostic("E863", SourceLocation(switched.kind.name), what))
-        pair = _extremes(switched, places, parameters)
+            raise ApcError(Diagnostic("E863", SourceLocation(switched.peer_type.name), message))
+        pair = _extremes(switched, indices, parameters)
         if pair is not None:
-            parts.append(SwitchingPart(name, places, *pair))
+            parts.append(SwitchingPart(name, indices, *pair))
     return tuple(parts)
 
 
-def varying_slopes(site: SubsystemJacobians) -> tuple[str, ...]:
-    """Return the names of what has slopes that change with time in some piece, whatever else moves.
+def varying_slopes(subsystem: SubsystemJacobians) -> tuple[str, ...]:
+    """Return the names of outputs with time-varying slopes in some piece.
 
-    Of a kind with a nonlinear loop nothing is known: all that is in the loop depends on all that drives it.
+    In a peer type with a nonlinear loop, all outputs of the loop are taken to depend on all its inputs.
     """
-    if not site.timed:
+    if not subsystem.timed:
         return ()
     result: dict[str, None] = {}
-    for function in find_switches(site.kind).functions:
+    for function in find_switches(subsystem.peer_type).functions:
         *moving, _, t = function.inputs
         slopes = jacobian(function.output, casadi.vertcat(*moving))
         result |= dict.fromkeys(function.names(slopes, t))
@@ -92,52 +92,54 @@ def varying_slopes(site: SubsystemJacobians) -> tuple[str, ...]:
 def bind(
     switched: SwitchedPeerType, base: SubsystemJacobians, settings: Mapping[int, bool]
 ) -> SubsystemJacobians:
-    """Return the Jacobians of a kind with every decision set.
+    """Return the Jacobians of a peer type with every decision set.
 
     Parameters
     ----------
     switched
-        The kind.
+        The peer type.
     base
-        Its ordinary Jacobians: states, start values and structural patterns stay theirs, so that every piece
-        has the same frame and the same states.
+        Its ordinary Jacobians: states, start values and structural patterns are taken from them, so that
+        every piece has the same frame and the same states.
     settings
-        By the place of the decision; what is left out is off.
+        By the index of the decision; those left out are off.
     """
-    return with_equations(base, bound_kind(switched, settings))
+    return with_equations(base, bound_peer_type(switched, settings))
 
 
 def _together(decisions: Sequence[Decision]) -> list[tuple[int, ...]]:
-    """Return the places of decisions that change something in common; not of those nobody reads."""
-    read = [place for place, decision in enumerate(decisions) if decision.changes]
+    """Return the indices of decisions that change a common output; without unused decisions."""
+    read = [index for index, decision in enumerate(decisions) if decision.changes]
     shared = [[not set(decisions[a].changes).isdisjoint(decisions[b].changes) for b in read] for a in read]
     count, labels = connected_components(np.array(shared).reshape(len(read), len(read)), directed=False)
     return sorted(
-        tuple(place for place, own in zip(read, labels, strict=True) if own == label)
+        tuple(index for index, local in zip(read, labels, strict=True) if local == label)
         for label in range(count)
     )
 
 
 def _extremes(
-    switched: SwitchedPeerType, places: Sequence[int], parameters: NDArray[np.float64]
+    switched: SwitchedPeerType, indices: Sequence[int], parameters: NDArray[np.float64]
 ) -> tuple[tuple[bool, ...], tuple[bool, ...]] | None:
     """Return the settings of the steepest and the flattest piece, None where all have the same slopes.
 
-    Steeper is what depends on more motions, then what has the larger slopes (in SI) at the start values.
+    The steeper piece depends on more motions, or else has larger slopes (in SI) at the start values.
     """
     slopes: dict[tuple[bool, ...], tuple[int, float, bytes]] = {}
-    for setting in itertools.product((True, False), repeat=len(places)):
-        site = jacobians(bound_kind(switched, dict(zip(places, setting, strict=True))))
-        x, u, m = start_values(site, list(parameters))
+    for setting in itertools.product((True, False), repeat=len(indices)):
+        subsystem = jacobians(bound_peer_type(switched, dict(zip(indices, setting, strict=True))))
+        x, u, m = start_values(subsystem, list(parameters))
         memories = [value for item in m for value in item]
-        heard = [0.0] * site.function.numel_in(3)
-        flat = np.asarray(site.function(x, u, memories, heard, parameters, 0.0), dtype=np.float64).ravel()
-        for edge in site.edges.values():
+        received = [0.0] * subsystem.function.numel_in(3)
+        flat = np.asarray(
+            subsystem.function(x, u, memories, received, parameters, 0.0), dtype=np.float64
+        ).ravel()
+        for edge in subsystem.edges.values():
             moving = (edge.function.numel_in(i) for i in range(4))
             values = edge.function(*([0.0] * size for size in moving), parameters, 0.0)
             flat = np.append(flat, np.asarray(values, dtype=np.float64).ravel()[1:])
         finite = np.nan_to_num(flat, posinf=0.0, neginf=0.0)
-        structural = sum(int(matrix.sum()) for matrix in _patterns(site))
+        structural = sum(int(matrix.sum()) for matrix in _patterns(subsystem))
         slopes[setting] = (structural, float(np.linalg.norm(finite)), flat.tobytes())
     steepest = max(slopes, key=lambda setting: slopes[setting][:2])
     flattest = min(slopes, key=lambda setting: slopes[setting][:2])
@@ -147,9 +149,9 @@ def _extremes(
     return steepest, flattest
 
 
-def _patterns(site: SubsystemJacobians) -> list[NDArray[Any]]:
-    """Return a site's structural patterns; edges' own parts are among the ticks'."""
-    pattern = site.pattern
+def _patterns(subsystem: SubsystemJacobians) -> list[NDArray[Any]]:
+    """Return a subsystem's structural patterns; edge functions are included in the ticks'."""
+    pattern = subsystem.pattern
     listed = [pattern.a, pattern.b]
     for tick in pattern.ticks:
         channels = np.array([len(channel) for channel in tick.channels], dtype=np.int64)

@@ -1,1 +1,1 @@
-"""Speed against error of every method on a scene."""
+"""Speed against error of every method on a topology."""

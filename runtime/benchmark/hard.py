@@ -1,10 +1,10 @@
-"""The hard cases: scenes whose truth is known to fifty digits, each analysed and compared with it.
+"""The hard cases: topologies whose truth is known to fifty digits, each analysed and compared with it.
 
 Takes: a folder of topologies and its `truths.json`.
 Gives: `HardCase`, `HardReport`, `run_hard_cases`.
 Guarantees: an error is computed exactly from the stored digits; a bound that does not hold or says nothing, a
 verdict that is wrong or left open and a wrong number of rigid modes fail.
-Does not: compute any truth (see the script beside the scenes).
+Does not: compute any truth (see the script beside the topologies).
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from apc.threads import single_threaded
 from apc.verdict import StabilityVerdict
 
 TRUTHS = "truths.json"
-FOLDER = "--hard FOLDER, of scenes and their truths, as tests/hard of a copy of the repository"
+FOLDER = "--hard FOLDER, of topologies and their truths, as tests/hard of a copy of the repository"
 REPEATS = 3  # of each analysis; its time is the median
 ENOUGH = 2.0  # seconds after which one is not repeated
 
 
 @dataclass(frozen=True, slots=True)
 class HardCase:
-    """One scene: the answer beside the truth.
+    """One topology: the answer beside the truth.
 
     `error` is |ρ − truth|, `bound` what the analysis says it is at most, both divided by max(ρ, 1) where ρ
     is the truth. `seconds` is the median time of the analysis. `undecided` says that it left the verdict
@@ -46,7 +46,7 @@ class HardCase:
     """
 
     name: str
-    about: str
+    description: str
     peers: int
     method: str
     verdict: StabilityVerdict
@@ -70,7 +70,7 @@ class HardCase:
 
 @dataclass(frozen=True, slots=True)
 class HardReport(Result):
-    """All cases of a folder, and its scenes without a truth."""
+    """All cases of a folder, and its topologies without a truth."""
 
     shown_by = "bench_output:hard"
 
@@ -90,7 +90,7 @@ def run_hard_cases(
     repeats: int = REPEATS,
     solve: Callable[[Model], Analysis] = analyze,
 ) -> HardReport:
-    """Analyse every scene of a folder and compare.
+    """Analyse every topology of a folder and compare.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def run_hard_cases(
         Holds topologies and `truths.json`: by the name of a file without its suffix, `spectral_radius` (text,
         many digits), `rigid_modes`, `verdict`.
     repeats
-        Analyses of each scene, of which the median time counts.
+        Analyses of each topology, of which the median time counts.
     solve
         The analysis.
 
@@ -119,8 +119,8 @@ def run_hard_cases(
             seconds, result = median_time(partial(solve, system), repeats, enough=ENOUGH)
         cases.append(compare(system, result, truths[path.stem], seconds, path.stem))
     if not cases:
-        what = "holds no topology whose truth is known"
-        raise ApcError(Diagnostic("E920", SourceLocation(str(folder)), what, hint=FOLDER))
+        message = "holds no topology whose truth is known"
+        raise ApcError(Diagnostic("E920", SourceLocation(str(folder)), message, hint=FOLDER))
     return HardReport(str(folder), tuple(cases), tuple(without))
 
 
@@ -132,7 +132,7 @@ def compare(
     Parameters
     ----------
     system, analysis
-        The scene and its analysis.
+        The topology and its analysis.
     truth
         An entry of `truths.json`.
     seconds
@@ -142,16 +142,16 @@ def compare(
     """
     radius = Fraction(truth["spectral_radius"])
     bound = analysis.spectral_radius_error
-    apart = None
+    separation = None
     if math.isfinite(analysis.spectral_radius):
-        apart = abs(Fraction(analysis.spectral_radius) - radius)
+        separation = abs(Fraction(analysis.spectral_radius) - radius)
     size = float(max(radius, Fraction(1)))
     wrong = []
-    if apart is None:
+    if separation is None:
         wrong.append("there is no spectral radius")
     elif not math.isfinite(bound):
         wrong.append("the bound says nothing")
-    elif apart > Fraction(bound):
+    elif separation > Fraction(bound):
         wrong.append("the bound does not hold")
     if analysis.stable is None:
         wrong.append(f"the verdict is left open: {truth['verdict']}")
@@ -161,12 +161,12 @@ def compare(
         wrong.append(f"{truth['rigid_modes']} rigid modes, not {analysis.rigid_modes}")
     return HardCase(
         name=name,
-        about=system.about,
+        description=system.description,
         peers=system.peers,
         method=analysis.method + (" + proof" if analysis.proof else ""),
         verdict=analysis.verdict,
         radius=str(truth["spectral_radius"]),
-        error=math.inf if apart is None else float(apart) / size,
+        error=math.inf if separation is None else float(separation) / size,
         bound=bound / size,
         seconds=seconds,
         undecided=analysis.stable is None,
@@ -177,13 +177,13 @@ def compare(
 def _truths(folder: Path) -> dict[str, Any]:
     """Read the truths of a folder."""
     path = folder / TRUTHS
-    place = SourceLocation(str(path))
+    location = SourceLocation(str(path))
     try:
         result = json.loads(read_file(path, MAX_BYTES))
     except RefusedError as refused:
-        raise ApcError(Diagnostic("E920", place, refused.words, hint=FOLDER)) from None
+        raise ApcError(Diagnostic("E920", location, refused.words, hint=FOLDER)) from None
     except ValueError as error:
-        raise ApcError(Diagnostic("E920", place, f"is not JSON: {error}")) from error
+        raise ApcError(Diagnostic("E920", location, f"is not JSON: {error}")) from error
     pairs: list[tuple[str, Any]] = list(result.items()) if isinstance(result, dict) else [("", None)]
     for name, truth in pairs:
         try:
@@ -192,8 +192,8 @@ def _truths(folder: Path) -> dict[str, Any]:
             if not whole:
                 raise TypeError
         except (TypeError, KeyError, ValueError, ArithmeticError) as error:
-            expected = "spectral_radius (digits), rigid_modes and verdict of each scene"
+            expected = "spectral_radius (digits), rigid_modes and verdict of each topology"
             raise ApcError(
-                Diagnostic("E920", place, name or "the truths", expected, "something else")
+                Diagnostic("E920", location, name or "the truths", expected, "something else")
             ) from error
     return dict(result)

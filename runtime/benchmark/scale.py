@@ -26,10 +26,10 @@ from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.pipeline import stages_of
 from apc.compiler.source.nodes import Mapping, Scalar
 from apc.compiler.source.source import parse_source, read_source
-from apc.compiler.words import counted
+from apc.compiler.wording import counted
+from apc.not_supported import NotSupportedError
 from apc.processes import Patience, local_processes, results
 from apc.result import Result
-from apc.unserved import NotSupportedError
 from apc.verdict import StabilityVerdict
 
 Found = TypeVar("Found")
@@ -41,7 +41,7 @@ REPEATS = 3  # of each analysis; its time is the median
 class ScaleRow:
     """One number of peers: seconds to compile and analyse, bytes at most, the error of the radius.
 
-    `count` is of the group that grows, `peers` of the whole scene.
+    `count` is of the group that grows, `peers` of the whole topology.
     """
 
     count: int
@@ -93,16 +93,16 @@ def scale(path: Path, counts: Sequence[int]) -> Scale:
         raise ApcError(Diagnostic("E921", SourceLocation("--scale"), "the list", expected, got))
     name, _ = _largest(path)
     rows, refused = [], []
-    floor = _alone(_floor, path, 0)
+    floor = _single_user(_floor, path, 0)
     for count in dict.fromkeys(counts):
         try:
-            rows.append(_alone(_measure, path, count))
+            rows.append(_single_user(_measure, path, count))
         except ApcError as error:
             refused.append((count, reason_of(error)))
     if not rows:
         count, reason = refused[0]
-        what = f"leaves nothing to measure: {counted(count, 'peer')} of {name}: {reason}"
-        raise ApcError(Diagnostic("E921", SourceLocation("--scale"), what))
+        message = f"leaves nothing to measure: {counted(count, 'peer')} of {name}: {reason}"
+        raise ApcError(Diagnostic("E921", SourceLocation("--scale"), message))
     text = f"{floor / 2**20:.0f} MiB are the program itself"
     return Scale(path.stem, name, tuple(rows), tuple(refused), text)
 
@@ -112,11 +112,11 @@ def with_count(path: Path, count: int) -> Model:
     source = read_source(path)
     _, number = _largest(path)
     lines = source.text.splitlines(keepends=True)
-    place = number.place
-    line = lines[place.line - 1]
-    assert line[place.column - 1 :].startswith(number.text)
-    lines[place.line - 1] = (
-        line[: place.column - 1] + str(count) + line[place.column - 1 + len(number.text) :]
+    location = number.location
+    line = lines[location.line - 1]
+    assert line[location.column - 1 :].startswith(number.text)
+    lines[location.line - 1] = (
+        line[: location.column - 1] + str(count) + line[location.column - 1 + len(number.text) :]
     )
     changed = parse_source("".join(lines).encode(), file=source.file, path=source.path)
     *_, (_, system) = stages_of(changed)
@@ -134,18 +134,20 @@ def _largest(path: Path) -> tuple[str, Scalar]:
         if isinstance(number, Scalar) and isinstance(number.value, int):
             result.append((number.value, key.text, number))
     if not result:
-        what = "no group of this topology has a count that could grow"
-        raise ApcError(Diagnostic("E921", SourceLocation(str(path)), what, hint="peers: {user: {count: 3}}"))
+        message = "no group of this topology has a count that could grow"
+        raise ApcError(
+            Diagnostic("E921", SourceLocation(str(path)), message, hint="peers: {user: {count: 3}}")
+        )
     _, name, number = max(result, key=lambda item: item[0])
     return name, number
 
 
-def _alone(measure: Callable[[Path, int], Found], path: Path, count: int) -> Found:
+def _single_user(measure: Callable[[Path, int], Found], path: Path, count: int) -> Found:
     """Measure in a process of its own."""
-    place = SourceLocation("--scale")
-    what = "the process that measured it ended without a word: stopped from outside, or out of memory"
-    with local_processes(measure, path, 1, Diagnostic("E921", place, what)) as workers:
-        return next(results(workers, [count], Patience(), place))
+    location = SourceLocation("--scale")
+    message = "the process that measured it ended without a word: stopped from outside, or out of memory"
+    with local_processes(measure, path, 1, Diagnostic("E921", location, message)) as workers:
+        return next(results(workers, [count], Patience(), location))
 
 
 def _measure(path: Path, count: int) -> ScaleRow:

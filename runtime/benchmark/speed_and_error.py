@@ -1,11 +1,11 @@
-"""Speed against error: every method on one scene, on this machine, beside the truth.
+"""Speed against error: every method on one topology, on this machine, beside the truth.
 
 Takes: a `Model`.
-Gives: `MethodTiming`, `TaskComparison`, `Bench`, `bench`; `pareto_front`.
+Gives: `MethodTiming`, `TaskComparison`, `Bench`, `bench`; `pareto_front`; `reason_of`.
 Guarantees: times are the processor's, medians over rounds in which all methods take turns; an error is the
 distance from the same equations in balls (of a spectral radius) or from the exact transition (of a motion,
 whose own error is what one rounding of every coefficient makes), and is left out where there is none.
-Does not: draw (see `bench.figure`), or grow the scene (see `bench.scale`).
+Does not: draw (see `output.bench_output`), or grow the topology (see `benchmark.scale`).
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Analysis, analyze
 from apc.analysis.methods import AUTO, METHODS, PAPER
-from apc.analysis.paper import analyze_paper
-from apc.benchmark.timing import spread_of, take_turns, timed
+from apc.analysis.paper_method import analyze_paper
+from apc.benchmark.timing import alternate, spread_of, timed
 from apc.benchmark.truth import spectral_truth
 from apc.compiler.compiled import Model, PeerColumn
 from apc.compiler.errors import ApcError
-from apc.compiler.words import with_unit
+from apc.compiler.wording import with_unit
 from apc.distribution import versions
+from apc.frame.interval_arithmetic import UNIT_ROUNDOFF
 from apc.frame.jacobians import jacobians
 from apc.frame.parameters import resolve
-from apc.frame.radius import UNIT
+from apc.not_supported import NotSupportedError
 from apc.result import Result
 from apc.simulation.flow import state_scales
-from apc.simulation.rows_in_time import blocks
+from apc.simulation.output_blocks import blocks
 from apc.simulation.settings import CVODES, DEFAULT, EXACT, RK4, SEMI_IMPLICIT, Method, Settings, finer
 from apc.simulation.simulation import Simulation, prepare
 from apc.threads import single_threaded
-from apc.unserved import NotSupportedError
 from apc.verdict import Limitation, LimitationCode, Note, code_of
 
 Floats = NDArray[np.float64]
@@ -50,11 +50,11 @@ Floats = NDArray[np.float64]
 ROUNDS, ENOUGH = 15, 3.0
 
 # Errors below this are one: which of two is smaller is luck. An eigenvalue of n states is computed to some n
-# roundings, a state after so many ticks to about as many as the root of their number; scenes have tens of
+# roundings, a state after so many ticks to about as many as the root of their number; topologies have tens of
 # states and hundreds of ticks.
-SAME = 64 * UNIT
+SAME = 64 * UNIT_ROUNDOFF
 
-# How long the scene is played: longer than any start-up.
+# How long the topology is played: longer than any start-up.
 DURATION = Fraction(1, 4)
 
 # Limitations that no method may have.
@@ -92,9 +92,9 @@ class MethodTiming:
 class TaskComparison:
     """All methods of one task, the fastest first.
 
-    `quantity` says what `error` is of, `relative` to what, `timed` what a time is of. `reference` is the
-    truth in words, or why there is none; `refused` are the methods that can't serve the scene, with the
-    reason; `left_out` is what of the scene none of them looks at.
+    `quantity` is the quantity with an error, `relative` the reference of that error, `timed` the measured
+    operation. `reference` describes the true value, or the reason why there is none; `refused` are the
+    methods that do not support the topology, with the reason; `limitations` are those of all methods.
     """
 
     task: str
@@ -105,7 +105,7 @@ class TaskComparison:
     reference: str
     refused: tuple[tuple[str, Note], ...]
     notes: tuple[Note, ...] = ()
-    left_out: tuple[str, ...] = ()
+    limitations: tuple[str, ...] = ()
 
     @property
     def chosen(self) -> MethodTiming | None:
@@ -122,7 +122,7 @@ class TaskComparison:
 
 @dataclass(frozen=True, slots=True)
 class Bench(Result):
-    """Both tasks on a scene; `machine` says where."""
+    """Both tasks on a topology; `machine` says where."""
 
     shown_by = "bench_output:bench"
 
@@ -133,26 +133,26 @@ class Bench(Result):
 
     @property
     def faults(self) -> tuple[str, ...]:
-        """What must not be, on any scene: none where all is well."""
+        """What must not be, on any topology: none where all is well."""
         return tuple(fault for comparison in self.comparisons for fault in comparison.faults)
 
 
 def bench(system: Model, *, rounds: int = ROUNDS, duration: Fraction = DURATION) -> Bench:
-    """Measure every method of analysis and of simulation on a scene.
+    """Measure every method of analysis and of simulation on a topology.
 
     Parameters
     ----------
     system
-        The compiled scene, with the numbers to use.
+        The compiled topology, with the numbers to use.
     rounds
         Runs of each method, fewer of slow ones.
     duration
-        How long the scene is played, in seconds.
+        How long the topology is played, in seconds.
 
     Raises
     ------
     ApcError
-        The scene can't be analysed at all.
+        The topology can't be analysed at all.
     """
     with single_threaded():
         analysis = bench_analysis(system, rounds=rounds)
@@ -190,7 +190,7 @@ def _processor() -> str:
 
 
 def bench_analysis(system: Model, *, rounds: int = ROUNDS) -> TaskComparison:
-    """Measure every method of analysis, from the compiled scene to its verdict.
+    """Measure every method of analysis, from the compiled topology to its verdict.
 
     The error is that of the spectral radius, rigid modes left out.
     """
@@ -200,7 +200,7 @@ def bench_analysis(system: Model, *, rounds: int = ROUNDS) -> TaskComparison:
     calls[CERTIFIED] = partial(analyze, system, certify=True)
     calls[PAPER] = partial(analyze_paper, system)
     default = analyze(system)
-    left_out = []
+    limitations = []
     truth, text = None, "the same equations in 512-bit balls, of the numbers as doubles: spectral radius"
     try:
         truth = spectral_truth(system)
@@ -209,9 +209,9 @@ def bench_analysis(system: Model, *, rounds: int = ROUNDS) -> TaskComparison:
         text = str(why)
     results, refused, slow = _first(calls)
     if CERTIFIED in results and (reason := _not_proved(results[CERTIFIED])):
-        left_out.append((CERTIFIED, reason))
+        limitations.append((CERTIFIED, reason))
         del results[CERTIFIED]
-    times = slow | take_turns(
+    times = slow | alternate(
         {name: calls[name] for name in results if name not in slow}, rounds, enough=ENOUGH
     )
     measured = [
@@ -236,12 +236,12 @@ def bench_analysis(system: Model, *, rounds: int = ROUNDS) -> TaskComparison:
         task="analyze",
         quantity="spectral radius",
         relative="absolute",
-        timed="an analysis, from the compiled scene to its verdict",
+        timed="an analysis, from the compiled topology to its verdict",
         measured=pareto_front(measured),
         reference=text,
-        refused=(*left_out, *refused),
+        refused=(*limitations, *refused),
         notes=tuple(notes),
-        left_out=default.left_out,
+        limitations=default.limitations,
     )
 
 
@@ -265,10 +265,10 @@ def bench_simulation(system: Model, duration: Fraction = DURATION, *, rounds: in
     notes = []
     if _rests(system, duration):
         system, how = _moved(system)
-        notes.append(f"nothing moves in this scene: {how}")
+        notes.append(f"nothing moves in this topology: {how}")
     calls = {str(method): partial(_ready, system, duration, method) for method in _methods(system)}
     ready, refused, _ = _first(calls)
-    times = take_turns({name: partial(_play, item) for name, item in ready.items()}, rounds, enough=ENOUGH)
+    times = alternate({name: partial(_simulate, item) for name, item in ready.items()}, rounds, enough=ENOUGH)
     chosen = prepare(system, Settings(duration)).how
     exact = ready.get(EXACT)
     rounded, _ = finer(Method(EXACT), all_linear=True)
@@ -320,7 +320,7 @@ def _methods(system: Model) -> list[Method]:
 
 def _rests(system: Model, duration: Fraction) -> bool:
     """Say whether no state ever changes: whatever pushes, and be it between two ticks, leaves its trace."""
-    names = tuple(dict.fromkeys(state.name for kind in system.kinds for state in kind.states))
+    names = tuple(dict.fromkeys(state.name for peer_type in system.peer_types for state in peer_type.states))
     if not names:
         return False
     first: Floats | None = None
@@ -334,11 +334,11 @@ def _rests(system: Model, duration: Fraction) -> bool:
 def _moved(system: Model) -> tuple[Model, str]:
     """Let the first peer start by its first state's own scale elsewhere, and say so."""
     first, *others = system.groups
-    kind, numbers = system.kinds[first.kind], resolve(system)
-    state = kind.states[0]
+    peer_type, numbers = system.peer_types[first.peer_type], resolve(system)
+    state = peer_type.states[0]
     rows = numbers.parameters[0]
-    by = float(state_scales(system, kind, jacobians(kind), list(rows))[0])
-    values = np.array(rows[numbers.rows[0], kind.parameters.index(state.start)], dtype=np.float64)
+    by = float(state_scales(system, peer_type, jacobians(peer_type), list(rows))[0])
+    values = np.array(rows[numbers.rows[0], peer_type.parameters.index(state.start)], dtype=np.float64)
     values[0] += by
     columns = (
         *(column for column in first.columns if column.name != state.start),
@@ -352,27 +352,30 @@ def _ready(system: Model, duration: Fraction, method: Method) -> Simulation:
     return prepare(system, Settings(duration, method))
 
 
-def _play(simulation: Simulation) -> None:
+def _simulate(simulation: Simulation) -> None:
     for _ in blocks(simulation):
         pass
 
 
 def _distance(simulation: Simulation, exact: Simulation) -> float:
     """Return how far any state is from an exact run, relative to the largest value of its unit there."""
-    names = {state.name for kind in simulation.system.kinds for state in kind.states}
-    moving = [place for place, signal in enumerate(exact.signals) if signal.local in names]
+    names = {state.name for peer_type in simulation.system.peer_types for state in peer_type.states}
+    moving = [index for index, signal in enumerate(exact.signals) if signal.local in names]
     rows = (row for block in blocks(simulation) for row in block.values)
-    apart, size = np.zeros(len(moving)), np.zeros(len(moving))
+    separation, size = np.zeros(len(moving)), np.zeros(len(moving))
     for block in blocks(exact):
         for row in block.values[:, moving]:
             other = next(rows, None)
             if other is None:
                 return np.inf  # it left the range of floats
-            apart, size = np.maximum(apart, np.abs(other[moving] - row)), np.maximum(size, np.abs(row))
+            separation, size = (
+                np.maximum(separation, np.abs(other[moving] - row)),
+                np.maximum(size, np.abs(row)),
+            )
     worst = 0.0
-    units = np.array([exact.signals[place].unit for place in moving])
+    units = np.array([exact.signals[index].unit for index in moving])
     for unit in dict.fromkeys(units.tolist()):
-        error, largest = (float(values[units == unit].max()) for values in (apart, size))
+        error, largest = (float(values[units == unit].max()) for values in (separation, size))
         worst = max(worst, error / largest if largest else error)
     return worst
 
@@ -385,14 +388,14 @@ def _first(
     refused: list[tuple[str, Note]] = []
     for name, call in calls.items():
         try:
-            taken, results[name] = timed(call)
+            used, results[name] = timed(call)
         except ApcError as error:
             refused.append((name, reason_of(error)))
         except Exception as error:  # a bug of one method is a result, and no reason to lose the others'
             refused.append((name, Limitation(LimitationCode.CRASHED, (repr(error),))))
         else:
-            if taken > ENOUGH:
-                slow[name] = [taken]
+            if used > ENOUGH:
+                slow[name] = [used]
     return results, tuple(refused), slow
 
 
@@ -422,5 +425,5 @@ def pareto_front(measured: Sequence[MethodTiming]) -> tuple[MethodTiming, ...]:
 
 def _beats(measured: MethodTiming, other: MethodTiming) -> bool:
     faster = measured.seconds + measured.spread + other.spread < other.seconds
-    mine, its = (max(m.error or 0.0, SAME) for m in (measured, other))
-    return (faster and mine <= its) or (mine < its and measured.seconds <= other.seconds)
+    mine, related = (max(m.error or 0.0, SAME) for m in (measured, other))
+    return (faster and mine <= related) or (mine < related and measured.seconds <= other.seconds)

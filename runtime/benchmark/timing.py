@@ -1,10 +1,10 @@
 """How long a call takes: the one clock of every figure.
 
 Takes: calls.
-Gives: `timed`, `median_time`, `take_turns`, `spread_of`; `waited`.
+Gives: `timed`, `median_time`, `alternate`, `spread_of`.
 Guarantees: a time is the processor's, of this process and all its threads, so that what else a machine does
 counts little; of several the median counts, which one slow run doesn't move.
-Does not: see what other processes do: who starts some waits for them by `waited`, the clock on the wall.
+Does not: count the time of other processes.
 """
 
 from __future__ import annotations
@@ -28,13 +28,6 @@ def timed(call: Callable[[], Result]) -> tuple[float, Result]:
     return time.process_time() - began, result
 
 
-def waited(call: Callable[[], Result]) -> tuple[float, Result]:
-    """Return the seconds that a person waits for a call, the processes it starts included, and its result."""
-    began = time.perf_counter()
-    result = call()
-    return time.perf_counter() - began, result
-
-
 def median_time(call: Callable[[], Result], runs: int, *, enough: float = math.inf) -> tuple[float, Result]:
     """Return the median of the processor's seconds of some runs, and what the last one returned.
 
@@ -47,15 +40,15 @@ def median_time(call: Callable[[], Result], runs: int, *, enough: float = math.i
     enough
         Seconds of all runs together after which there is no further one.
     """
-    taken, result = timed(call)
-    times = [taken]
+    used, result = timed(call)
+    times = [used]
     while len(times) < runs and sum(times) < enough:
-        taken, result = timed(call)
-        times.append(taken)
+        used, result = timed(call)
+        times.append(used)
     return statistics.median(times), result
 
 
-def take_turns(
+def alternate(
     calls: Mapping[str, Callable[[], Any]], rounds: int, *, enough: float = math.inf
 ) -> dict[str, list[float]]:
     """Time all calls in rounds, so that what slows the machine for a while slows them alike.

@@ -1,11 +1,11 @@
-"""The spectral radius of a scene to fifty digits: the same equations in balls of 512 bits.
+"""The spectral radius of a topology to fifty digits: the same equations in balls of 512 bits.
 
 Takes: a `Model`.
 Gives: `Truth`, `spectral_truth`.
-Guarantees: every entry of a frame's matrix is a ball about the true number (see `eigen.balls`), and two
-precisions agree on every digit given.
-Does not: compose the frame by another way than the analysis: a mistake in the scene's own equations, in the
-order of events or in how a scene falls into systems is the truth's too. What it judges is arithmetic.
+Guarantees: every entry of a frame's matrix is a ball about the true number (see `eigen.ball_arithmetic`), and
+two precisions agree on every digit given.
+Does not: compose the frame by another way than the analysis: a mistake in the topology's own equations, in
+the order of events or in how a topology falls into systems is the truth's too. What it judges is arithmetic.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ import flint
 
 from apc.analysis.analysis import lifted_groups
 from apc.compiler.compiled import Model
-from apc.eigen.balls import frame_balls, precision, square, unprovable
-from apc.eigen.closing import ClosedLoop, ModalSystem, close_loop
-from apc.eigen.modes import arrange, dense_loop
+from apc.eigen.ball_arithmetic import frame_balls, precision, square, unprovable
+from apc.eigen.interconnection import ClosedLoop, ModalSystem, close_loop
+from apc.eigen.modes import decompose, dense_loop
 from apc.frame.parameters import resolve
-from apc.unserved import NotSupportedError
+from apc.not_supported import NotSupportedError
 
 # What is asked of a reference, relative to the largest: far beyond what floats can be wrong by.
 DIGITS = 50
@@ -31,7 +31,7 @@ DIGITS = 50
 # A radius below this is none: eigenvalues 0, that the roots of roundings hide.
 LEAST = 10.0**-DIGITS
 
-# Bits tried in turn until two of them agree on the digits; the first two do unless a scene is very stiff.
+# Bits tried in turn until two of them agree on the digits; the first two do unless a topology is very stiff.
 PRECISIONS = (512, 1024, 2048, 4096)
 
 # An eigenvalue so near to 1 is 1: a motion that nothing hinders. A pair or a triple of them that belongs to
@@ -59,7 +59,7 @@ class Truth:
 
 
 def spectral_truth(system: Model) -> Truth:
-    """Return the truth about one frame of a scene.
+    """Return the truth about one frame of a topology.
 
     Raises
     ------
@@ -82,10 +82,12 @@ def spectral_truth(system: Model) -> Truth:
 
 
 def _loops(system: Model) -> Sequence[ModalSystem]:
-    """Return the systems that a scene falls into, each of weights known exactly; refuse what is too large."""
+    """Return the systems that a topology falls into, each of weights known exactly; refuse what is too
+    large.
+    """
     numbers = resolve(system)
     moving = sum(
-        len(rows) * len(system.kinds[group.kind].states)
+        len(rows) * len(system.peer_types[group.peer_type].states)
         for rows, group in zip(numbers.parameters, system.groups, strict=True)
     )
     if moving > MOST_STATES:
@@ -93,8 +95,12 @@ def _loops(system: Model) -> Sequence[ModalSystem]:
     if system.peers > MOST_STATES and any(link.graph.shape not in SPLIT for link in system.links):
         raise NotSupportedError(f"{system.peers:,} peers on a graph {TOO_LONG}")
     groups, exchange = lifted_groups(system)
-    loops = arrange(groups, exchange).loops
-    if any(doubt and way not in loop.surds for loop in loops for way, doubt in loop.doubts.items()):
+    loops = decompose(groups, exchange).loops
+    if any(
+        weight_error and coupling_term not in loop.surds
+        for loop in loops
+        for coupling_term, weight_error in loop.weight_errors.items()
+    ):
         loops = (dense_loop(groups, exchange),)  # the eigenvalues of its graph are floats
     if sum(loop.states**3 for loop in loops) > MOST_STATES**3:
         most = max(loop.states for loop in loops)
@@ -110,11 +116,13 @@ def _radius(systems: Sequence[ClosedLoop]) -> Any:
         size = matrix.nrows()
         # Of a chain of equal eigenvalues each step of QR gains a few bits: as many steps as bits, each.
         values = matrix.eig(algorithm="approx", maxiter=flint.ctx.prec * size) if size else []
-        off = abs(sum(values, flint.acb(0)) - sum((matrix[i, i] for i in range(size)), flint.acb(0))).mid()
+        error_bound = abs(
+            sum(values, flint.acb(0)) - sum((matrix[i, i] for i in range(size)), flint.acb(0))
+        ).mid()
         ball = max(
             ball, *(abs(value).mid() for value in values if abs(value - 1).mid() > RIGID), flint.arb(0)
         )
-        assert off < RIGID * max(ball, flint.arb(1)), "QR did not converge"
+        assert error_bound < RIGID * max(ball, flint.arb(1)), "QR did not converge"
     return ball
 
 

@@ -20,7 +20,7 @@ from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 
 if TYPE_CHECKING:
     from apc.compiler.compiled import Model
-    from apc.frame.names import Range
+    from apc.frame.parameter_names import Range
 
 # Of peers that all differ, by the thousand: 100,000 took 9 s on one core of 2026.
 SECONDS_A_PEER = 1e-4
@@ -32,7 +32,7 @@ def analyze_command(
     file: str | None,
     settings: tuple[str, ...],
     method: str = option(
-        "auto: what serves the scene. modes: a few small systems. dense: all peers in one, to check. "
+        "auto: what serves the topology. modes: a few small systems. dense: all peers in one, to check. "
         "determinant: zeros of a small determinant, for peers that all differ and for long delays. "
         "paper: the lifted matrices of Rakhsha and "
         "Constantinescu, eqs. (18) to (20).",
@@ -55,11 +55,11 @@ def analyze_command(
         type=click.IntRange(min=1),
     ),
     every_convention: bool = option(
-        "Repeat the analysis under every order of events that coincide.", name="--conventions"
+        "Repeat the analysis under every order of events that coincide.", name="--event-order"
     ),
     margins: bool | None = option(
         "Look for all margins, however long it takes, or for none: how far stiffnesses, dampings and delays "
-        "may grow. Without either, for all in a scene where that takes a second or so.",
+        "may grow. Without either, for all in a topology where that takes a second or so.",
         name="--margins/--no-margins",
         default=None,
     ),
@@ -67,15 +67,15 @@ def analyze_command(
         "Of a network that loses or delays packets, say all of the nominal one, too: modes, sensitivities, "
         "margins."
     ),
-    with_buzz: bool = option(
-        "Predict how one-sided contacts buzz, and play the scene for up to 80 s to lay it beside.",
-        name="--buzz",
+    with_limit_cycle: bool = option(
+        "Predict how one-sided contacts buzz, and play the topology for up to 80 s to lay it beside.",
+        name="--limit-cycle",
     ),
     hands: str,
     plot: Path | None = picture_option("Draw the eigenvalues over the unit circle: .png, .svg or .pdf."),
     as_json: bool,
 ) -> None:
-    """Say whether a scene is stable, by how much, and in which modes.
+    """Say whether a topology is stable, by how much, and in which modes.
 
     FILE is a topology or a compiled model. The spectral radius is per frame,
     the time after which all clocks stand as before; below 1 every motion
@@ -85,18 +85,22 @@ def analyze_command(
     never pull, which of them make it unstable, and whether they may open and
     close at will.
     """
-    from apc.answer import answer
+    from apc.analysis_report import answer
     from apc.frame.devices import HANDS, PASSIVE, published
-    from apc.inputs import open_scene
+    from apc.inputs import open_topology
 
     if cells is not None and not box and hands in (*HANDS, PASSIVE):  # hands of the library make a box
         raise click.UsageError("--cells wants a --box to divide")
-    system = open_scene(file, settings, {"--plot": plot}, hands=hands, varied=box, notify=note_aside)
+    system = open_topology(file, settings, {"--plot": plot}, hands=hands, varied=box, notify=note_aside)
     if hands == PASSIVE:
-        asked = {"--method": method != AUTO, "--conventions": every_convention, "--buzz": with_buzz}
-        asked |= {"--margins": bool(margins), "--plot": plot is not None}
-        refused = [name for name, given in asked.items() if given]
-        _judge_passive(system, refused, box, certify=certify, as_json=as_json)
+        requested = {
+            "--method": method != AUTO,
+            "--event-order": every_convention,
+            "--limit-cycle": with_limit_cycle,
+        }
+        requested |= {"--margins": bool(margins), "--plot": plot is not None}
+        refused = [name for name, given in requested.items() if given]
+        _absolute_stability(system, refused, box, certify=certify, as_json=as_json)
         return
     if hands not in HANDS:  # one of the library: all that were measured
         box = (*box, *(f"{name}={low}:{high}" for name, (low, high, _) in published(hands).items()))
@@ -111,11 +115,11 @@ def analyze_command(
             cells=cells,
             every_convention=every_convention,
             margins=margins,
-            with_buzz=with_buzz,
+            with_limit_cycle=with_limit_cycle,
         )
     result = replace(result, nominal=nominal)
     if plot is not None:
-        from apc.present.pictures import write_picture
+        from apc.output.pictures import write_picture
 
         write_picture(result.analysis.plot, plot)
     print_result(result, as_json=as_json, written=[plot])
@@ -123,25 +127,27 @@ def analyze_command(
 
 def _ranges(system: Model, box: tuple[str, ...]) -> list[Range]:
     """Return the ranges of a box as they are written, and those that the topology gives."""
-    from apc.analysis.box import parse_range
-    from apc.frame.names import given_ranges
+    from apc.analysis.parametric_frames import parse_range
+    from apc.frame.parameter_names import given_ranges
 
     return given_ranges(system, [parse_range(system, text) for text in box])
 
 
-def _judge_passive(
-    system: Model, asked: list[str], box: tuple[str, ...], *, certify: bool, as_json: bool
+def _absolute_stability(
+    system: Model, requested: list[str], box: tuple[str, ...], *, certify: bool, as_json: bool
 ) -> None:
-    """Say whether a scene is stable with any passive hands, at all delays if asked; refuse anything else."""
-    from apc.hands.passivity import passive_hands
+    """Say whether a topology is stable with any passive hands, at all delays if asked; refuse anything
+    else.
+    """
+    from apc.haptics.absolute_stability import absolute_stability
 
-    if asked:
-        options = " and ".join((*asked, "--hands passive"))
-        what = f"{options} don't go together: what hands can draw has no modes of its own"
-        raise ApcError(Diagnostic("E930", SourceLocation("--hands"), what, hint="--hands clamped"))
+    if requested:
+        options = " and ".join((*requested, "--hands passive"))
+        message = f"{options} don't go together: what hands can draw has no modes of its own"
+        raise ApcError(Diagnostic("E930", SourceLocation("--hands"), message, hint="--hands clamped"))
     if ranges := _ranges(system, box):
-        from apc.answer import proved_box
+        from apc.analysis_report import robust_stability
 
-        print_result(proved_box(system, ranges, passive=True), as_json=as_json)
+        print_result(robust_stability(system, ranges, passive=True), as_json=as_json)
         return
-    print_result(passive_hands(system, certify=certify), as_json=as_json)
+    print_result(absolute_stability(system, certify=certify), as_json=as_json)

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import click
 
-from apc.cli.options import command, note_aside, option, picture_option, print_result, tell
+from apc.cli.options import command, echo, note_aside, option, picture_option, print_result
 from apc.cli.progress import at_work
-from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
+from apc.compiler.number_parsing import plain_float
 
 HARD = Path("tests/hard")  # of a copy of the repository
 
@@ -32,7 +32,7 @@ def bench_command(
         name="--scale",
     ),
     folder: Path | None = option(
-        f"Analyse a folder of scenes whose truth is known instead ({HARD} if not given). "
+        f"Analyse a folder of topologies whose truth is known instead ({HARD} if not given). "
         "Not with FILE, --set, --plot or --scale.",
         "[FOLDER]",
         name="--hard",
@@ -41,13 +41,13 @@ def bench_command(
     ),
     as_json: bool,
 ) -> None:
-    """Measure speed against error, on this scene and this machine.
+    """Measure speed against error, on this topology and this machine.
 
-    Every method of analysis and of simulation that can serve the scene is
+    Every method of analysis and of simulation that can serve the topology is
     timed, and its error found: of a spectral radius against the same equations
     in 512-bit balls, to fifty digits; of a motion against the exact transition.
     A star marks those that none is better than in both. FILE is a topology or
-    a compiled model. Fifty digits are had where what the scene falls into has
+    a compiled model. Fifty digits are had where what the topology falls into has
     at most 110 states (equal peers count once), and a true error of motion
     where all of it is linear between ticks; beyond, times and bounds stand
     without a true error.
@@ -59,10 +59,12 @@ def bench_command(
     """
     if folder is not None:
         if file or settings or plot or counts:
-            raise click.UsageError("--hard has scenes of its own: no FILE, --set, --plot or --scale with it")
+            raise click.UsageError(
+                "--hard has topologies of its own: no FILE, --set, --plot or --scale with it"
+            )
         _hard(folder, as_json)
         return
-    from apc.inputs import find_input, open_scene
+    from apc.inputs import find_input, open_topology
 
     if counts is not None:
         if settings or plot:
@@ -71,20 +73,20 @@ def bench_command(
         return
     from apc.benchmark.speed_and_error import bench
 
-    system = open_scene(file, settings, {"--plot": plot}, notify=note_aside)
+    system = open_topology(file, settings, {"--plot": plot}, notify=note_aside)
     with at_work("measuring"):
         result = bench(system)
     print_result(result, as_json=as_json)
     if plot is not None:  # what took minutes is printed already, should it be unable to be written
-        from apc.present.bench_output import bench_picture
-        from apc.present.pictures import write_picture
+        from apc.output.bench_output import bench_picture
+        from apc.output.pictures import write_picture
 
         write_picture(lambda: bench_picture(result), plot)
         if not as_json:
-            tell(f"  {plot} is written")
+            echo(f"  {plot} is written")
     if result.faults:
-        what = f"not everything came out right: {'; '.join(result.faults)}"
-        raise ApcError(Diagnostic("E922", SourceLocation(result.topology), what))
+        message = f"not everything came out right: {'; '.join(result.faults)}"
+        raise ApcError(Diagnostic("E922", SourceLocation(result.topology), message))
 
 
 def _hard(folder: Path, as_json: bool) -> None:
@@ -105,9 +107,11 @@ def _scale(path: Path, counts: str, as_json: bool) -> None:
     from apc.benchmark.scale import scale
 
     if path.suffix == ".apc":
-        what = "is a compiled model, whose peers are counted"
+        message = "is a compiled model, whose peers are counted"
         raise ApcError(
-            Diagnostic("E921", SourceLocation(str(path)), what, hint=f"apc bench {path.with_suffix('.yaml')}")
+            Diagnostic(
+                "E921", SourceLocation(str(path)), message, hint=f"apc bench {path.with_suffix('.yaml')}"
+            )
         )
     try:
         numbers = [plain_float(text) for text in counts.split(",")]

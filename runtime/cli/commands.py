@@ -10,7 +10,7 @@ from __future__ import annotations
 import click
 
 from apc import cli
-from apc.cli.options import tell
+from apc.cli.options import echo
 
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 80}
 SUFFIX = "_command"  # of the functions that `apc.cli` names
@@ -26,11 +26,11 @@ LISTED = [
     "tune",
     "sweep",
     "compare",
-    "feel",
+    "transparency",
     "simulate",
     "explore",
     "network",
-    "play",
+    "run",
     "report",
     "export",
     "show",
@@ -40,11 +40,11 @@ LISTED = [
 ]
 
 
-def _print_version(context: click.Context, _: click.Parameter, wanted: bool) -> None:
-    if wanted:
+def _print_version(context: click.Context, _: click.Parameter, requested: bool) -> None:
+    if requested:
         from apc.distribution import program_version
 
-        tell(f"apc {program_version()}")
+        echo(f"apc {program_version()}")
         context.exit()
 
 

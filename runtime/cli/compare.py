@@ -15,7 +15,7 @@ from apc.cli.options import (
     command,
     criterion_with,
     note_aside,
-    note_usual,
+    note_typical_hand,
     option,
     print_result,
     result_option,
@@ -29,7 +29,8 @@ def compare_command(
     *,
     files: tuple[str, ...] = argument(nargs=-1, required=True, metavar="FILE..."),
     over: tuple[str, ...] = option(
-        "Which stiffness, delay or loss is looked at, where a scene has several. May be repeated; a scene "
+        "Which stiffness, delay or loss is looked at, where a topology has several. May be repeated; a "
+        "topology "
         "takes those it has.",
         "PATH",
     ),
@@ -50,12 +51,12 @@ def compare_command(
     is not linear and the verdict is that of its linearization; the largest
     stable stiffness of what couples it to others, and the delay and loss of
     the link that break it, as `apc critical` finds them; what the first
-    peer's hand feels at 1 and 10 Hz, of `apc feel`; how much a tick computes
-    and how many numbers are sent. --set, --in and --hands hold for all files.
-    (To lay the stable regions of scenes over each other: apc region
+    peer's hand feels at 1 and 10 Hz, of `apc transparency`; how much a tick computes
+    and how many numbers are sent. --set, --criterion and --hands hold for all files.
+    (To lay the stable regions of topologies over each other: apc region
     --compare.)
 
-    A folder NAME.run of `apc play` is laid beside what simulate and analyze
+    A folder NAME.run of `apc run` is laid beside what simulate and analyze
     say for the delays and losses that were measured.
 
     \b
@@ -67,32 +68,34 @@ def compare_command(
         return
     from apc.comparison.comparison import compare
     from apc.frame.devices import UNHELD, names_hand
-    from apc.inputs import open_scene
-    from apc.present.pictures import write_result
+    from apc.inputs import open_topology
+    from apc.output.pictures import write_result
 
-    asked = criterion_with(hands, criterion)
-    note_usual(hands)
+    requested = criterion_with(hands, criterion)
+    note_typical_hand(hands)
     systems, refused = [], {}
-    for place, file in enumerate(files):
+    for index, file in enumerate(files):
         try:
-            system = open_scene(file, settings, {"--out": out}, hands=hands, notify=note_aside)
+            system = open_topology(file, settings, {"--out": out}, hands=hands, notify=note_aside)
         except ApcError as error:
             if error.mistakes[0].code not in UNHELD:
                 raise
             others = [text for text in settings if not names_hand(text)]
-            system = open_scene(file, others, {"--out": out})
-            refused[place] = error.mistakes[0].reason
+            system = open_topology(file, others, {"--out": out})
+            refused[index] = error.mistakes[0].reason
         systems.append(system)
     with status_line() as progress:
-        comparison = compare(systems, over=over, criterion=asked, at=at, refused=refused, progress=progress)
+        comparison = compare(
+            systems, over=over, criterion=requested, at=at, refused=refused, progress=progress
+        )
     if out is not None:
         write_result(out, comparison, comparison.plot)
     print_result(comparison, as_json=as_json, written=[out])
 
 
 def _compare_run(folder: Path, *, as_json: bool) -> None:
-    """Lay a run of `apc play` beside what is said of its scene."""
-    from apc.loop.beside import compare_run
-    from apc.loop.run_folder import read_run
+    """Lay a run of `apc run` beside what is said of its topology."""
+    from apc.realtime.run_comparison import compare_run
+    from apc.realtime.run_folder import read_run
 
     print_result(compare_run(read_run(folder)), as_json=as_json)

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import click
 
-from apc.cli.options import command, option, tell
+from apc.cli.options import command, echo, option
 from apc.cli.progress import at_work
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.timings import recording
-from apc.compiler.words import counted
+from apc.compiler.wording import counted
 
-STAGES = ("source", "scene", "flat", "clocked", "sorted", "compiled")
+STAGES = ("source", "topology", "flat", "clocked", "sorted", "compiled")
 
 
 @command
@@ -29,21 +29,21 @@ def check_command(
 
     Exit code 0 if there is none, 1 otherwise.
     """
-    from apc.analysis.elements import replaced_elements
+    from apc.analysis.nonlinear_elements import replaced_elements
     from apc.compiler.pipeline import check_definition, compile_topology
     from apc.frame.start_checks import check_values
     from apc.inputs import find_input
-    from apc.present.analysis_output import warning_lines
+    from apc.output.analysis_output import warning_lines
 
     path = find_input(file, compiled_too=False)
     if text := check_definition(path):
-        tell(f"{path}: no mistakes. {text}.")
+        echo(f"{path}: no mistakes. {text}.")
         return
     system = compile_topology(path)
     check_values(system)
-    tell(f"{path}: no mistakes. {system.name}, {counted(system.peers, 'peer')}.")
+    echo(f"{path}: no mistakes. {system.name}, {counted(system.peers, 'peer')}.")
     for line in warning_lines((*system.warnings, *replaced_elements(system))):
-        tell(line)
+        echo(line)
 
 
 @command
@@ -61,7 +61,7 @@ def compile_command(
 ) -> None:
     """Turn a topology into equations: NAME.yaml to NAME.apc beside it.
 
-    Prints what the scene needed: states, delays and packets kept for a peer,
+    Prints what the topology needed: states, delays and packets kept for a peer,
     and how large the systems are that decide its stability. Compiles nothing
     if the topology, every file it names and apc itself are as they were, and
     no --timings are asked for.
@@ -73,14 +73,14 @@ def compile_command(
         from apc.compiler.pipeline import run_stages
         from apc.compiler.view.stages import describe
 
-        tell(describe(run_stages(path, until=until)))  # type: ignore[arg-type] # click checked the word
+        echo(describe(run_stages(path, until=until)))  # type: ignore[arg-type] # click checked the word
         return
     if path.suffix == ".apc":
         raise ApcError(
             Diagnostic("E614", SourceLocation(str(path)), "is compiled already", hint=f"apc analyze {path}")
         )
     if not (force or recording()) and compiled_already(path):
-        tell(f"{path} → {path.with_suffix('.apc')}: unchanged, not compiled again (--force does)")
+        echo(f"{path} → {path.with_suffix('.apc')}: unchanged, not compiled again (--force does)")
         return
     check_model_name(path)
     with at_work("compiling"):
@@ -89,13 +89,13 @@ def compile_command(
 
 def _compile(path: Path) -> None:
     """Compile, check, save and report."""
-    from apc.analysis.needs import needs
+    from apc.analysis.model_size import model_size
     from apc.compiler.pipeline import compile_topology
     from apc.compiler.store import save
     from apc.frame.start_checks import check_values
-    from apc.present.analysis_output import compile_text
+    from apc.output.analysis_output import compile_text
 
     system = compile_topology(path)
     check_values(system)
     save(system, target := path.with_suffix(".apc"), compiled=True)
-    tell("\n".join(compile_text(system, needs(system), target)))
+    echo("\n".join(compile_text(system, model_size(system), target)))

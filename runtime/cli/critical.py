@@ -18,7 +18,7 @@ from apc.cli.options import (
     command,
     criterion_with,
     note_aside,
-    note_usual,
+    note_typical_hand,
     option,
     picture_option,
     print_result,
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from apc.compiler.compiled import Model
     from apc.tuning.tuner import Tuning
 
-# What the name of a scene ends in.
-SCENES = (".yaml", ".yml", ".apc")
+# What the name of a topology ends in.
+TOPOLOGIES = (".yaml", ".yml", ".apc")
 
 
 @command
@@ -58,31 +58,33 @@ def critical_command(
 
     PATH names a stiffness, damping, mass or delay, of one group or of all:
     coordination.stiffness, left.device.mass, lan.delay. The values at which
-    the scene becomes stable or unstable are looked for, down to a cell size
+    the topology becomes stable or unstable are looked for, down to a cell size
     that is printed; each is proved where it can be, and on which side of it
-    the scene is stable. FILE is a topology or a compiled model.
+    the topology is stable. FILE is a topology or a compiled model.
     """
-    from apc.inputs import open_scene
-    from apc.vary.critical_values import critical
+    from apc.inputs import open_topology
+    from apc.parameter_studies.critical_values import critical
 
     _check_order(path, file)
-    asked = criterion_with(hands, criterion)
-    note_usual(hands)
-    if plot is not None and asked == "passive":
-        what = "--plot and --hands passive don't go together: what hands can draw has no eigenvalues"
-        raise ApcError(Diagnostic("E930", SourceLocation("--hands"), what, hint="--hands clamped"))
-    system = open_scene(
+    requested = criterion_with(hands, criterion)
+    note_typical_hand(hands)
+    if plot is not None and requested == "passive":
+        message = "--plot and --hands passive don't go together: what hands can draw has no eigenvalues"
+        raise ApcError(Diagnostic("E930", SourceLocation("--hands"), message, hint="--hands clamped"))
+    system = open_topology(
         file, settings, {"--plot": plot}, hands=hands, varied=(path, *over), notify=note_aside
     )
     if over:
         if plot is not None:
-            raise click.UsageError("--plot and --over don't go together: there are as many loci as scenes")
-        print_result(_over(system, path, (lower, upper), over, asked), as_json=as_json)
+            raise click.UsageError(
+                "--plot and --over don't go together: there are as many loci as topologies"
+            )
+        print_result(_over(system, path, (lower, upper), over, requested), as_json=as_json)
         return
     with status_line() as progress:
-        result = critical(system, path, lower=lower, upper=upper, criterion=asked, progress=progress)
+        result = critical(system, path, lower=lower, upper=upper, criterion=requested, progress=progress)
     if plot is not None:
-        from apc.present.pictures import write_picture
+        from apc.output.pictures import write_picture
 
         write_picture(result.plot, plot)
     print_result(result, as_json=as_json, written=[plot])
@@ -96,32 +98,34 @@ def _over(
     criterion: str | None,
 ) -> Tuning:
     """Return the largest value that is stable in all that is given: the best of one gain."""
-    from apc.frame.names import find, unit_of, value_now
-    from apc.tuning.demands import read_demands
+    from apc.frame.parameter_names import find, unit_of, value_now
+    from apc.parameter_studies.margins import GROWTH
+    from apc.tuning.specification import read_tuning_spec
     from apc.tuning.tuner import tune
-    from apc.vary.margins import GROWTH
 
     free = find(system, path, SourceLocation("critical value"))
     present, unit = value_now(system, free), unit_of(system, free.name)
     if not present and ends[1] is None:
         raise click.UsageError(f"{path} is 0 now, which says nothing of how large it may be: give --upper")
     low, high = ends[0] or f"0 {unit}", ends[1] or f"{GROWTH * abs(present):.12g} {unit}"
-    demands = read_demands(system, [f"{path}={low}:{high}"], maximize=path, over=over, criterion=criterion)
+    tuning_spec = read_tuning_spec(
+        system, [f"{path}={low}:{high}"], maximize=path, over=over, criterion=criterion
+    )
     with status_line() as progress:
-        return tune(system, demands, progress=progress)
+        return tune(system, tuning_spec, progress=progress)
 
 
 def _check_order(path: str, file: str | None) -> None:
-    """Refuse a scene where the parameter belongs: the two were exchanged, or only one was given."""
-    if Path(path).suffix.lower() not in SCENES:
+    """Refuse a topology where the parameter belongs: the two were exchanged, or only one was given."""
+    if Path(path).suffix.lower() not in TOPOLOGIES:
         return
     got, name = f"{path}, then {file}", file
-    if file is None or Path(file).suffix.lower() in SCENES:  # then a name of the scene's own is shown
-        from apc.inputs import open_scene
-        from apc.vary.margins import coupler_parameters
+    if file is None or Path(file).suffix.lower() in TOPOLOGIES:  # then a name of the topology's own is shown
+        from apc.inputs import open_topology
+        from apc.parameter_studies.margins import coupler_parameters
 
         got = got if file else f"{path} alone"
-        name = next((free.label for free in coupler_parameters(open_scene(path, ()))), None)
+        name = next((free.label for free in coupler_parameters(open_topology(path, ()))), None)
     hint = f"apc critical {name} {path}" if name else ""
-    wanted = "a parameter or delay, then the scene"
-    raise ApcError(Diagnostic("E841", SourceLocation("apc critical"), "the command", wanted, got, hint))
+    requested = "a parameter or delay, then the topology"
+    raise ApcError(Diagnostic("E841", SourceLocation("apc critical"), "the command", requested, got, hint))

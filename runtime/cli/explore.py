@@ -8,7 +8,7 @@ Does not: compute.
 
 from __future__ import annotations
 
-from apc.cli.options import WholeNumber, command, option, tell
+from apc.cli.options import WholeNumber, command, echo, option
 
 
 @command
@@ -26,7 +26,7 @@ def explore_command(
 ) -> None:
     """Open a page in the browser: sliders, and what follows from them.
 
-    Sliders of the scene's parameters, delays, periods and number of users;
+    Sliders of the topology's parameters, delays, periods and number of users;
     beside them the stable region of two of them, the verdict and what
     limits it, eigenvalues, the response to a push, what a hand feels, how
     much loss and jitter the network may have, redrawn as a slider moves. A
@@ -39,20 +39,20 @@ def explore_command(
     \b
         apc explore three-users.yaml --set "lan.delay=16 ms" --no-browser
     """
-    from apc.inputs import find_input, open_scene
+    from apc.inputs import find_input, open_topology
     from apc.optional import need
 
     need("bokeh.server.server", "explore")
+    from apc.app.page import open_page, topology_of
+    from apc.app.server import bound, run
     from apc.compiler.source.source import read_source
-    from apc.explore.page import open_page, scene_of
-    from apc.explore.server import bound, run
 
     path = find_input(file, compiled_too=True)
-    system = open_scene(str(path), ())
+    system = open_topology(str(path), ())
     topology = path.with_suffix(".yaml")
     text = read_source(topology).text if topology.is_file() else None
-    scene = scene_of(system, settings, text)
-    server, link = bound(lambda document: open_page(scene, document), port)
-    tell(link)
+    topology_file = topology_of(system, settings, text)
+    server, link = bound(lambda document: open_page(topology_file, document), port)
+    echo(link)
     run(server, link, browser=not no_browser)
-    tell("ended", err=True)
+    echo("ended", err=True)

@@ -20,17 +20,17 @@ def export_command(
     to: str | None = option(
         "control: a script that makes a python-control StateSpace (.py); mat, npz: the same matrices for "
         "MATLAB, SciPy, NumPy; modelica: a flat model with clocks (.mo); c: one tick of a peer in C99, with "
-        "header and driver; fmu: the scene or a peer for co-simulation (FMI 2.0). Taken from --out if not "
+        "header and driver; fmu: the topology or a peer for co-simulation (FMI 2.0). Taken from --out if not "
         "given.",
         "FORMAT",
     ),
     settings: tuple[str, ...],
-    cut: str = option(
+    open_at: str = option(
         "Cut the loop open at a link or a coupler, for margins and designs of your own: closed again by "
         "u = -y it is the closed loop.",
         "NAME",
     ),
-    free: tuple[str, ...] = option(
+    symbolic: tuple[str, ...] = option(
         "Leave a number free: A, B, C and D are a casadi.Function of it too, `casadi_function` in the "
         "file. May be repeated.",
         "PATH",
@@ -48,7 +48,7 @@ def export_command(
     out: Path = option("The file to write."),
     as_json: bool,
 ) -> None:
-    """Hand a scene over to other tools.
+    """Hand a topology over to other tools.
 
     FILE is a topology or a compiled model. As a state space it is the whole
     loop over one frame, all peers in it: from a force on every mass and noise
@@ -58,16 +58,16 @@ def export_command(
 
     \b
         apc export --out loop.mat
-        apc export --out scene.mo
-        apc export --to control --cut lan --out open_loop.py
-        apc export --free coordination.stiffness --out family.npz
+        apc export --out topology.mo
+        apc export --to control --open-at lan --out open_loop.py
+        apc export --symbolic coordination.stiffness --out family.npz
         apc export --peer "left[1]" --out left.c
-        apc export --out scene.fmu
+        apc export --out topology.fmu
     """
     from apc.exports.formats import ExportRequest, export, format_of
-    from apc.inputs import open_scene
+    from apc.inputs import open_topology
 
     chosen = format_of(to, out)
-    system = open_scene(file, settings, {"--out": out}, notify=note_aside)
-    result = export(system, chosen, ExportRequest(cut, free, peer, device, method), out)
+    system = open_topology(file, settings, {"--out": out}, notify=note_aside)
+    result = export(system, chosen, ExportRequest(open_at, symbolic, peer, device, method), out)
     print_result(result, as_json=as_json, written=[out])

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import click
 
-from apc.cli.options import argument, command, option, tell
+from apc.cli.options import argument, command, echo, option
 from apc.cli.progress import at_work
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import unwritable
-from apc.present.forms import json_text
+from apc.output.formatting import json_text
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,62}\Z")
 SCHEMA_FILE = "topology.schema.json"
@@ -41,54 +41,56 @@ def library_command(
     and all, as it is written.
     """
     from apc.compiler.components.component_library import Library
-    from apc.compiler.scene.scene import readable_library
+    from apc.compiler.topology.topology import readable_library
     from apc.compiler.view import catalogue
 
-    own = () if folder is None else (folder,)
+    local = () if folder is None else (folder,)
     library = Library(
         tuple(
             readable_library(path, str(path), SourceLocation("--folder"), key="--folder", example="parts")
-            for path in own
+            for path in local
         )
     )
     if name is None:
         document, lines = catalogue.library_document(library), catalogue.library_lines(library)
-        tell(json_text(document) if as_json else "\n".join(lines))
+        echo(json_text(document) if as_json else "\n".join(lines))
     elif as_json:
-        tell(json_text(catalogue.component_document(library, name)))
+        echo(json_text(catalogue.component_document(library, name)))
     else:
-        tell(catalogue.component_text(library, name))
+        echo(catalogue.component_text(library, name))
 
 
 @command
 def new_command(
     *,
     name: str | None = argument(required=False),
-    like: str | None = option("Copy this scene of the library, and the tables it names.", "SCENE"),
-    listing: bool = option("Name the scenes of the library; write no topology.", name="--list"),
+    like: str | None = option("Copy this topology of the library, and the tables it names.", "TOPOLOGY"),
+    listing: bool = option("Name the topologies of the library; write no topology.", name="--list"),
     out: Path | None = option("With --list, write a page of them (.html): pictures, topologies, verdicts."),
 ) -> None:
     """Write NAME.yaml, a commented topology to start from.
 
-    NAME is "topology" if not given, or the name of the scene that is copied.
+    NAME is "topology" if not given, or the name of the topology that is copied.
     A file that exists is never overwritten.
     """
     from apc.compiler.view import catalogue
 
     if listing:
         if name is not None or like is not None:
-            raise click.UsageError("--list names the scenes and writes none: no NAME or --like with it")
-        tell("\n".join(catalogue.scene_lines()) if out is None else _gallery(out))
+            raise click.UsageError("--list names the topologies and writes none: no NAME or --like with it")
+        echo("\n".join(catalogue.topology_lines()) if out is None else _gallery(out))
         return
     if out is not None:
         raise click.UsageError("--out is of --list")
-    source = catalogue.scene_named(catalogue.TEMPLATE if like is None else like)
+    source = catalogue.topology_named(catalogue.TEMPLATE if like is None else like)
     name = name if name is not None else like or "topology"
     if not NAME.match(name):
-        what = "a scene's name"
+        message = "a topology's name"
         expected = "letters, digits, - and _, 63 at most, with a letter or digit first"
         raise ApcError(
-            Diagnostic("E612", SourceLocation(name[:80] or "''"), what, expected, "this", "apc new my-scene")
+            Diagnostic(
+                "E612", SourceLocation(name[:80] or "''"), message, expected, "this", "apc new my-topology"
+            )
         )
     path = Path(f"{name}.yaml")
     # Its first line names the schema beside the library; a schema beside the new topology serves as well.
@@ -101,22 +103,22 @@ def new_command(
     written = (
         f"{' and '.join([str(path), *(table.name for table in tables)])} {'are' if tables else 'is'} written"
     )
-    tell(f"{written}. Next: apc compile {path}")
+    echo(f"{written}. Next: apc compile {path}")
 
 
 def _gallery(out: Path) -> str:
-    """Write the page of the library's scenes; return what was written."""
+    """Write the page of the library's topologies; return what was written."""
     from apc.compiler.files import check_target, write_text
-    from apc.compiler.view.catalogue import scenes
+    from apc.compiler.view.catalogue import topologies
     from apc.optional import need
-    from apc.present.pages import gallery_page
+    from apc.output.pages import gallery_page
     from apc.suffixes import check_suffix
 
     check_suffix(out, (".html",), "--out")
     check_target(out)
     need("matplotlib", "plot")
-    paths = list(scenes().values())
-    with at_work(f"analysing {len(paths)} scenes"):
+    paths = list(topologies().values())
+    with at_work(f"analysing {len(paths)} topologies"):
         write_text(out, gallery_page(paths))
     return f"{out} is written"
 
@@ -141,5 +143,5 @@ def _write(texts: dict[Path, str]) -> None:
         if not isinstance(error, FileExistsError):
             raise unwritable(path, error) from None
         hint = "apc new another-name" if path == next(iter(texts)) else f"mv {path} another-name{path.suffix}"
-        what = "exists already and is left as it is"
-        raise ApcError(Diagnostic("E613", SourceLocation(str(path)), what, hint=hint)) from None
+        message = "exists already and is left as it is"
+        raise ApcError(Diagnostic("E613", SourceLocation(str(path)), message, hint=hint)) from None

@@ -36,7 +36,7 @@ def network_command(
     """
     from apc.compiler.files import write_text
     from apc.inputs import check_outputs
-    from apc.network.recorded import describe
+    from apc.network.link_fit import fit_recording
     from apc.option_value import option_value
     from apc.suffixes import check_suffix
 
@@ -45,15 +45,15 @@ def network_command(
         check_outputs(Path(recording), (), {"--out": out})
     between = None
     if interval is not None:
-        between = float(option_value("--interval", interval, what="a time", unit="s"))
+        between = float(option_value("--interval", interval, subject="a time", unit="s"))
         if between <= 0:
             expected, hint = "a time above 0", '--interval "8 ms"'
             raise ApcError(
                 Diagnostic("E207", SourceLocation("--interval"), "the interval", expected, interval, hint)
             )
-    network_recording = describe(recording, between)
+    network_recording = fit_recording(recording, between)
     if out is not None:
-        from apc.present.network_output import recording_table
+        from apc.output.network_output import recording_table
 
         write_text(out, recording_table(network_recording))
     print_result(network_recording, as_json=as_json, written=[out])

@@ -2,7 +2,7 @@
 
 Takes: a function whose parameters say what a command takes; a result.
 Gives: `command`, `option`, `argument`; `picture_option`, `result_option`, `seed_option`, `WholeNumber`;
-`criterion_with`; `print_result`, `tell`, `beside`, `note_aside`, `note_usual`.
+`criterion_with`; `print_result`, `echo`, `prints_to_stderr`, `note_aside`, `note_typical_hand`.
 Guarantees: with --json, one JSON document is printed and nothing else; nothing printed acts on the terminal;
 a file that can't be written is refused before anything is computed.
 Does not: know any command.
@@ -18,11 +18,11 @@ from typing import Any
 
 import click
 
-from apc.compiler.digits import plain_int
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, visible
 from apc.compiler.files import is_stdout
+from apc.compiler.number_parsing import plain_int
 from apc.compiler.timings import part, record
-from apc.present.forms import json_text
+from apc.output.formatting import json_text
 from apc.result import Result
 from apc.threads import start_single_threaded
 
@@ -53,10 +53,13 @@ def option(text: str, metavar: str | None = None, *, name: str = "", **settings:
     """
 
     def make(parameter: inspect.Parameter) -> click.Parameter:
-        said = {**BY_TYPE.get(parameter.annotation, {}), **({"metavar": metavar} if metavar else {})}
-        said = {"show_default": bool(settings.get("default")), **said, **settings}
+        option_settings = {
+            **BY_TYPE.get(parameter.annotation, {}),
+            **({"metavar": metavar} if metavar else {}),
+        }
+        option_settings = {"show_default": bool(settings.get("default")), **option_settings, **settings}
         return click.Option(
-            [name or f"--{parameter.name.replace('_', '-')}", parameter.name], help=text, **said
+            [name or f"--{parameter.name.replace('_', '-')}", parameter.name], help=text, **option_settings
         )
 
     return make
@@ -70,11 +73,11 @@ def argument(**settings: Any) -> Any:
 def picture_option(text: str, more: Sequence[str] = ()) -> Any:
     """Return an option that names a picture to write, or a file with a suffix of `more`."""
 
-    def check(_: click.Context, asked: click.Parameter, path: Path | None) -> Path | None:
+    def check(_: click.Context, requested: click.Parameter, path: Path | None) -> Path | None:
         if path is not None:
-            from apc.present.pictures import check_picture
+            from apc.output.pictures import check_picture
 
-            check_picture(path, asked.opts[0], more)
+            check_picture(path, requested.opts[0], more)
         return path
 
     return option(text, callback=check)
@@ -103,28 +106,29 @@ SHARED: dict[str, Callable[[inspect.Parameter], click.Parameter]] = {
     "criterion": option(
         "What stable means. mean-square: second moments die out over the network as it is, the default "
         "where a link is unreliable; nominal: motions die out if every packet takes its nominal delay.",
-        name="--in",
+        name="--criterion",
         type=click.Choice(("mean-square", "nominal")),
     ),
     "hands": option(
-        "What holds the devices. free: nothing but what the scene says. clamped: they are held fast. held: "
+        "What holds the devices. free: nothing but what the topology says. clamped: they are held "
+        "fast. held: "
         "each by a hand of hand.mass, hand.damping and hand.stiffness, given by --set. passive: stable means "
         "stable with all hands that give back no more energy than they got. Or a hand of the library, such "
         "as StylusArmForward.",
         "HANDS",
         default="free",
     ),
-    "duration": option('How long, such as "2 s"; that of the scene\'s experiment if not given.', '"TIME"'),
+    "duration": option('How long, such as "2 s"; that of the topology\'s experiment if not given.', '"TIME"'),
     "as_json": option("Print one JSON document instead of text.", name="--json"),
 }
 
 
 def command(function: Callable[..., None]) -> Command:
     """Return a function `NAME_command` as the command of that name, its options in their order."""
-    asked = inspect.signature(function).parameters.values()
+    requested = inspect.signature(function).parameters.values()
     made = [
         (SHARED[parameter.name] if parameter.default is parameter.empty else parameter.default)(parameter)
-        for parameter in asked
+        for parameter in requested
     ]
     made.append(click.Option(["--timings"], is_flag=True, help="Say on stderr how long each part took."))
     name = function.__name__.removesuffix("_command")
@@ -132,13 +136,18 @@ def command(function: Callable[..., None]) -> Command:
 
 
 def criterion_with(hands: str, criterion: str | None) -> str | None:
-    """Return the criterion that --in and --hands together ask for. Raises ApcError E930 where they can't."""
+    """Return the criterion that --criterion and --hands together ask for. Raises ApcError E930 where they
+    can't.
+    """
     if hands != "passive":
         return criterion
     if criterion == "mean-square":
-        what = "--in mean-square and --hands passive don't go together: hands draw from the nominal network"
+        message = (
+            "--criterion mean-square and --hands passive don't go together: hands draw from the "
+            "nominal network"
+        )
         raise ApcError(
-            Diagnostic("E930", SourceLocation("--hands"), what, hint="--in nominal --hands passive")
+            Diagnostic("E930", SourceLocation("--hands"), message, hint="--criterion nominal --hands passive")
         )
     return "passive"
 
@@ -152,11 +161,11 @@ class Command(click.Command):
         if not ctx.params.pop("timings"):
             return super().invoke(ctx)
         started = time.process_time()
-        with record() as taken:
+        with record() as timings:
             try:
                 return super().invoke(ctx)
             finally:
-                ctx.call_on_close(lambda: tell(timings_text({"start": started, **taken}), err=True))
+                ctx.call_on_close(lambda: echo(timings_text({"start": started, **timings}), err=True))
 
 
 class WholeNumber(click.IntRange):
@@ -190,23 +199,23 @@ def print_result(
         What stands before the name of a file; None where the result names it itself.
     """
     files = [path for path in written if path is not None]
-    err = beside(*files)
-    tell(json_text(result.to_dict()) if as_json else str(result), err=err)
+    err = prints_to_stderr(*files)
+    echo(json_text(result.to_dict()) if as_json else str(result), err=err)
     for path in () if as_json or before is None else files:
-        tell(f"{before}{path} is written", err=err)
+        echo(f"{before}{path} is written", err=err)
 
 
-def beside(*outputs: Path | None) -> bool:
+def prints_to_stderr(*outputs: Path | None) -> bool:
     """Return whether what is printed goes to stderr, as one of the files written is stdout."""
     return any(output is not None and is_stdout(output) for output in outputs)
 
 
 def note_aside(text: str) -> None:
     """Print a note on what was asked, beside the answer."""
-    tell(f"note: {text}", err=True)
+    echo(f"note: {text}", err=True)
 
 
-def note_usual(hands: str) -> None:
+def note_typical_hand(hands: str) -> None:
     """Say of a hand of the library that its usual values stand for the range that was measured."""
     from apc.frame.devices import HANDS
 
@@ -214,13 +223,13 @@ def note_usual(hands: str) -> None:
         note_aside(f"{hands} by its usual values; apc analyze takes the range that was measured")
 
 
-def tell(text: str, *, err: bool = False) -> None:
+def echo(text: str, *, err: bool = False) -> None:
     """Print a text, with characters that would act on the terminal written out."""
     click.echo(visible(text), err=err)
 
 
-def timings_text(taken: Mapping[str, float]) -> str:
+def timings_text(timings: Mapping[str, float]) -> str:
     """Return what --timings says: parts and their seconds."""
-    rows = [*taken.items(), ("all", sum(taken.values()))]
+    rows = [*timings.items(), ("all", sum(timings.values()))]
     width = max(len(name) for name, _ in rows)
     return "\n".join(f"  {name:<{width}}  {seconds * 1e3:8.1f} ms" for name, seconds in rows)

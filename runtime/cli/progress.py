@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from apc.compiler.errors import visible
-from apc.compiler.words import time_left
+from apc.compiler.wording import time_left
 
 LONG = 1.0  # seconds of work after which a bar is shown
 
@@ -60,22 +60,22 @@ def progress_bar(title: str, unit: str, *, after: float = LONG) -> Iterator[Bar]
         TextColumn(f"{{task.fields[of]}} {unit}"),
         TimeRemainingColumn(),
     )
-    drawn = Progress(*columns, console=Console(stderr=True), transient=True)
-    task = drawn.add_task(title, total=None, of="")
+    plotted = Progress(*columns, console=Console(stderr=True), transient=True)
+    task = plotted.add_task(title, total=None, of="")
     begun, shown = time.monotonic(), False
 
     def show(done: float, total: float) -> None:
         nonlocal shown
         if not shown and time.monotonic() - begun > after:
-            drawn.start()
+            plotted.start()
             shown = True
-        drawn.update(task, completed=done, total=total, of=f"{done:,.6g} of {total:,.6g}")
+        plotted.update(task, completed=done, total=total, of=f"{done:,.6g} of {total:,.6g}")
 
     try:
         yield show
     finally:
         if shown:
-            drawn.stop()
+            plotted.stop()
 
 
 @contextmanager

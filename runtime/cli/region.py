@@ -16,7 +16,7 @@ from apc.cli.options import (
     command,
     criterion_with,
     note_aside,
-    note_usual,
+    note_typical_hand,
     option,
     print_result,
     result_option,
@@ -29,15 +29,15 @@ from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 def region_command(
     *,
     file: str | None,
-    x: str | None = option("Horizontal axis; the scene's studies: region: if not given.", "PATH=LO:HI"),
+    x: str | None = option("Horizontal axis; the topology's studies: region: if not given.", "PATH=LO:HI"),
     y: str | None = option("Vertical axis.", "PATH=LO:HI"),
-    compare: tuple[str, ...] = option("Another scene in the same picture. May be repeated.", "FILE"),
+    compare: tuple[str, ...] = option("Another topology in the same picture. May be repeated.", "FILE"),
     vary: str | None = option("A panel a value: lan.delay=0,8 ms.", "PATH=V1,V2,…"),
     panels: tuple[str, ...] = option(
         "A panel with several values at once; repeat it for (a), (b), ….", '"PATH=V, …"', name="--panel"
     ),
     normalize: bool = option(
-        "Compare at equal effective gain: where a scene sums over its others, y counts once an other."
+        "Compare at equal effective gain: where a topology sums over its others, y counts once an other."
     ),
     overlays: tuple[str, ...] = option(
         "Draw a published condition too; every symbol is given a parameter or a quantity.",
@@ -66,19 +66,19 @@ def region_command(
                    --compare mesh.yaml --vary "lan.delay=0,8 ms" \\
                    --out regions.svg
     """
-    from apc.inputs import open_scene
-    from apc.present.pictures import write_result
+    from apc.inputs import open_topology
+    from apc.output.pictures import write_result
     from apc.regions.panels import compare_regions, parse_panel, parse_vary
 
     if vary and panels:
-        what = "--vary and --panel both say what the panels are: one of them is enough"
-        raise ApcError(Diagnostic("E907", SourceLocation("region"), what))
+        message = "--vary and --panel both say what the panels are: one of them is enough"
+        raise ApcError(Diagnostic("E907", SourceLocation("region"), message))
     listed = parse_vary(vary) if vary else tuple(parse_panel(text) for text in panels) or ((),)
-    asked = criterion_with(hands, criterion)
-    note_usual(hands)
+    requested = criterion_with(hands, criterion)
+    note_typical_hand(hands)
     varied = [text for text in (x, y, *itertools.chain(*listed)) if text]
     systems = [
-        open_scene(text, settings, {"--out": out}, hands=hands, varied=varied, notify=note_aside)
+        open_topology(text, settings, {"--out": out}, hands=hands, varied=varied, notify=note_aside)
         for text in (file, *compare)
     ]
     with status_line() as progress:
@@ -90,7 +90,7 @@ def region_command(
             overlays=overlays,
             normalize=normalize,
             cells=cells,
-            criterion=asked,
+            criterion=requested,
             progress=progress,
         )
     if out is not None:

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import click
 
-from apc.cli.options import beside, command, option, tell
+from apc.cli.options import command, echo, option, prints_to_stderr
 from apc.compiler.files import write_text
-from apc.present.forms import json_text
+from apc.output.formatting import json_text
 from apc.suffixes import check_suffix
 
 FORMATS = {".txt": "text", ".json": "json", ".dot": "dot", ".gv": "dot", ".mmd": "mermaid", ".svg": "svg"}
@@ -35,7 +35,7 @@ def show_command(
     parameters: bool = option("List what may be set instead: names, values, units, limits; as text or json."),
     out: Path | None = option("Write to this file: .txt .json .dot .mmd, or as a picture .svg .png .pdf."),
 ) -> None:
-    """Show what a scene is made of: its graph, equations and schedule.
+    """Show what a topology is made of: its graph, equations and schedule.
 
     The graph has the parts of one peer and how they are joined, and the
     peers and the links between them. The schedule says what ticks when, how
@@ -44,37 +44,37 @@ def show_command(
     from apc.api import show as shown
     from apc.inputs import check_topology_outputs, find_input
 
-    wanted = format_ or "text"
+    requested = format_ or "text"
     formats = {name: of for name, of in FORMATS.items() if not parameters or of in ("text", "json")}
     if out is not None and (out.suffix or not format_):
         known = [suffix for suffix in formats if format_ in (None, formats[suffix])]
-        wanted = formats[check_suffix(out, known, "--out")]
+        requested = formats[check_suffix(out, known, "--out")]
     if parameters:
-        _show_parameters(file, wanted, out)
+        _show_parameters(file, requested, out)
         return
     path = find_input(file, compiled_too=False)
     check_topology_outputs(path, {"--out": out})
     if out is not None and out.suffix.lower() in PICTURES:
         from apc.compiler.view.listing import diagram_of
-        from apc.present.graph import graph_picture
-        from apc.present.pictures import check_picture, write_figure
+        from apc.output.graph import graph_picture
+        from apc.output.pictures import check_picture, write_figure
 
         check_picture(out, "--out")
         write_figure(graph_picture(diagram_of(path)), out)
-        tell(f"{out} is written", err=beside(out))
+        echo(f"{out} is written", err=prints_to_stderr(out))
         return
-    _print_or_write(shown(path, format=wanted), out)  # type: ignore[arg-type] # click checked the word
+    _print_or_write(shown(path, format=requested), out)  # type: ignore[arg-type] # click checked the word
 
 
-def _show_parameters(file: str | None, wanted: str, out: Path | None) -> None:
-    """List what may be set of a scene."""
-    from apc.frame.settable import parameters
-    from apc.inputs import open_scene
+def _show_parameters(file: str | None, requested: str, out: Path | None) -> None:
+    """List what may be set of a topology."""
+    from apc.frame.parameter_listing import parameters
+    from apc.inputs import open_topology
 
-    if wanted not in ("text", "json"):
+    if requested not in ("text", "json"):
         raise click.UsageError("--parameters is a table: --format text or json")
-    result = parameters(open_scene(file, (), {"--out": out}))
-    _print_or_write(json_text(result.to_dict()) if wanted == "json" else str(result), out)
+    result = parameters(open_topology(file, (), {"--out": out}))
+    _print_or_write(json_text(result.to_dict()) if requested == "json" else str(result), out)
 
 
 @command
@@ -101,8 +101,8 @@ def schema_command(
 
 def _print_or_write(text: str, out: Path | None) -> None:
     if out is None:
-        tell(text)
+        echo(text)
         return
 
     write_text(out, text)
-    tell(f"{out} is written", err=beside(out))
+    echo(f"{out} is written", err=prints_to_stderr(out))

@@ -18,12 +18,12 @@ import click
 from apc.cli.options import (
     WholeNumber,
     command,
+    echo,
     note_aside,
     option,
     picture_option,
     print_result,
     seed_option,
-    tell,
 )
 from apc.cli.progress import progress_bar
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
@@ -51,7 +51,7 @@ def simulate_command(
         "Write the rows to this file: .csv, .parquet, .mat or .npz; or what moves: .gif, .mp4."
     ),
     plot: Path | None = picture_option("Draw them, a panel a quantity: .png, .svg or .pdf."),
-    still: Path | None = picture_option(
+    snapshot: Path | None = picture_option(
         "Draw how it begins, the peers' bodies side by side: .png, .svg or .pdf."
     ),
     as_json: bool,
@@ -68,16 +68,16 @@ def simulate_command(
         "not given.",
         "METHOD",
     ),
-    strike: str | None = option(
+    impulse: str | None = option(
         'Strike a peer as it begins, such as "user[1]": its device starts at 0.1 m/s.', "PEER"
     ),
     trace_of: str | None = option(
-        "Lose packets by the periodic pattern that analyze finds to shake the scene.",
+        "Lose packets by the periodic pattern that analyze finds to shake the topology.",
         type=click.Choice(["worst"]),
     ),
     error: bool = option("Play it a second time, more closely, and say how far off it is."),
 ) -> None:
-    """Play a scene in time.
+    """Play a topology in time.
 
     FILE is a topology or a compiled model. Devices move by their exact
     transition from event to event, forces are computed at their ticks,
@@ -89,78 +89,80 @@ def simulate_command(
         apc simulate --duration "3 s" --plot run.png
         apc simulate --signals cube.x --out run.csv
         apc simulate --out run.gif
-        apc simulate --strike "user[1]" --plot run.png
+        apc simulate --impulse "user[1]" --plot run.png
         apc simulate --runs 1000 --seed 1 --jobs 4
         apc simulate --method semi-implicit:1ms --error
     """
-    from apc.inputs import open_scene
+    from apc.inputs import open_topology
     from apc.simulation.settings import DEFAULT, Settings, parse_method
     from apc.simulation.trajectory import duration_of, parse_duration
 
     if runs is not None and (signals or out or plot or error):
         raise click.UsageError("--runs keeps no rows: --signals, --out, --plot and --error are for one run")
     chosen = parse_method(method) if method is not None else DEFAULT
-    asked = parse_duration(duration) if duration is not None else None
+    requested = parse_duration(duration) if duration is not None else None
     if out is not None:
         _check_rows(out)
-    system = open_scene(file, settings, {"--out": out, "--plot": plot, "--still": still}, notify=note_aside)
+    system = open_topology(
+        file, settings, {"--out": out, "--plot": plot, "--snapshot": snapshot}, notify=note_aside
+    )
     if trace_of is not None:
-        from apc.moments.worst import trace_of_worst
+        from apc.mean_square.dropout_bounds import worst_trace
 
-        system = trace_of_worst(system)
-    if strike is not None:
-        from apc.simulation.strike import WATCHED, impulse_text
-        from apc.simulation.strike import strike as struck
+        system = worst_trace(system)
+    if impulse is not None:
+        from apc.simulation.initial_velocity import WATCHED, impulse_text
+        from apc.simulation.initial_velocity import initial_velocity as struck
 
-        system, what = struck(system, strike)
-        note_aside(impulse_text(what))
-        asked = asked or system.experiment.duration or WATCHED
-    seconds = duration_of(system, asked, runs=runs or 1)
-    if still is not None:
-        from apc.present.pictures import write_picture
-        from apc.present.still import draw_actors
+        system, subject = struck(system, impulse)
+        note_aside(impulse_text(subject))
+        requested = requested or system.experiment.duration or WATCHED
+    seconds = duration_of(system, requested, runs=runs or 1)
+    if snapshot is not None:
+        from apc.output.pictures import write_picture
+        from apc.output.still_picture import draw_actors
 
-        write_picture(lambda: draw_actors(system)[0], still)
+        write_picture(lambda: draw_actors(system)[0], snapshot)
     how = Settings(seconds, chosen, seed, jit=not no_jit)
     if runs is not None:
-        _play_many(system, how, runs, jobs, as_json=as_json)
+        _simulate_many(system, how, runs, jobs, as_json=as_json)
     else:
-        _play_one(system, how, _Kept(signals, out, plot, still, error), as_json=as_json)
+        _simulate_single(system, how, _StoredRows(signals, out, plot, snapshot, error), as_json=as_json)
 
 
 @dataclass(frozen=True, slots=True)
-class _Kept:
-    """What is kept of a run: rows of which signals, a picture of them, and its error; `still` is drawn."""
+class _StoredRows:
+    """The outputs of a run: rows of `signals`, a picture of them, its error, a `snapshot` of the start."""
 
     signals: tuple[str, ...]
     out: Path | None
     plot: Path | None
-    still: Path | None
+    snapshot: Path | None
     error: bool
 
 
 def _check_rows(out: Path) -> None:
     """Refuse a file that can't be written, before anything is computed."""
-    from apc.present import animation
-    from apc.present.pictures import FORMATS
-    from apc.present.recording import SUFFIXES
+    from apc.output import animation
+    from apc.output.pictures import FORMATS
+    from apc.output.recording import SUFFIXES
 
     if out.suffix.lower() in FORMATS:
-        what, known = "the suffix of --out", ", ".join((*SUFFIXES, *animation.SUFFIXES))
+        message, known = "the suffix of --out", ", ".join((*SUFFIXES, *animation.SUFFIXES))
         hint = f"--plot {out}"
         raise ApcError(
-            Diagnostic("E878", SourceLocation(str(out)), what, f"one of {known}", out.suffix, hint)
+            Diagnostic("E878", SourceLocation(str(out)), message, f"one of {known}", out.suffix, hint)
         )
     if check_suffix(out, (*SUFFIXES, *animation.SUFFIXES), "--out") in animation.SUFFIXES:
         animation.check_animation(out)
 
 
-def _play_many(system: Model, how: Settings, runs: int, jobs: int, *, as_json: bool) -> None:
-    """Play a scene many times and print what that amounts to."""
-    from apc.simulation.ensemble import play_many
+def _simulate_many(system: Model, how: Settings, runs: int, jobs: int, *, as_json: bool) -> None:
+    """Play a topology many times and print what that amounts to."""
+    from apc.simulation.monte_carlo import simulate_many
 
     with progress_bar("simulate", "runs") as show:
-        many = play_many(
+        many = simulate_many(
             system,
             how,
             runs=runs,
@@ -172,77 +174,77 @@ def _play_many(system: Model, how: Settings, runs: int, jobs: int, *, as_json: b
         raise click.Abort
 
 
-def _play_one(system: Model, how: Settings, kept: _Kept, *, as_json: bool) -> None:
-    """Play a scene once, keep what is wanted of it, and print what it amounts to."""
+def _simulate_single(system: Model, how: Settings, stored: _StoredRows, *, as_json: bool) -> None:
+    """Play a topology once, keep what is wanted of it, and print what it amounts to."""
     from apc.simulation.accuracy import compare_with
     from apc.simulation.simulation import prepare
     from apc.simulation.trajectory import Keeper, SimulationReport, provenance_of, trajectory_of
 
     moving = None
-    if kept.out is not None:
-        from apc.present.animation import SUFFIXES, save_animation
+    if stored.out is not None:
+        from apc.output.animation import SUFFIXES, save_animation
 
-        moving = kept.out if kept.out.suffix.lower() in SUFFIXES else None
-    if moving is not None and kept.signals:
+        moving = stored.out if stored.out.suffix.lower() in SUFFIXES else None
+    if moving is not None and stored.signals:
         raise click.UsageError(f"--signals chooses rows: a {moving.suffix} shows all that moves")
-    simulation = prepare(system, how, signals=kept.signals)
-    keeper = Keeper(simulation) if kept.plot is not None or moving is not None else None
-    comparison = compare_with(simulation, signals=kept.signals) if kept.error else None
+    simulation = prepare(system, how, signals=stored.signals)
+    keeper = Keeper(simulation) if stored.plot is not None or moving is not None else None
+    comparison = compare_with(simulation, signals=stored.signals) if stored.error else None
     sinks = [sink for sink in (keeper, comparison) if sink is not None]
-    summary, interrupted, out = _play_into(simulation, kept.out if moving is None else None, sinks)
+    summary, interrupted, out = _simulate_into(simulation, stored.out if moving is None else None, sinks)
     estimate = comparison.estimate() if comparison is not None else None
-    plot = kept.plot
+    plot = stored.plot
     if moving is not None and keeper is not None:
         out = partial_name(moving) if interrupted else moving
         save_animation(system, trajectory_of(simulation, keeper, summary, interrupted), out)
     if plot is not None and keeper is not None:
-        from apc.present.pictures import write_picture
+        from apc.output.pictures import write_picture
 
         plot = partial_name(plot) if interrupted else plot
         write_picture(trajectory_of(simulation, keeper, summary, interrupted).plot, plot)
-    played = SimulationReport(
+    simulated = SimulationReport(
         topology=system.name,
         summary=summary,
         provenance=provenance_of(simulation),
         interrupted=interrupted,
         error=estimate,
     )
-    print_result(played, as_json=as_json, written=[out, plot, kept.still], before="  ")
+    print_result(simulated, as_json=as_json, written=[out, plot, stored.snapshot], before="  ")
     if interrupted:
         until = f"{summary.end:g} s of {float(how.duration):g} s"
-        what = "what was done is kept" if out or not kept.out else f"{kept.out} was not begun"
-        tell(f"stopped at {until}; {what}", err=True)
+        message = "what was done is kept" if out or not stored.out else f"{stored.out} was not begun"
+        echo(f"stopped at {until}; {message}", err=True)
         raise click.Abort
 
 
-def _play_into(
+def _simulate_into(
     simulation: Simulation, out: Path | None, sinks: Sequence[Sink]
 ) -> tuple[Summary, bool, Path | None]:
-    """Play a simulation into sinks and a file, whose name is returned with what `play` returns.
+    """Run a simulation into sinks and a file; return the result of `run_simulation` with the file's name.
 
-    What was done is in the file even if the run can't go on.
+    The file contains all completed rows even if the run fails.
     """
-    from apc.present.recording import SUFFIXES, open_recording
+    from apc.output.recording import SUFFIXES, open_recording
     from apc.simulation.simulation import size_note
-    from apc.simulation.trajectory import play
+    from apc.simulation.trajectory import run_simulation
 
     recording = open_recording(out, simulation) if out is not None else None
     if out is not None and (
         note := size_note(simulation, decimal=check_suffix(out, SUFFIXES, "--out") == ".csv")
     ):
-        tell(f"{out} {note}", err=True)
+        echo(f"{out} {note}", err=True)
     total = float(simulation.settings.duration)
     try:
         with progress_bar("simulate", "s") as show:
             every = sinks if recording is None else [recording, *sinks]
-            summary, interrupted = play(simulation, every, progress=lambda done: show(done, total))
+            summary, interrupted = run_simulation(simulation, every, progress=lambda done: show(done, total))
         if recording is not None:
             recording.close(partial=interrupted)
     except ApcError:  # the run can't go on: what was done is kept
         if recording is not None:
             recording.close(partial=True)
             if recording.path != out:
-                tell(f"{recording.path} holds what was done; {out} is as it was", err=True)
+                echo(f"{recording.path} holds what was done; {out} is as it was", err=True)
         raise
     except BaseException:
         if recording is not None:

@@ -16,11 +16,11 @@ from apc.cli.options import (
     WholeNumber,
     command,
     criterion_with,
+    echo,
     note_aside,
-    note_usual,
+    note_typical_hand,
     option,
     print_result,
-    tell,
 )
 from apc.cli.progress import Bar, progress_bar
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
@@ -69,23 +69,23 @@ def sweep_command(
     "critical:PATH" (the value of another parameter at which the verdict
     changes, with its error).
     """
-    from apc.inputs import open_scene
+    from apc.inputs import open_topology
     from apc.processes import Patience
     from apc.sweeps.resumable_sweep import sweep
     from apc.tables import check_table_path
 
     check_table_path(out, "--out")
-    waiting = Patience(_seconds(patience), lambda text: tell(text, err=True))
+    waiting = Patience(_seconds(patience), lambda text: echo(text, err=True))
     values = _values(over)
-    asked = criterion_with(hands, criterion)
-    note_usual(hands)
-    system = open_scene(file, settings, {"--out": out}, hands=hands, varied=over, notify=note_aside)
+    requested = criterion_with(hands, criterion)
+    note_typical_hand(hands)
+    system = open_topology(file, settings, {"--out": out}, hands=hands, varied=over, notify=note_aside)
     with _progress(out) as progress:
         result = sweep(
             system,
             values,
             of=of,
-            criterion=asked,
+            criterion=requested,
             out=out,
             jobs=jobs,
             cluster=cluster,
@@ -98,7 +98,7 @@ def sweep_command(
 def _seconds(patience: str | None) -> float | None:
     if patience is None:
         return None
-    value = float(option_value("--patience", patience, what="patience", unit="s"))
+    value = float(option_value("--patience", patience, subject="patience", unit="s"))
     if value <= 0:
         form = '--patience "10 min"'
         raise ApcError(
@@ -137,6 +137,6 @@ def _progress(out: Path) -> Iterator[Bar]:
             yield progress
     except BaseException:
         if state["done"] > 0 and not is_special(out):
-            kept = f"{state['done']:,.0f} of {state['of']:,.0f} points are kept in {out}.parts"
-            tell(f"{kept}; the same command takes up from there", err=True)
+            stored = f"{state['done']:,.0f} of {state['of']:,.0f} points are kept in {out}.parts"
+            echo(f"{stored}; the same command takes up from there", err=True)
         raise

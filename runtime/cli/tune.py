@@ -18,7 +18,7 @@ from apc.cli.options import (
     command,
     criterion_with,
     note_aside,
-    note_usual,
+    note_typical_hand,
     option,
     picture_option,
     print_result,
@@ -43,20 +43,22 @@ def tune_command(
     maximize: str = option("What is to be as large as can be: a gain, or as for --minimize.", "AIM"),
     minimize: str = option(
         "What is to be as small as can be: a gain; settling_time or spectral_radius (the same gains); "
-        '"feel.error at 1 Hz", or feel.impedance, feel.transmitted; feel.damping of slow motions; '
-        "feel.error_h2, the rms at the ticks for white forces of 1 N rms, feel.error_hinf, the largest gain "
+        '"coordination_error at 1 Hz", or impedance, transmitted_velocity; damping of slow motions; '
+        "coordination_error_h2, the rms at the ticks for white forces of 1 N rms, "
+        "coordination_error_hinf, the largest gain "
         "at any frequency; or a weighted sum in SI of gains and these, "
-        '"feel.damping - 0.01*coordination.stiffness".',
+        '"damping - 0.01*coordination.stiffness".',
         "AIM",
     ),
-    subject: tuple[str, ...] = option(
-        'Beside stability: "decay=60 dB in 2 s"; "feel.impedance at 5 Hz < 20 N*s/m", or feel.transmitted in '
-        "m/s/N, feel.error in m/N, feel.damping, feel.error_h2, feel.error_hinf, or delay=changing: "
+    constraint: tuple[str, ...] = option(
+        'Beside stability: "decay=60 dB in 2 s"; "impedance at 5 Hz < 20 N*s/m", or transmitted_velocity in '
+        "m/s/N, coordination_error in m/N, damping, coordination_error_h2, coordination_error_hinf, or "
+        "delay=changing: "
         "stable, too, where the delay of --over changes from packet to packet. May be repeated.",
         "DEMAND",
     ),
-    against: str = option(
-        "Weigh the aim against what a hand feels, feel.impedance at 5 Hz: the best for each of 20 bounds "
+    tradeoff: str = option(
+        "Weigh the aim against what a hand feels, impedance at 5 Hz: the best for each of 20 bounds "
         "(Pareto front).",
         "QUANTITY",
     ),
@@ -71,14 +73,14 @@ def tune_command(
     write: Path | None = option("Write the topology with these gains in it, comments and all (.yaml)."),
     plot: Path | None = picture_option(
         "Draw two gains over the stable regions of what limits them and what a strike comes to, now and "
-        "with the gains found; or with --against the front: .png, .svg or .pdf."
+        "with the gains found; or with --tradeoff the front: .png, .svg or .pdf."
     ),
     as_json: bool,
 ) -> None:
     """Find the gains that do best, and prove that they do.
 
     The free gains are chosen so that an aim, as one of them, is as large (or
-    small) as can be while the scene is stable in all that stands in --over.
+    small) as can be while the topology is stable in all that stands in --over.
     They are printed to four digits, and proved at these: in boxes, for every
     number of peers, over the network as it is. That no gains in these ranges
     do better by 2 % is proved where that is quick; the answer says so, and how
@@ -91,24 +93,29 @@ def tune_command(
                  --over user.count=2:10 --over device.mass=±20%
     """
     from apc.frame.devices import FREE
-    from apc.inputs import open_scene
-    from apc.present.pictures import write_picture
-    from apc.present.tuning_output import panels_of
-    from apc.tuning.demands import held_as_studied, read_against, read_demands, read_seconds
-    from apc.tuning.front import front
+    from apc.inputs import open_topology
+    from apc.output.pictures import write_picture
+    from apc.output.tuning_output import panels_of
+    from apc.tuning.pareto_front import pareto_front
+    from apc.tuning.specification import gripped_as_studied, read_seconds, read_tradeoff, read_tuning_spec
     from apc.tuning.tuner import tune
 
-    note_usual(hands)
+    note_typical_hand(hands)
     if write is not None and write.suffix not in (".yaml", ".yml"):
-        what, got = "the name of a topology", write.suffix or write.name
+        message, got = "the name of a topology", write.suffix or write.name
         raise ApcError(
             Diagnostic(
-                "E996", SourceLocation("--write"), what, ".yaml at its end", got, f"{write.stem}-tuned.yaml"
+                "E996",
+                SourceLocation("--write"),
+                message,
+                ".yaml at its end",
+                got,
+                f"{write.stem}-tuned.yaml",
             )
         )
-    if write is not None and against:
-        raise click.UsageError("--write is of one design, and --against finds several")
-    system = open_scene(
+    if write is not None and tradeoff:
+        raise click.UsageError("--write is of one design, and --tradeoff finds several")
+    system = open_topology(
         file,
         settings,
         {"--write": write, "--plot": plot},
@@ -118,38 +125,38 @@ def tune_command(
     )
     criterion = criterion_with(hands, None)
     if hands == FREE:
-        system, criterion = held_as_studied(system)
-    demands = read_demands(
+        system, criterion = gripped_as_studied(system)
+    tuning_spec = read_tuning_spec(
         system,
         free,
         maximize=maximize,
         minimize=minimize,
-        subject=subject,
+        constraint=constraint,
         over=over,
         criterion=criterion,
     )
-    if plot is not None and not against:  # what can't be drawn is refused before the search
-        panels_of(system, len(demands.free))
-    if against:
+    if plot is not None and not tradeoff:  # what can't be drawn is refused before the search
+        panels_of(system, len(tuning_spec.free))
+    if tradeoff:
         with status_line() as progress:
-            weighed = front(
-                system, demands, read_against(against), seconds=read_seconds(time), progress=progress
+            weighed = pareto_front(
+                system, tuning_spec, read_tradeoff(tradeoff), seconds=read_seconds(time), progress=progress
             )
         if plot is not None:
             write_picture(weighed.plot, plot)
         print_result(weighed, as_json=as_json, written=[plot])
         return
     with status_line() as progress:
-        tuning = tune(system, demands, seconds=read_seconds(time), progress=progress)
+        tuning = tune(system, tuning_spec, seconds=read_seconds(time), progress=progress)
     refused: ApcError | None = None
-    if write is not None and tuning.met:
+    if write is not None and tuning.feasible:
         try:
             _write(system, tuning, settings, write)
         except ApcError as error:  # the gains are shown all the same
             refused = error
     if plot is not None:
         write_picture(tuning.plot, plot)
-    written = write if tuning.met and refused is None else None
+    written = write if tuning.feasible and refused is None else None
     print_result(tuning, as_json=as_json, written=[written, plot])
     if refused is not None:
         raise refused
@@ -157,11 +164,11 @@ def tune_command(
 
 def _write(system: Model, tuning: Tuning, settings: Sequence[str], path: Path) -> None:
     """Write the topology with the gains, and with what else was set."""
+    from apc.app.yaml_edit import write_topology
     from apc.compiler.pipeline import compile_again
-    from apc.compiler.words import with_unit
-    from apc.explore.written import write_topology
-    from apc.frame.names import HELD, find
+    from apc.compiler.wording import with_unit
     from apc.frame.overrides import parse_override
+    from apc.frame.parameter_names import HELD, find
 
     as_written = compile_again(replace(system.origin, changes=()), path.parent)
     # The numbers of the hand of --hands held are of no topology.

@@ -1,1 +1,1 @@
-"""Schemes beside each other: the same questions asked of several scenes."""
+"""Comparison of schemes: the same analyses of several models."""

@@ -1,10 +1,11 @@
-"""Schemes side by side: of several scenes the same numbers, each as its own command gives it.
+"""Comparison table: the same quantities of several models, each from its own analysis.
 
 Takes: `Model`s.
 Gives: `SchemeComparison`, `Scheme`, `compare`; `FREQUENCIES`.
-Guarantees: every number is that of `analysis`, `vary.critical_values`, `hands.frequency_response`,
-`simulation` or `effort`; what can't be had says why and keeps nothing else from being told.
-Does not: compute any of it itself, or say which scheme is the better one.
+Guarantees: every number is that of `analysis`, `parameter_studies.critical_values`,
+`haptics.frequency_response`, `simulation` or `effort`; an unavailable value has a reason and does not affect
+the others.
+Does not: compute any value itself, or rank schemes.
 """
 
 from __future__ import annotations
@@ -20,24 +21,24 @@ from apc.comparison.effort import Effort, effort
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, SourceLocation
 from apc.compiler.timings import part
-from apc.frame.instance import Prepared, prepare
-from apc.hands.answers import held_names
-from apc.hands.frequency_response import Transparency, feel
-from apc.moments.network_verdict import MeanSquareStability, judge_network
+from apc.frame.numeric_model import Prepared, prepare
+from apc.haptics.frequency_response import Transparency, transparency
+from apc.haptics.peer_responses import gripped_names
+from apc.mean_square.mean_square_stability import MeanSquareStability, mean_square_stability
+from apc.parameter_studies.critical_values import Critical, critical
+from apc.parameter_studies.crossing import Progress
+from apc.parameter_studies.stability_criteria import NOMINAL, PASSIVE, criterion_of
 from apc.result import PlotStyle, Result
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare as prepare_to_play
-from apc.simulation.trajectory import SimulationReport, duration_of, play, provenance_of
-from apc.vary.critical_values import Critical, critical
-from apc.vary.crossing import Progress
-from apc.vary.growth import NOMINAL, PASSIVE, criterion_of
+from apc.simulation.trajectory import SimulationReport, duration_of, provenance_of, run_simulation
 
 if TYPE_CHECKING:
     import pandas
 
-    from apc.hands.passivity import AbsoluteStability
+    from apc.haptics.absolute_stability import AbsoluteStability
 
-FREQUENCIES = (1.0, 10.0)  # Hz, at which is told what a hand feels
+FREQUENCIES = (1.0, 10.0)  # frequencies of the transparency, in Hz
 NOTHING: Mapping[int, str] = MappingProxyType({})  # refused
 
 
@@ -46,14 +47,14 @@ _Found = TypeVar("_Found")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scheme:
-    """One scene of a comparison, each part as the command gives it that is named.
+    """One model of a comparison, with the results of the commands.
 
-    `analysis` and `network` (None where all packets are on time, or are taken to be) are those of `analyze`;
-    `passive` that of `analyze --hands passive`, where stable means that. `played` is what `simulate` tells of
-    a scene that is not linear, where all else is of its linearization; None of one that is. `stiffness`,
-    `delay` and `loss` are those of `critical`; `feel` that of `feel` at `FREQUENCIES`, at the device of the
-    first peer that has one. `missing` says why a part is None, by its name. A scene that can't be asked at
-    all, as one with hands can't about passive ones, is `refused`, with why: only its effort is known.
+    `analysis` and `network` (None if all packets are on time, or assumed to be) are those of `analyze`;
+    `passive` that of `analyze --hands passive`, with that criterion. `simulated` is the `simulate` result of
+    a nonlinear model, whose other results are of its linearization; None for a linear one. `stiffness`,
+    `delay` and `loss` are those of `critical`; `transparency` that of `transparency` at `FREQUENCIES`, at the
+    first device. `missing` has the reason for each part that is None. A model that cannot be analyzed, such
+    as one with hands under passive hands, is `refused` with the reason, and has its effort only.
     """
 
     topology: str
@@ -61,42 +62,42 @@ class Scheme:
     analysis: Analysis | None
     network: MeanSquareStability | None
     passive: AbsoluteStability | None
-    played: SimulationReport | None
+    simulated: SimulationReport | None
     stiffness: Critical | None
     delay: Critical | None
     loss: Critical | None
-    feel: Transparency | None
+    transparency: Transparency | None
     effort: Effort
     missing: tuple[tuple[str, str], ...]
     refused: str = ""
 
     @property
     def verdict(self) -> str:
-        """The verdict by what stable means: with passive hands, over the network as it is, or nominal."""
-        judged = self.passive or self.network or self.analysis
-        return "refused" if judged is None else judged.verdict
+        """The verdict by the criterion: with passive hands, over the lossy network, or nominal."""
+        decided = self.passive or self.network or self.analysis
+        return "refused" if decided is None else decided.verdict
 
     @property
     def stable(self) -> bool | None:
         """Whether it is stable, in the same sense."""
-        judged = self.passive or self.network or self.analysis
-        return None if judged is None else judged.stable
+        decided = self.passive or self.network or self.analysis
+        return None if decided is None else decided.stable
 
     @property
     def linearized(self) -> bool:
-        """Whether all but what is played is of a linearization."""
+        """Whether all results except the simulation are of a linearization."""
         return self.analysis is not None and self.analysis.linearized
 
     @property
-    def left_out(self) -> tuple[str, ...]:
-        """What of the scene some of its numbers don't look at."""
-        parts = (self.analysis, self.stiffness, self.delay, self.loss, self.feel)
-        return tuple(dict.fromkeys(text for part in parts if part is not None for text in part.left_out))
+    def limitations(self) -> tuple[str, ...]:
+        """The limitations of some results of the model."""
+        parts = (self.analysis, self.stiffness, self.delay, self.loss, self.transparency)
+        return tuple(dict.fromkeys(text for part in parts if part is not None for text in part.limitations))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SchemeComparison(Result):
-    """Schemes side by side, in the order asked for; `notes` say in what they can't be compared."""
+    """The compared schemes in the given order; `notes` list limits of the comparison."""
 
     shown_by = "comparison_output:comparison"
 
@@ -104,18 +105,18 @@ class SchemeComparison(Result):
     notes: tuple[str, ...]
 
     @property
-    def left_out(self) -> tuple[str, ...]:
-        """What some numbers don't look at, with the places (from 1) of the schemes it is said of."""
-        said: dict[str, list[str]] = {}
-        for place, scheme in enumerate(self.schemes):
-            for text in scheme.left_out:
-                said.setdefault(text, []).append(str(place + 1))
+    def limitations(self) -> tuple[str, ...]:
+        """The limitations of some results, with the one-based indices of the schemes."""
+        reasons: dict[str, list[str]] = {}
+        for index, scheme in enumerate(self.schemes):
+            for text in scheme.limitations:
+                reasons.setdefault(text, []).append(str(index + 1))
         every = len(self.schemes)
-        return tuple(f"{', '.join(on)}: {text}" if len(on) < every else text for text, on in said.items())
+        return tuple(f"{', '.join(on)}: {text}" if len(on) < every else text for text, on in reasons.items())
 
-    def plot(self, **look: Unpack[PlotStyle]) -> Any:
-        """Draw all schemes beside each other, as `look` says; return the matplotlib Figure."""
-        return self._drawn(look=look)
+    def plot(self, **style: Unpack[PlotStyle]) -> Any:
+        """Plot all schemes in the style `look`; return the matplotlib Figure."""
+        return self._plotted(style=style)
 
     def to_dataframe(self) -> pandas.DataFrame:
         """Return a table with a row a scheme, in SI."""
@@ -133,40 +134,40 @@ def compare(
     refused: Mapping[int, str] = NOTHING,
     progress: Progress | None = None,
 ) -> SchemeComparison:
-    """Ask the same of several scenes.
+    """Compare several models.
 
     Parameters
     ----------
     systems
-        The compiled scenes, with the numbers to analyse.
+        The models, with the parameter values to analyze.
     over
-        Which stiffness, delay and loss are varied, in the scenes that have them: see `choice.choose`.
+        The varied stiffness, delay and loss, for the models that have them: see `choice.choose`.
     criterion
-        What stable means, as for `vary.critical_values.critical`.
+        The stability criterion, as for `parameter_studies.critical_values.critical`.
     at
-        The device whose hand feels, as `frequency_response.feel` takes it; if not given, of the first peer
-        with one.
+        The device of the transparency analysis, as for `frequency_response.transparency`; by default the
+        first.
     refused
-        Of scenes, by their places, that can't be asked: why. They have a place in the table all the same.
+        The reasons for models that cannot be analyzed, by index. They have a row in the table all the same.
     progress
-        Is told how far the work is.
+        Called with the progress.
 
     Raises
     ------
     ApcError
-        E940, E941 and E622, as `choice`; E898 no such criterion.
+        E940, E941 and E622, as `choice`; E898 an unknown criterion.
     """
     check_over(systems, over)
-    asked = {place: system for place, system in enumerate(systems) if place not in refused}
-    for system in asked.values():
+    requested = {index: system for index, system in enumerate(systems) if index not in refused}
+    for system in requested.values():
         criterion_of(system, criterion, SourceLocation("criterion"))
-    chosen = {place: choose(system, over) for place, system in asked.items()}
+    chosen = {index: choose(system, over) for index, system in requested.items()}
     schemes = []
-    for place, system in enumerate(systems):
-        why = refused.get(place, "")
+    for index, system in enumerate(systems):
+        why = refused.get(index, "")
         if not why:
             try:
-                schemes.append(_scheme(system, chosen[place], criterion, at, progress))
+                schemes.append(_scheme(system, chosen[index], criterion, at, progress))
                 continue
             except ApcError as error:
                 why = error.mistakes[0].reason
@@ -182,7 +183,7 @@ def _scheme(
     at: str,
     progress: Progress | None,
 ) -> Scheme:
-    """Return what is told of one scene. Raises ApcError, as `analyze` and `passive_hands`, if it can't be."""
+    """Return the results of one model. Raises ApcError as `analyze` and `absolute_stability`."""
     names = {axis: item.name for axis, item in axes.items()}
     missing = {axis: item.why for axis, item in axes.items() if item.why}
     say = progress or (lambda _: None)
@@ -205,7 +206,7 @@ def _scheme(
 
     say(f"{system.name}: its verdict")
     prepared = prepare(system)
-    network = judge_network(system, prepared) if criterion not in (NOMINAL, PASSIVE) else None
+    network = mean_square_stability(system, prepared) if criterion not in (NOMINAL, PASSIVE) else None
     if network is not None and network.mean_square_radius is None:
         missing["verdict"] = "; ".join(network.notes)
     analysis = analyze(system, prepared=prepared)
@@ -215,21 +216,23 @@ def _scheme(
         analysis=analysis,
         network=network,
         passive=_passive(system, prepared) if criterion == PASSIVE else None,
-        played=had("played", "apc simulate", lambda: _played(system, say)) if analysis.linearized else None,
+        simulated=had("simulated", "apc simulate", lambda: _simulated(system, say))
+        if analysis.linearized
+        else None,
         stiffness=crossing(STIFFNESS),
         delay=crossing(DELAY),
         loss=crossing(LOSS),
-        feel=had("feel", "apc feel", lambda: _feel(system, prepared, at)),
+        transparency=had("transparency", "apc transparency", lambda: _transparency(system, prepared, at)),
         effort=effort(system),
         missing=tuple(missing.items()),
     )
 
 
-def _played(system: Model, say: Progress) -> SimulationReport:
-    """Return what a scene does in time, by its experiment."""
+def _simulated(system: Model, say: Progress) -> SimulationReport:
+    """Return the simulation of a model's experiment."""
     simulation = prepare_to_play(system, Settings(duration_of(system, None)))
     say(f"{system.name}: apc simulate")
-    summary, interrupted = play(simulation, [])
+    summary, interrupted = run_simulation(simulation, [])
     if interrupted:
         raise KeyboardInterrupt
     return SimulationReport(
@@ -237,31 +240,31 @@ def _played(system: Model, say: Progress) -> SimulationReport:
     )
 
 
-def _feel(system: Model, prepared: Prepared, at: str) -> Transparency:
-    """Return what is felt, at the first device there is if it isn't said: a server has none."""
-    names = held_names(system, prepared)
+def _transparency(system: Model, prepared: Prepared, at: str) -> Transparency:
+    """Return the transparency, by default at the first device: a server has none."""
+    names = gripped_names(system, prepared)
     at = at or (names[0].partition(".")[0] if names else "")
-    return feel(system, FREQUENCIES, at=at, beside=(), prepared=prepared)
+    return transparency(system, FREQUENCIES, at=at, alongside=(), prepared=prepared)
 
 
 def _passive(system: Model, prepared: Prepared) -> AbsoluteStability:
     """Return the verdict with all passive hands; imported here, as few comparisons ask for it."""
-    from apc.hands.passivity import passive_hands
+    from apc.haptics.absolute_stability import absolute_stability
 
-    return passive_hands(system, prepared)
+    return absolute_stability(system, prepared)
 
 
 def _notes(schemes: Sequence[Scheme]) -> tuple[str, ...]:
-    """Say in what the schemes differ beside their couplings."""
+    """Return the differences between the models other than their couplings."""
     peers = dict.fromkeys(scheme.peers for scheme in schemes)
     frames = dict.fromkeys(scheme.analysis.frame_s for scheme in schemes if scheme.analysis is not None)
-    judged = dict.fromkeys(scheme.network is None for scheme in schemes if scheme.analysis is not None)
+    decided = dict.fromkeys(scheme.network is None for scheme in schemes if scheme.analysis is not None)
     notes = {
         f"they have different numbers of peers: {', '.join(f'{peer:,}' for peer in peers)}": len(peers) > 1,
         "their frames differ, and with them what a spectral radius is of: "
         f"{', '.join(f'{frame * 1e3:.6g} ms' for frame in frames)}": len(frames) > 1,
         "some are judged in mean square over the network as it is, some with every packet on time": len(
-            judged
+            decided
         )
         > 1,
     }

@@ -1,6 +1,6 @@
-"""Eigenvalues with their right and left vectors, of one matrix or of many, and what follows from both.
+"""Eigenvalues with their right and left vectors, of one matrix or of many; slopes and conditions.
 
-Takes: matrices (…, n, n), their derivatives, or what they are off by.
+Takes: matrices (…, n, n), their derivatives, or their error bounds.
 Gives: `Eigenpairs`, `eigenpairs`, `pairs_to`, `refined`; `eigenvalues`; `components`,
 `driving_parts`, `inverses`.
 Guarantees: a derivative that `eigenvalues` gives and that would be mostly rounding comes as 0.
@@ -23,7 +23,7 @@ from apc.threads import load_pool
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
-Places = NDArray[np.intp]
+Indices = NDArray[np.intp]
 Matrix = NDArray[Any]  # float64 or complex128
 
 # A derivative of an eigenvalue of worse condition than this is mostly rounding.
@@ -36,8 +36,8 @@ SMALL = 0.05
 # regular. Each step leaves a share of about SHIFT/gap of the other vectors.
 SHIFT = 1e-7
 
-# Steps of inverse iteration with one inverse. The vectors give the slopes: with a guess right to 1e-4 and
-# other eigenvalues 0.1 away, 1e-9 of what there was of the others is left.
+# Steps of inverse iteration with one inverse. The vectors give the slopes: with an estimate accurate to 1e-4
+# and other eigenvalues 0.1 away, 1e-9 of the other components is left.
 STEPS = 3
 
 
@@ -49,9 +49,9 @@ class Eigenpairs:
     right: Complexes  # (…, n, m)
     left: Complexes  # (…, m, n)
 
-    def at(self, places: NDArray[np.intp]) -> Eigenpairs:
+    def at(self, indices: NDArray[np.intp]) -> Eigenpairs:
         """Return some of the pairs."""
-        return Eigenpairs(self.values[..., places], self.right[..., places], self.left[..., places, :])
+        return Eigenpairs(self.values[..., indices], self.right[..., indices], self.left[..., indices, :])
 
     @property
     def condition(self) -> Floats:
@@ -65,7 +65,7 @@ class Eigenpairs:
         return np.asarray(np.einsum("...ij,...ji->...i", self.left, slope @ self.right) / product)
 
     def errors(self, error: Floats) -> Floats:
-        """Return by how much the eigenvalues are off, to first order, for what their matrix is off by."""
+        """Return the first-order error bounds of the eigenvalues, for given error bounds of their matrix."""
         product = np.abs(np.einsum("...ij,...ji->...i", self.left, self.right))
         moved = np.einsum("...ij,...ji->...i", np.abs(self.left), error @ np.abs(self.right))
         return np.asarray(moved / product)
@@ -85,11 +85,11 @@ def eigenpairs(matrix: Matrix) -> Eigenpairs:
     geev = load_pool("scipy.linalg.lapack").get_lapack_funcs("geev", (matrix,))
     values = np.empty(matrix.shape[:-1], dtype=np.complex128)
     left, right = np.empty((2, *matrix.shape), dtype=np.complex128)
-    for place in np.ndindex(matrix.shape[:-2] if matrix.size else 0):
-        *parts, left[place], right[place], failed = geev(matrix[place])
+    for index in np.ndindex(matrix.shape[:-2] if matrix.size else 0):
+        *parts, left[index], right[index], failed = geev(matrix[index])
         if failed:
             raise np.linalg.LinAlgError("eigenvalues did not converge")
-        values[place] = parts[0] if len(parts) == 1 else parts[0] + 1j * parts[1]
+        values[index] = parts[0] if len(parts) == 1 else parts[0] + 1j * parts[1]
     if not np.iscomplexobj(matrix):
         *where, first = np.nonzero(values.imag > 0)
         upper, lower = (*where, slice(None), first), (*where, slice(None), first + 1)
@@ -146,7 +146,7 @@ def refined(matrix: Matrix, guess: Eigenpairs) -> Eigenpairs:
     return Eigenpairs(pair.slopes(matrix), v, w)
 
 
-def components(driven: NDArray[np.bool_]) -> list[Places]:
+def components(driven: NDArray[np.bool_]) -> list[Indices]:
     """Return the strongly connected components of a matrix's graph, by their first places.
 
     Parameters
@@ -161,9 +161,9 @@ def components(driven: NDArray[np.bool_]) -> list[Places]:
     return list(_components(len(driven), np.packbits(driven).tobytes()))
 
 
-# SciPy takes 0.1 ms to check its argument, and one scene asks of the same few graphs again and again.
+# SciPy takes 0.1 ms to check its argument, and one model has the same few graphs repeatedly.
 @lru_cache(maxsize=256)
-def _components(count: int, packed: bytes) -> tuple[Places, ...]:
+def _components(count: int, packed: bytes) -> tuple[Indices, ...]:
     """Return the components of a graph of so many states, whose `driven` is packed to bits."""
     # Imported where it is asked: it takes 30 ms, as long as many an analysis.
     from scipy.sparse.csgraph import connected_components
@@ -176,7 +176,7 @@ def _components(count: int, packed: bytes) -> tuple[Places, ...]:
     return tuple(sorted(parts, key=lambda part: int(part[0])))
 
 
-def driving_parts(driven: NDArray[np.bool_]) -> list[Places]:
+def driving_parts(driven: NDArray[np.bool_]) -> list[Indices]:
     """Return the `components` in which some state drives one of them, itself or another.
 
     What only passes on, as packets on their way, has the eigenvalue 0 whatever the entries are.

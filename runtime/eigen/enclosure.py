@@ -1,18 +1,20 @@
-"""Eigenvalues of matrices known up to an error, each with a bound.
+"""Enclosures of eigenvalues of matrices known up to an error.
 
-Takes: square matrices, and a bound on what each entry may be off by.
-Gives: `Enclosure`, `enclose_stack`, `enclose_eigenvalues`, `discs`; `least_radius`; `misses_an_eigenvalue`.
-Guarantees: the bounds hold for every matrix within the error, whatever their conditioning; rounding in the
-bounds themselves is charged. LAPACK's results are checked by their residuals, not believed.
-Does not: know where a matrix comes from, or what is rigid (see `spectrum`).
+Takes: square matrices, and a bound on the error of each entry.
+Gives: `Enclosure`, `enclose_stack`, `enclose_eigenvalues`, `discs`; `least_radius`; `misses_an_eigenvalue`;
+`descending`.
+Guarantees: the bounds hold for every matrix within the error, for any conditioning; rounding in the bounds
+themselves is charged. LAPACK's results are verified by their residuals.
+Does not: build the matrix, or remove rigid modes (see `spectrum`).
 
 X⁻¹(M + E)X = T + G, where X holds the right vectors and T = diag(Λ). Every eigenvalue is in one of
-Gershgorin's discs of D⁻¹(T + G)D, whatever the positive diagonal D. Discs that touch hold together as many
-eigenvalues as there are of them.
+Gershgorin's discs of D⁻¹(T + G)D, for any positive diagonal D. Connected discs together contain as many
+eigenvalues as there are discs.
 
-A queue that runs empty is nearly a Jordan block at zero, whose vectors are hardly several. Where it leaves
-the spectral radius uncertain, X takes an orthonormal basis of what small eigenvalues span, or all, in the
-place of their vectors; T is Schur's triangular form there, and D makes what is above its diagonal small.
+The state of an emptying queue is nearly a Jordan block at zero, with nearly parallel vectors. Where it leaves
+the spectral radius uncertain, X takes an orthonormal basis of the invariant subspace of small eigenvalues, or
+of all, instead of their vectors; T is then Schur's triangular form, and D makes the entries above its
+diagonal small.
 """
 
 from __future__ import annotations
@@ -26,31 +28,30 @@ from numpy.typing import NDArray
 
 from apc.eigen.eigenpairs import Eigenpairs, components, eigenpairs, inverses
 from apc.eigen.matrix_norms import PRODUCT_ROUNDINGS, balance, norms
-from apc.frame.radius import UNIT
+from apc.frame.interval_arithmetic import UNIT_ROUNDOFF
 from apc.threads import load_pool
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
-Truths = NDArray[np.bool_]
 Matrix = NDArray[Any]  # float64 or complex128
 
-# Eigenvalues smaller than this decide nothing: e-folding in a fifth of a frame.
+# The limit of negligible eigenvalues: a decay by e in a fifth of a frame.
 SMALL = 1e-2
 
-# Floats scatter defective clusters at zero as far as this: below it eigenvalues are taken together.
+# The spread of defective clusters at zero in floats: eigenvalues below it are treated together.
 CLUSTER = 0.3
 
-# How much larger than the largest of a cluster's discs must be those of a scaling that all can have.
+# The ratio of a cluster's largest disc to the disc of a common scaling.
 FARTHER = 1.25
 
-# A spectral radius less certain than the first, relative to itself or to 1, has small ones taken together;
-# what is less certain than the second is open.
+# Uncertainty of a spectral radius, relative to itself or to 1: above the first, small eigenvalues are treated
+# together; above the second, the radius is undecided.
 SHARP, WIDE = 2e-12, 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Enclosure:
-    """Bounds on the spectral radius (…), and how far each estimate can be from a true eigenvalue (…, n)."""
+    """Bounds on the spectral radius (…), and the error bound of each estimate of an eigenvalue (…, n)."""
 
     low: Any
     high: Any
@@ -58,34 +59,34 @@ class Enclosure:
 
 
 def enclose_eigenvalues(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure]:
-    """Compute all eigenvalues of a matrix, the largest first, with their vectors, and enclose them.
+    """Return all eigenvalues of a matrix, the largest first, with their vectors, and an enclosure.
 
     Parameters
     ----------
     matrix, error
-        The matrix (n, n), and a bound on what each entry is off by.
+        The matrix (n, n), and a bound on the error of each entry.
 
     Returns
     -------
-    The vectors are those of the part that the eigenvalue belongs to: the products of right and left ones are
-    zero elsewhere.
+    The vectors are those of the strongly connected part of the eigenvalue: the products of right and left
+    ones are zero elsewhere.
 
     Notes
     -----
-    Ordered by its strongly connected parts the matrix is block triangular: its eigenvalues, each as often as
-    it is one, are those of the parts' own blocks. Equal peers in a directed chain make one Jordan block of
-    the whole, which floats scatter far about; those of a part have nothing to do with the next part's.
+    Ordered by its strongly connected parts the matrix is block triangular: its eigenvalues, with
+    multiplicities, are those of the diagonal blocks. Equal peers in a directed chain make one Jordan block of
+    the complete matrix, which floats scatter widely; the blocks of the parts are independent.
     """
     n = len(matrix)
     values, errors = np.zeros(n, dtype=np.complex128), np.zeros(n)
     right, left = np.zeros((2, n, n), dtype=np.complex128)
     low = high = 0.0
     parts = components(~(np.abs(matrix) + error == 0)) if n else []
-    for size in {len(part) for part in parts}:  # all of a size at once
-        places = np.array([part for part in parts if len(part) == size])
-        square = places[:, :, None], places[:, None]
+    for size in {len(part) for part in parts}:  # all of one size together
+        indices = np.array([part for part in parts if len(part) == size])
+        square = indices[:, :, None], indices[:, None]
         pairs, bounds = enclose_stack(matrix[square], error[square])
-        values[places], errors[places] = pairs.values, bounds.errors
+        values[indices], errors[indices] = pairs.values, bounds.errors
         right[square], left[square] = pairs.right, pairs.left
         low, high = float(np.maximum(low, bounds.low.max())), float(np.maximum(high, bounds.high.max()))
     order = descending(values)
@@ -98,13 +99,13 @@ def descending(values: Complexes) -> NDArray[np.intp]:
 
 
 def enclose_stack(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure]:
-    """Do the same for a stack of matrices (k, n, n), each taken as a whole, with bounds on each."""
-    # In one order in memory, no bit of an answer hangs on what is solved beside it.
+    """Return the same for a stack of matrices (k, n, n), each without splitting, with bounds on each."""
+    # In one memory order, so that no bit of an answer depends on the other matrices.
     matrix, error = np.ascontiguousarray(matrix), np.ascontiguousarray(error)
     k, n = matrix.shape[:2]
     if n == 1:
         values, ones = matrix[:, 0].astype(np.complex128), np.ones((k, 1, 1), dtype=np.complex128)
-        return Eigenpairs(values, ones, ones), discs(values, values, error[:, 0] * (1 + 4 * UNIT))
+        return Eigenpairs(values, ones, ones), discs(values, values, error[:, 0] * (1 + 4 * UNIT_ROUNDOFF))
     with np.errstate(all="ignore"):
         values, right = np.linalg.eig(matrix)
         order = descending(values)
@@ -114,14 +115,14 @@ def enclose_stack(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure]
         bounds = _bounds(matrix, error, pairs, pairs.left, values)
         wide = bounds.high - bounds.low
         for row in np.flatnonzero(~(wide <= SHARP * np.maximum(bounds.low, 1.0))).tolist():
-            again, closer = _enclose_split(matrix[row : row + 1], error[row : row + 1])
-            values[row], right[row], pairs.left[row] = again.values[0], again.right[0], again.left[0]
+            repeated, closer = _enclose_split(matrix[row : row + 1], error[row : row + 1])
+            values[row], right[row], pairs.left[row] = repeated.values[0], repeated.right[0], repeated.left[0]
             bounds.low[row], bounds.high[row], bounds.errors[row] = closer.low, closer.high, closer.errors
     return pairs, bounds
 
 
 def _enclose_split(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure]:
-    """Enclose the eigenvalues of one matrix (1, n, n) by their vectors, those below a limit together."""
+    """Return an enclosure for one matrix (1, n, n) by its vectors, small eigenvalues together."""
     scale = balance(np.abs(matrix[0]) + error[0])
     units = scale / scale[:, None]
     matrix, error = matrix * units, error * units
@@ -143,7 +144,7 @@ def _enclose_split(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure
         low, high = max(low, float(enclosure.low[0])), min(high, float(enclosure.high[0]))
         errors = np.minimum(errors, enclosure.errors[0])
     vectors = Eigenpairs(pairs.values, pairs.right * scale[:, None], pairs.left / scale)
-    # No estimate is farther from its eigenvalue than both are from zero.
+    # No estimate is farther from its eigenvalue than the sum of their distances from zero.
     return vectors, Enclosure(min(low, high), high, np.minimum(errors, sizes + high))
 
 
@@ -159,57 +160,63 @@ def _bounds(
     values: Complexes,
     above: Complexes | None = None,
 ) -> Enclosure:
-    """Enclose the eigenvalues of a stack.
+    """Return an enclosure for a stack of matrices.
 
     Parameters
     ----------
     matrix, error
-        The matrices (k, n, n) and what they are off by.
+        The matrices (k, n, n) and their error bounds.
     estimate, inverse
-        What the eigenvalues may be, beside X, and about X⁻¹ (k, n, n).
+        Estimates of the eigenvalues, X, and about X⁻¹ (k, n, n).
     values, above
-        The diagonal of T (k, n), and what is above it (n, n), None if nothing is.
+        The diagonal of T (k, n), and the part above it (n, n), None if it is zero.
 
     Notes
     -----
     With the row and column of an eigenvalue c scaled by 1/α > 1, its disc shrinks to |G_cc| + α Σ_b |G_cb|,
-    and those of others b grow by |G_bc| / α. As long as these keep clear of it, it holds one eigenvalue
-    (Wilkinson, The Algebraic Eigenvalue Problem, 1965, chapter 2). For what is above the diagonal D = diag(d)
-    with d = (r − N)⁻¹ 1, r larger than N's eigenvalues: then N d < r d.
+    and those of others b grow by |G_bc| / α. As long as these are disjoint from it, it contains one
+    eigenvalue (Wilkinson, The Algebraic Eigenvalue Problem, 1965, chapter 2). For the part N above the
+    diagonal D = diag(d) with d = (r − N)⁻¹ 1, r larger than N's eigenvalues: then N d < r d.
     """
     n = matrix.shape[-1]
-    charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
-    fine = (n + 4) * UNIT if np.isrealobj(matrix) else charge  # a real matrix makes sums of n real products
+    charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT_ROUNDOFF
+    fine = (
+        (n + 4) * UNIT_ROUNDOFF if np.isrealobj(matrix) else charge
+    )  # a real matrix has sums of n real products
     basis = estimate.right
     residual = matrix @ basis - basis * values[:, None]
     size, weight = np.abs(basis), np.abs(inverse)
-    doubt = (error + fine * np.abs(matrix)) @ size + 4 * UNIT * size * np.abs(values)[:, None]
+    uncertainty = (error + fine * np.abs(matrix)) @ size + 4 * UNIT_ROUNDOFF * size * np.abs(values)[:, None]
     if above is not None:
         residual = residual - basis @ above
-        doubt += charge * (size @ np.abs(above))
-    doubt += charge * np.abs(residual)
-    over = (np.abs(inverse @ residual) + weight @ doubt) * (1 + charge)  # |G|, but for the inverse
-    # The computed inverse Y is off: X⁻¹ = (I − F)⁻¹ Y with F = I − Y X.
+        uncertainty += charge * (size @ np.abs(above))
+    uncertainty += charge * np.abs(residual)
+    over = (np.abs(inverse @ residual) + weight @ uncertainty) * (1 + charge)  # |G|, but for the inverse
+    # The computed inverse Y has an error: X⁻¹ = (I − F)⁻¹ Y with F = I − Y X.
     wrong = (np.abs(np.eye(n) - inverse @ basis) + charge * (weight @ size)).sum(axis=2)
     defect = wrong.max(axis=1)
     over += (wrong / (1 - defect)[:, None])[:, :, None] * over.max(axis=1, keepdims=True)
 
     if above is not None:
-        over = over + np.abs(above) * (1 + 4 * UNIT)
+        over = over + np.abs(above) * (1 + 4 * UNIT_ROUNDOFF)
         over = over * _scaling(over[0], above)
     total = over.sum(axis=2) * (1 + charge)
-    gap = np.abs(values[:, :, None] - values[:, None]) * (1 - 8 * UNIT) - total[:, :, None] - total[:, None]
+    gap = (
+        np.abs(values[:, :, None] - values[:, None]) * (1 - 8 * UNIT_ROUNDOFF)
+        - total[:, :, None]
+        - total[:, None]
+    )
     np.einsum("kii->ki", gap)[:] = np.inf
-    share = np.where(gap > 0, over / gap, np.inf).max(axis=1) * (1 + 8 * UNIT)
+    share = np.where(gap > 0, over / gap, np.inf).max(axis=1) * (1 + 8 * UNIT_ROUNDOFF)
     first = np.einsum("kii->ki", over)
-    less = (first + share * (total - first)) * (1 + 8 * UNIT)
+    less = (first + share * (total - first)) * (1 + 8 * UNIT_ROUNDOFF)
     radii = np.where(share < 1, np.minimum(less, total), total) * (1 + charge)
     known = (defect < 0.5) & np.isfinite(radii).all(axis=1)
     return discs(estimate.values, values, np.where(known[:, None], radii, np.inf))
 
 
 def _scaling(over: Floats, above: Complexes) -> Floats:
-    """Return d_j / d_i (n, n) of a D that makes small what stands above the diagonal."""
+    """Return d_j / d_i (n, n) of a D that makes the entries above the diagonal small."""
     scale = np.ones(len(over))
     part = np.flatnonzero(above.any(axis=0) | above.any(axis=1))
     within = over[np.ix_(part, part)]
@@ -222,11 +229,11 @@ def _scaling(over: Floats, above: Complexes) -> Floats:
 
 
 def discs(values: Complexes, centres: Complexes, radii: Floats, inner: Floats | None = None) -> Enclosure:
-    """Return bounds on the spectral radius (…) and how far each estimate (…, n) is from its eigenvalue.
+    """Return bounds on the spectral radius (…) and the distance of each estimate (…, n) from its eigenvalue.
 
-    k discs that hang together hold k eigenvalues, nobody knows which in which: each estimate is then off by
-    at most the distance to the far side of any of them. `inner` (…, n) is what of each disc is not below the
-    bound that is wanted, without it the least magnitude.
+    k connected discs contain k eigenvalues, in any order: the error of each estimate is then at most the
+    distance to the far side of any of them. `inner` (…, n) is a lower bound on the magnitudes in each disc,
+    by default the smallest magnitude.
     """
     n = values.shape[-1]
     touching = (
@@ -239,12 +246,12 @@ def discs(values: Complexes, centres: Complexes, radii: Floats, inner: Floats | 
     together = label[..., :, None] == label[..., None, :]
     reach = np.abs(values[..., :, None] - centres[..., None, :]) + radii[..., None, :]
     floor = 0.0 if inner is None else -np.inf
-    inner = np.abs(centres) * (1 - 4 * UNIT) - radii if inner is None else inner
+    inner = np.abs(centres) * (1 - 4 * UNIT_ROUNDOFF) - radii if inner is None else inner
     least = np.where(together, inner[..., None, :], np.inf).min(axis=-1, initial=np.inf)
     return Enclosure(
         low=least.max(axis=-1, initial=floor),
-        high=((np.abs(centres) + radii) * (1 + 4 * UNIT)).max(axis=-1, initial=0.0),
-        errors=np.where(together, reach, 0.0).max(axis=-1, initial=0.0) * (1 + 4 * UNIT),
+        high=((np.abs(centres) + radii) * (1 + 4 * UNIT_ROUNDOFF)).max(axis=-1, initial=0.0),
+        errors=np.where(together, reach, 0.0).max(axis=-1, initial=0.0) * (1 + 4 * UNIT_ROUNDOFF),
     )
 
 
@@ -254,14 +261,14 @@ def least_radius(matrix: Floats, slopes: Floats, error: Floats) -> float:
     Parameters
     ----------
     matrix, slopes, error
-        M (n, n), S (m, n, n) and a bound on what each entry of E is.
+        M (n, n), S (m, n, n) and a bound on each entry of E.
 
     Notes
     -----
     X⁻¹(M + …)X = [λ + g, c; r, T + H], λ being the largest eigenvalue, alone, and T that of all others. A z
     near λ is an eigenvalue if z − λ − g = c (z − T − H)⁻¹ r, whose right side is at most ‖c‖‖r‖/(s − ρ), as
     long as |z − λ − g| ≤ ρ < s = σ_min(λ − T) − |g| − ‖H‖. By Rouché's theorem one is within the ρ at which
-    both are equal. It goes along with λ + g, which only what moves it inwards brings nearer to zero.
+    both are equal. Only the inward component of g reduces the bound.
     """
     with np.errstate(all="ignore"):
         n, linalg = len(matrix), load_pool("scipy.linalg")
@@ -271,26 +278,26 @@ def least_radius(matrix: Floats, slopes: Floats, error: Floats) -> float:
         pairs = eigenpairs(matrix)
         pairs = pairs.at(descending(pairs.values))
         first = pairs.values[0]
-        apart = np.abs(pairs.values[1:] - first).min(initial=np.inf) / 2
+        separation = np.abs(pairs.values[1:] - first).min(initial=np.inf) / 2
         form, basis, count = linalg.schur(
-            matrix, output="complex", sort=lambda value: abs(value - first) > apart, check_finite=False
+            matrix, output="complex", sort=lambda value: abs(value - first) > separation, check_finite=False
         )
         if count != n - 1:
             return 0.0
         right = np.hstack([pairs.right[:, :1], basis[:, :count]])
         left, centre = inverses(right), linalg.block_diag(first, form[:count, :count])
         moves = left @ slopes @ right
-        charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
+        charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT_ROUNDOFF
         size, weight = np.abs(right), np.abs(left)
-        off = np.abs(left @ matrix @ right - centre)
-        off += weight @ (error + 2 * charge * (np.abs(matrix) + np.abs(slopes).sum(axis=0))) @ size
-        # The computed inverse Y is off: X⁻¹ = (I − F)⁻¹ Y with F = I − Y X.
+        error_bound = np.abs(left @ matrix @ right - centre)
+        error_bound += weight @ (error + 2 * charge * (np.abs(matrix) + np.abs(slopes).sum(axis=0))) @ size
+        # The computed inverse Y has an error: X⁻¹ = (I − F)⁻¹ Y with F = I − Y X.
         wrong = norms(np.abs(np.eye(n) - left @ right) + charge * (weight @ size))
-        doubt = float(wrong / (1 - wrong) * (norms(centre) + norms(off) + norms(moves).sum()))
+        uncertainty = float(wrong / (1 - wrong) * (norms(centre) + norms(error_bound) + norms(moves).sum()))
 
         def most(rows: slice, columns: slice) -> float:
-            """Return a bound on the norm of a block of what moves."""
-            block = norms(moves[:, rows, columns]).sum() + norms(off[rows, columns]) + doubt
+            """Return a bound on the norm of a block of the perturbation."""
+            block = norms(moves[:, rows, columns]).sum() + norms(error_bound[rows, columns]) + uncertainty
             return float(block) * (1 + charge)
 
         item, rest = slice(0, 1), slice(1, n)
@@ -301,16 +308,20 @@ def least_radius(matrix: Floats, slopes: Floats, error: Floats) -> float:
         if not (wrong < 1 and spare > 0 and square > 0):
             return 0.0
         near = 2 * most(item, rest) * most(rest, item) / (spare + np.sqrt(square))
-        inwards = np.abs((np.exp(-1j * np.angle(first)) * moves[:, 0, 0]).real).sum() + off[0, 0] + doubt
+        inwards = (
+            np.abs((np.exp(-1j * np.angle(first)) * moves[:, 0, 0]).real).sum()
+            + error_bound[0, 0]
+            + uncertainty
+        )
         return float(abs(first) - (inwards + near) * (1 + charge) - charge)
 
 
 def misses_an_eigenvalue(matrix: Floats, error: Floats) -> bool:
-    """Say whether 1 is certainly no eigenvalue of a matrix (n, n) known up to an error."""
+    """Return whether 1 is certainly no eigenvalue of a matrix (n, n) known up to an error."""
     n = len(matrix)
     away = np.eye(n) - matrix
     inverse = inverses(away)
-    doubt = norms(error) + (n + 4) * UNIT * (n + norms(matrix))
+    uncertainty = norms(error) + (n + 4) * UNIT_ROUNDOFF * (n + norms(matrix))
     wrong = np.asarray(np.eye(n) - inverse @ away, dtype=np.float64)
     with np.errstate(all="ignore"):
-        return bool(norms(wrong) + norms(inverse) * doubt < 0.5)
+        return bool(norms(wrong) + norms(inverse) * uncertainty < 0.5)

@@ -1,10 +1,10 @@
-"""The eigenvalues of a graph's weights W: in closed form, or from floats with a bound on their errors.
+"""The eigenvalues of a graph's weight matrix W: in closed form, or from floats with error bounds.
 
 Takes: a `Graph` of a link and the number of its peers.
 Gives: `GraphMode`, `Surd`, `graph_modes`, `ring_mode`.
 Guarantees: an eigenvalue that equal row sums make exact, or that is a simple fraction, is exact, with its
 multiplicity proven; any other comes with a bound on its error.
-Does not: know what is sent over the graph, or close a loop (see `graph_loops`).
+Does not: use the values sent over the graph, or close a loop (see `graph_loops`).
 """
 
 from __future__ import annotations
@@ -19,25 +19,24 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import Graph
 from apc.compiler.weights import exact_weight, sum_weights
 from apc.eigen.null_space import null_space
-from apc.frame.exchange import arcs
-from apc.frame.radius import UNIT
+from apc.frame.communication_graph import arcs
+from apc.frame.interval_arithmetic import UNIT_ROUNDOFF
 
-Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 # Backward error of LAPACK's eigenvalue solvers in units of n·UNIT·‖W‖_F: 'a modest constant' (LAPACK Users'
 # Guide, 3rd ed., section 4.7).
 EIGEN_ROUNDINGS = 10
 
-# Eigenvectors worse conditioned than this: the matrix can't be told from one that has no full set of them.
+# The largest condition of eigenvectors: beyond it the matrix may lack a full set of eigenvectors.
 WORST_CONDITION = 1e6
 
-# Beyond so many peers, a repeated row sum is not proven an eigenvalue of that multiplicity in exact
+# Beyond this number of peers, the multiplicity of a repeated row sum as an eigenvalue is not proved in exact
 # rationals.
 MOST_EXACT = 300
 
-# An eigenvalue that may be a fraction with no larger a denominator, such as −1 of two peers or −1/2 of three,
-# is asked whether it is one.
+# The largest denominator of a fraction, such as −1 of two peers or −1/2 of three, that is tested as an exact
+# eigenvalue.
 MOST_DENOMINATOR = 12
 
 
@@ -52,16 +51,16 @@ class Surd:
 
 @dataclass(frozen=True, slots=True)
 class GraphMode:
-    """An eigenvalue of W, held `multiplicity` times; with a positive imaginary part it stands for a pair.
+    """An eigenvalue of W with its `multiplicity`; with a positive imaginary part it represents a pair.
 
-    `doubt` bounds its error; `common` says that all peers move alike in it. `surd` is what it is exactly,
-    where `doubt` is not zero and there is a closed form.
+    `weight_error` bounds its error; `common` states that all peers have equal amplitude and phase in it.
+    `surd` is its exact value, where `weight_error` is not zero and there is a closed form.
     """
 
     real: Fraction
     imaginary: Fraction
     multiplicity: int
-    doubt: float
+    weight_error: float
     common: bool
     surd: Surd | None = None
 
@@ -87,15 +86,15 @@ def graph_modes(graph: Graph, peers: int, *, mean: bool) -> tuple[GraphMode, ...
     if graph.shape == "ring" and n > 2:
         return tuple(ring_mode(k, n, mean=mean) for k in range(n // 2 + 1))
     if graph.shape == "star" and n > 2:
-        # The centre against the others, alike or opposite: ±1 of the mean, ±√(n−1) of the sum; the others
-        # apart.
+        # The centre and the others, in phase or opposite: ±1 of the mean, ±√(n−1) of the sum; then
+        # differences of the others.
         root = math.isqrt(n - 1)
         exact = mean or root**2 == n - 1
         largest = Fraction(1) if mean else Fraction(root) if exact else Fraction(math.sqrt(n - 1))
-        doubt = 0.0 if exact else float(largest) * UNIT
+        weight_error = 0.0 if exact else float(largest) * UNIT_ROUNDOFF
         return (
-            GraphMode(largest, Fraction(0), 1, doubt, mean, Surd(Fraction(1), square=n - 1)),
-            GraphMode(-largest, Fraction(0), 1, doubt, False, Surd(Fraction(-1), square=n - 1)),
+            GraphMode(largest, Fraction(0), 1, weight_error, mean, Surd(Fraction(1), square=n - 1)),
+            GraphMode(-largest, Fraction(0), 1, weight_error, False, Surd(Fraction(-1), square=n - 1)),
             GraphMode(Fraction(0), Fraction(0), n - 2, 0.0, False),
         )
     return _numeric_modes(graph, n, mean=mean)
@@ -106,7 +105,7 @@ def ring_mode(k: int, n: int, *, mean: bool) -> GraphMode:
     scale = Fraction(1, 2) if mean else Fraction(1)
     times = 1 if 2 * k in (0, n) else 2
     value = 2 * scale * _cosine(k, n)
-    return GraphMode(value, Fraction(0), times, _cosine_doubt(k, n), k == 0, Surd(2 * scale, Fraction(k, n)))
+    return GraphMode(value, Fraction(0), times, _cosine_error(k, n), k == 0, Surd(2 * scale, Fraction(k, n)))
 
 
 def _cosine(k: int, n: int) -> Fraction:
@@ -122,37 +121,37 @@ def _cosine(k: int, n: int) -> Fraction:
     return known[turn] if turn in known else Fraction(math.cos(2 * math.pi * k / n))
 
 
-def _cosine_doubt(k: int, n: int) -> float:
+def _cosine_error(k: int, n: int) -> float:
     """Return a bound on the error of twice the cosine: of its argument, up to π, and of its own."""
-    return 0.0 if Fraction(k, n).denominator in (1, 2, 3, 4, 6) else 2 * (4 * math.pi + 2) * UNIT
+    return 0.0 if Fraction(k, n).denominator in (1, 2, 3, 4, 6) else 2 * (4 * math.pi + 2) * UNIT_ROUNDOFF
 
 
 def _numeric_modes(graph: Graph, n: int, *, mean: bool) -> tuple[GraphMode, ...] | None:
-    """Compute the eigenvalues of W, those that are one within their errors as one."""
+    """Return the eigenvalues of W, with those merged that are equal within their errors."""
     pairs, weights = arcs(graph, n)
     plain = np.zeros((n, n))
     np.add.at(plain, (pairs[:, 1], pairs[:, 0]), weights)
-    sums = sum_weights(pairs[:, 1], weights, n).astype(np.float64)  # those that cancel lose no digits
+    sums = sum_weights(pairs[:, 1], weights, n).astype(np.float64)  # cancellation loses no digits
     matrix = plain / sums[:, None] if mean else plain
-    size = EIGEN_ROUNDINGS * n * UNIT
+    size = EIGEN_ROUNDINGS * n * UNIT_ROUNDOFF
     if np.array_equal(plain, plain.T) and (not mean or np.all(sums > 0)):
         # D⁻¹S is similar to D^(−1/2) S D^(−1/2): real, with a full set of eigenvectors.
         root = np.sqrt(sums) if mean else np.ones(n)
         symmetric = plain / root[:, None] / root
         values = np.linalg.eigvalsh((symmetric + symmetric.T) / 2).astype(np.complex128)
-        doubt = size * float(np.linalg.norm(symmetric))
+        weight_error = size * float(np.linalg.norm(symmetric))
     else:
         values, vectors = np.linalg.eig(matrix)
         condition = float(np.linalg.cond(vectors))
         if not condition <= WORST_CONDITION:
             return None
         # Bauer and Fike: an eigenvalue moves no further than the condition times the matrix.
-        doubt = size * condition * float(np.linalg.norm(matrix))
+        weight_error = size * condition * float(np.linalg.norm(matrix))
     exact_sum = _row_sum(graph, n, mean=mean)
     modes = []
-    for cluster in _clusters(values, doubt):
+    for cluster in _clusters(values, weight_error):
         centre = complex(np.mean(values[cluster]))
-        spread = doubt + float(np.abs(values[cluster] - centre).max())
+        spread = weight_error + float(np.abs(values[cluster] - centre).max())
         if exact_sum is not None and abs(centre - float(exact_sum)) <= spread:
             is_exact = _is_exact(graph, n, exact_sum, len(cluster), mean=mean)
             modes.append(
@@ -171,23 +170,23 @@ def _numeric_modes(graph: Graph, n: int, *, mean: bool) -> tuple[GraphMode, ...]
     return tuple(sorted(modes, key=lambda mode: (not mode.common, -mode.real, mode.imaginary)))
 
 
-def _simple(value: complex, off: float) -> Fraction | None:
-    """Return the one simple fraction that an eigenvalue may be, None if there is none."""
+def _simple(value: complex, error_bound: float) -> Fraction | None:
+    """Return the one simple fraction within an eigenvalue's error, None if there is none."""
     number = Fraction(value.real).limit_denominator(MOST_DENOMINATOR)
-    return number if abs(value - float(number)) <= off else None
+    return number if abs(value - float(number)) <= error_bound else None
 
 
-def _clusters(values: NDArray[np.complex128], doubt: float) -> list[Integers]:
-    """Group the eigenvalues that can't be told apart, by their places."""
+def _clusters(values: NDArray[np.complex128], weight_error: float) -> list[Integers]:
+    """Return the groups of indistinguishable eigenvalues, by their indices."""
     cluster = np.arange(len(values))
     for i in range(len(values)):
-        near = np.unique(cluster[np.abs(values - values[i]) <= 2 * doubt])
+        near = np.unique(cluster[np.abs(values - values[i]) <= 2 * weight_error])
         cluster[np.isin(cluster, near)] = near[0]
     return [np.flatnonzero(cluster == item) for item in np.unique(cluster)]
 
 
 def _row_sum(graph: Graph, n: int, *, mean: bool) -> Fraction | None:
-    """Return what all rows of W add up to exactly, or None when they differ."""
+    """Return the exact sum of every row of W, or None when the sums differ."""
     if mean:
         return Fraction(1)
     pairs, weights = arcs(graph, n)
@@ -196,7 +195,7 @@ def _row_sum(graph: Graph, n: int, *, mean: bool) -> Fraction | None:
 
 
 def _is_exact(graph: Graph, n: int, value: Fraction, multiplicity: int, *, mean: bool) -> bool:
-    """Say whether W − value is proven to have a null space of exactly this dimension."""
+    """Return whether W − value is proved to have a null space of exactly this dimension."""
     pairs, weights = arcs(graph, n)
     rows: dict[tuple[int, int], Fraction] = {}
     for (sender, receiver), weight in zip(pairs.tolist(), weights.tolist(), strict=True):
@@ -215,6 +214,6 @@ def _is_exact(graph: Graph, n: int, value: Fraction, multiplicity: int, *, mean:
     if n > MOST_EXACT and multiplicity > 1:
         return False
     matrix = np.zeros((n, n), dtype=object)
-    for place, entry in rows.items():
-        matrix[place] = entry
+    for index, entry in rows.items():
+        matrix[index] = entry
     return len(null_space(matrix)) == multiplicity

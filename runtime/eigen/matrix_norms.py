@@ -1,9 +1,9 @@
-"""The size of matrices: bounds on their norms, and units in which rows and columns are alike.
+"""Bounds on matrix norms, and balancing of rows and columns.
 
 Takes: matrices, real or complex.
 Gives: `norms`, `balance`; `PRODUCT_ROUNDINGS`.
-Guarantees: a norm is a bound, rounding included; units are powers of two, by which nothing is rounded.
-Does not: find the least norm there is.
+Guarantees: a norm is a bound, rounding included; scales are powers of two, which round nothing.
+Does not: compute the smallest bound.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.frame.radius import UNIT
+from apc.frame.interval_arithmetic import UNIT_ROUNDOFF
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]  # float64 or complex128
@@ -22,24 +22,24 @@ Matrix = NDArray[Any]  # float64 or complex128
 # classical bound is 1 for real and 2√2 for complex matrices (Higham, Accuracy and Stability, 3.6).
 PRODUCT_ROUNDINGS = 4
 
-# Sweeps of balancing: after twice as many the bounds are hardly less.
+# Sweeps of balancing: twice as many hardly reduce the bounds.
 SWEEPS = 8
 
 
 def norms(stack: Matrix) -> Floats:
-    """Return upper bounds on the 2-norms of matrices (…, n, m): the least of Frobenius and √(‖·‖₁‖·‖∞)."""
+    """Return upper bounds on the 2-norms of matrices (…, n, m): the minimum of Frobenius and √(‖·‖₁‖·‖∞)."""
     size = np.abs(stack)
     if 0 in size.shape[-2:]:
         return np.zeros(size.shape[:-2])
-    peak = size.max(axis=(-2, -1), keepdims=True)  # relative to it no square is lost
+    peak = size.max(axis=(-2, -1), keepdims=True)  # relative to it no square underflows
     peak = np.where(peak > 0, peak, 1.0)
     frobenius = np.sqrt(np.square(size / peak).sum(axis=(-2, -1))) * peak[..., 0, 0]
     mixed = np.sqrt(size.sum(axis=-2).max(axis=-1)) * np.sqrt(size.sum(axis=-1).max(axis=-1))
-    return np.asarray(np.minimum(frobenius, mixed) * (1 + 4 * sum(size.shape[-2:]) * UNIT))
+    return np.asarray(np.minimum(frobenius, mixed) * (1 + 4 * sum(size.shape[-2:]) * UNIT_ROUNDOFF))
 
 
 def balance(size: Floats) -> Floats:
-    """Return d (…, n), powers of two, that make rows and columns of D⁻¹ |M| D about alike in norm.
+    """Return d (…, n), powers of two, for nearly equal row and column norms of D⁻¹ |M| D.
 
     Parameters
     ----------
@@ -49,8 +49,8 @@ def balance(size: Floats) -> Floats:
 
     Notes
     -----
-    As Parlett and Reinsch (Numerische Mathematik 13, 1969) in the 2-norm, the diagonal left out; of all
-    states at once, so that each goes half-way, as those beside it go as well.
+    As Parlett and Reinsch (Numerische Mathematik 13, 1969) in the 2-norm, without the diagonal; for all
+    states simultaneously, so that each takes half a step.
     """
     with np.errstate(all="ignore"):
         squared = np.where(np.eye(size.shape[-1], dtype=np.bool_), 0.0, np.square(size))

@@ -1,26 +1,25 @@
-"""A whole system as few and small loops instead of one large one.
+"""Modal decomposition: a complete system as few and small independent loops.
 
-Takes: the groups of equal peers of a scene, and the exchange between them.
-Gives: `split`; `ModalDecomposition`, `arrange`; `loops_at_right_angles`; `complete_loops`, `dense_loop`,
+Takes: the groups of equal peers of a model, and the links between them.
+Gives: `split`; `ModalDecomposition`, `decompose`; `loops_at_right_angles`; `complete_loops`, `dense_loop`,
 `dense`, `refuse_dense`, `split_exchangeable`; `couple`, `complete_degrees`.
-Guarantees: the systems of a split, each as often as its multiplicity says, have together the spectrum of
-`dense`, whatever the number of peers. Weights are exact; a mean over nobody, or of weights that add up to 0,
-raises.
-Does not: compute eigenvalues (see `spectrum`); find symmetries of different peers other than of two that
-change places.
+Guarantees: the systems of a split, each with its multiplicity, have together the spectrum of `dense`, for any
+number of peers. Weights are exact; a mean over no peers, or with weights that sum to 0, raises an error.
+Does not: compute eigenvalues (see `spectrum`); find symmetries of different peers other than a permutation of
+two.
 
-On a complete graph a peer of group g hears r = c_g (Σ_j s_j − s_own), with c_g = 1/(others) for a mean and 1
-for a sum. K groups of n_1 … n_K equal peers then split exactly:
+On a complete graph a peer of group g receives r = c_g (Σ_j s_j − s_own), with c_g = 1/(others) for a mean and
+1 for a sum. K groups of n_1 … n_K equal peers then split exactly:
 
-    common        all peers of a group alike: r_g = c_g Σ_h (n_h − δ_gh) s_h        once
-    difference g  peers of group g apart, their sum zero, all else at rest: r_g = −c_g s_g        n_g − 1
-    times
+    common        all peers of a group in phase: r_g = c_g Σ_h (n_h − δ_gh) s_h         once
+    difference g  peers of group g with sum zero, all others at rest: r_g = −c_g s_g     n_g − 1 times
 
-Equal peers on any other graph: see `graph_loops`. Different peers on such a graph are one whole system, less
-those that are exchangeable: g and h of equal dynamics that hear all others alike and are heard by them alike.
-A class c of n_c exchangeable peers that weigh themselves by w_own and one another by w_other moves alike, as
-one site that hears w_own + (n_c − 1) w_other times itself and n_d W_cd times class d; or apart, its sum zero
-and all else at rest, each of them hearing w_own − w_other times itself, n_c − 1 times over.
+For equal peers on any other graph see `graph_loops`. Different peers on such a graph are one system, reduced
+by interchangeable peers: g and h of equal dynamics whose weights to and from all others are equal. A class c
+of n_c interchangeable peers with self-weight w_own and mutual weight w_other splits in two: the common motion
+is that of one subsystem that receives w_own + (n_c − 1) w_other times its own packets and n_d W_cd times
+those of class d; in the difference modes, with sum zero and all others at rest, each peer receives w_own −
+w_other times its own packets, n_c − 1 times.
 """
 
 from __future__ import annotations
@@ -30,22 +29,29 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from apc.compiler.weights import exact_weight
-from apc.eigen.closing import ClosedLoop, Coupling, ModalSystem, close_loop
 from apc.eigen.graph_loops import common_graph, graph_loop, graph_scale
 from apc.eigen.graph_modes import graph_modes
-from apc.eigen.peers import MOST_STATES, PeerClass, group_name, states_of, too_large, used_ways
-from apc.frame.exchange import CommunicationGraph, check_mean
-from apc.frame.instance import PeerIndices
+from apc.eigen.interconnection import ClosedLoop, Coupling, ModalSystem, close_loop
+from apc.eigen.peer_classes import (
+    MOST_STATES,
+    PeerClass,
+    group_name,
+    states_of,
+    too_large,
+    used_coupling_terms,
+)
+from apc.frame.communication_graph import CommunicationGraph, check_mean
+from apc.frame.numeric_model import PeerIndices
 from apc.frame.schedule import CouplingTerm
-from apc.unserved import NotSupportedError
+from apc.not_supported import NotSupportedError
 
-# The shape of modes of peers that differ.
+# The mode family of peers that differ.
 COUPLED = "coupled"
 
 
 @dataclass(frozen=True, slots=True)
 class ModalDecomposition:
-    """A whole system as independent loops; `method` is "modes" or "dense", `notes` say why."""
+    """A complete system as independent loops; `method` is "modes" or "dense", `notes` give the reason."""
 
     method: str
     loops: tuple[ModalSystem, ...]
@@ -53,43 +59,49 @@ class ModalDecomposition:
 
 
 def split(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> tuple[ClosedLoop, ...]:
-    """Split the whole system into as few and small closed systems as its graphs and groups allow.
+    """Return the complete system as the smallest closed systems that its graphs and groups allow.
 
     Parameters
     ----------
     groups
-        All peers, see `peers.peer_groups`.
+        All peers (see `peer_classes.peer_groups`).
     exchange
         The links.
 
     Raises
     ------
     ApcError
-        E801, E802 a mean that can't be; E804 one system of too many states.
+        E801, E802 an undefined mean; E804 one system of too many states.
     """
-    loops = arrange(groups, exchange).loops
+    loops = decompose(groups, exchange).loops
     for loop in loops:
         if loop.states > MOST_STATES:
             raise too_large(exchange, f"{exchange.peers:,} peers", loop.states)
     return tuple(close_loop(loop) for loop in loops)
 
 
-def arrange(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> ModalDecomposition:
-    """Find the independent loops of a whole system: `split`, before any matrix is built.
+def decompose(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> ModalDecomposition:
+    """Return the independent loops of a complete system: `split` before matrices are built.
 
     Parameters
     ----------
     groups, exchange
         As for `split`.
     """
-    ways = used_ways(group.schedule for group in groups)
-    graphs = list(dict.fromkeys(way.link for way in ways if not exchange.is_complete(way.link)))
+    coupling_terms = used_coupling_terms(group.schedule for group in groups)
+    graphs = list(
+        dict.fromkeys(
+            coupling_term.link
+            for coupling_term in coupling_terms
+            if not exchange.is_complete(coupling_term.link)
+        )
+    )
     if not graphs:
         return ModalDecomposition("modes", complete_loops(groups, exchange), ())
     named = " and ".join(f"{link} ({exchange.links[link].graph.shape})" for link in graphs)
-    reason = f"the peers on {named} differ" if len(groups) > 1 else common_graph(ways, exchange)
+    reason = f"the peers on {named} differ" if len(groups) > 1 else common_graph(coupling_terms, exchange)
     if not reason:
-        scale = graph_scale(groups[0], ways, exchange)
+        scale = graph_scale(groups[0], coupling_terms, exchange)
         modes = graph_modes(exchange.links[graphs[0]].graph, exchange.peers, mean=scale.by_mean)
         if modes is not None:
             note = f"{len(modes)} systems, one an eigenvalue of the graph of {named}"
@@ -107,21 +119,21 @@ def arrange(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> ModalD
 def loops_at_right_angles(
     groups: Sequence[PeerClass], exchange: CommunicationGraph, most: int
 ) -> tuple[ModalSystem, ...]:
-    """Split a scene into loops at right angles to one another, all peers alike the first.
+    """Return a model as orthogonal loops, the common loop first.
 
     Parameters
     ----------
     groups, exchange
         As for `split`.
     most
-        How many peers on a graph that isn't complete are not too many.
+        The limit of peers on a graph that is not complete.
 
     Raises
     ------
     NotSupportedError
-        More peers on such a graph.
+        More peers on such a graph than the limit.
     """
-    graphs = {way.link for way in used_ways(group.schedule for group in groups)}
+    graphs = {coupling_term.link for coupling_term in used_coupling_terms(group.schedule for group in groups)}
     graphs = {link for link in graphs if not exchange.is_complete(link)}
     if not graphs:
         return complete_loops(groups, exchange)
@@ -131,67 +143,70 @@ def loops_at_right_angles(
             f"{count:,} peers on a graph that is not complete are too many: {most} are the most"
         )
     if len(groups) == 1 and all(exchange.links[link].graph.shape == "ring" for link in graphs):
-        arrangement = arrange(groups, exchange)
+        arrangement = decompose(groups, exchange)
         if arrangement.method == "modes":
             return arrangement.loops
     return split_exchangeable(dense_loop(groups, exchange), exchange)
 
 
 def complete_loops(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> tuple[ModalSystem, ...]:
-    """Split a system of complete graphs into a common loop and a difference loop a group of two or more.
+    """Return a common loop, and a difference loop for each group of two or more, on complete graphs.
 
     Parameters
     ----------
     groups
-        All peers, see `peers.peer_groups`.
+        All peers (see `peer_classes.peer_groups`).
     exchange
         The links, all of them complete.
     """
     degrees = complete_degrees(groups, exchange)
     weights = couple(
-        groups, exchange, lambda way, g, h: Fraction(groups[h].count - (1 if g == h else 0)), degrees
+        groups,
+        exchange,
+        lambda coupling_term, g, h: Fraction(groups[h].count - (1 if g == h else 0)),
+        degrees,
     )
     loops = [ModalSystem(_together_named(groups), 1, tuple(groups), weights)]
     if all(group.count < 2 for group in groups):
         return tuple(loops)
-    apart = couple(groups, exchange, lambda way, g, h: Fraction(-1 if g == h else 0), degrees)
-    for place, group in enumerate(groups):
+    separation = couple(groups, exchange, lambda coupling_term, g, h: Fraction(-1 if g == h else 0), degrees)
+    for index, group in enumerate(groups):
         if group.count < 2:
             continue
-        own = {key: ((rows[place][place],),) for key, rows in apart.items()}
+        local = {key: ((rows[index][index],),) for key, rows in separation.items()}
         name = "difference" if len(groups) == 1 else f"difference {group.name}"
-        loops.append(ModalSystem(name, group.count - 1, (group,), own))
+        loops.append(ModalSystem(name, group.count - 1, (group,), local))
     return tuple(loops)
 
 
 def dense(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> ClosedLoop:
-    """Assemble every peer of the whole system: the check on all else, at the cost of N³.
+    """Return the closed loop of every peer of the system: the reference, at the cost of N³.
 
     Parameters
     ----------
     groups
-        All peers, see `peers.peer_groups`.
+        All peers (see `peer_classes.peer_groups`).
     exchange
         The links.
 
     Raises
     ------
     ApcError
-        E801, E802 a mean that can't be; E804 more than `MOST_STATES` states.
+        E801, E802 an undefined mean; E804 more than `MOST_STATES` states.
     """
     refuse_dense(groups, exchange)
     return close_loop(dense_loop(groups, exchange))
 
 
 def refuse_dense(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> None:
-    """Refuse so many peers before each of them is looked at."""
+    """Raise an error for too many peers, before any of them is evaluated."""
     states = sum(group.count * states_of(group.schedule, group.jacobians) for group in groups)
     if states > MOST_STATES:
         raise too_large(exchange, f"{exchange.peers:,} peers", states)
 
 
 def dense_loop(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> ModalSystem:
-    """Return every peer of the whole system as one loop."""
+    """Return every peer of the system as one loop."""
     everyone = tuple(
         replace(group, name=exchange.peer_name(peer), count=1, peers=PeerIndices((range(peer, peer + 1),)))
         for peer, group in sorted(
@@ -211,59 +226,69 @@ def dense_loop(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> Mod
             if everyone[sender].sends(link):
                 degrees[link, receiver] = degrees.get((link, receiver), Fraction(0)) + weight
     coupling = couple(
-        everyone, exchange, lambda way, g, h: weights[way.link].get((g, h), Fraction(0)), degrees
+        everyone,
+        exchange,
+        lambda coupling_term, g, h: weights[coupling_term.link].get((g, h), Fraction(0)),
+        degrees,
     )
     return ModalSystem(COUPLED, 1, everyone, coupling)
 
 
-def _together_named(sites: Sequence[PeerClass]) -> str:
-    """Return how peers move together: one alone, equal ones alike, others each in its own way."""
-    return COUPLED if len(sites) > 1 else "common" if sites[0].count > 1 else "single"
+def _together_named(subsystems: Sequence[PeerClass]) -> str:
+    """Return the mode family of peers: one alone, equal peers in common, or different peers coupled."""
+    return COUPLED if len(subsystems) > 1 else "common" if subsystems[0].count > 1 else "single"
 
 
 def split_exchangeable(loop: ModalSystem, exchange: CommunicationGraph) -> tuple[ModalSystem, ...]:
-    """Split a loop by its exchangeable peers.
+    """Return a loop split by its interchangeable peers.
 
     Parameters
     ----------
     loop
-        Of all peers, one a site, its weights exact; without exchangeable ones it is returned as it is.
+        A loop of all peers, one per subsystem, with exact weights; without interchangeable peers it is
+        returned unchanged.
     exchange
         The links, for the names of the groups.
     """
     classes: list[list[int]] = []
-    for place in range(len(loop.sites)):
-        alike = (members for members in classes if _are_exchangeable(loop, members[0], place))
-        numbers = next(alike, None)
+    for index in range(len(loop.subsystems)):
+        interchangeable = (members for members in classes if _are_exchangeable(loop, members[0], index))
+        numbers = next(interchangeable, None)
         if numbers is None:
-            classes.append([place])
+            classes.append([index])
         else:
-            numbers.append(place)
-    if loop.doubts or len(classes) == len(loop.sites):
+            numbers.append(index)
+    if loop.weight_errors or len(classes) == len(loop.subsystems):
         return (loop,)
-    sites = tuple(_together([loop.sites[place] for place in members], exchange) for members in classes)
+    subsystems = tuple(
+        _together([loop.subsystems[index] for index in members], exchange) for members in classes
+    )
     coupling = {
-        way: tuple(tuple(_weight_of(loop, way, members, others) for others in classes) for members in classes)
-        for way in loop.coupling
+        coupling_term: tuple(
+            tuple(_weight_of(loop, coupling_term, members, others) for others in classes)
+            for members in classes
+        )
+        for coupling_term in loop.coupling
     }
-    loops = [replace(loop, name=_together_named(sites), sites=sites, coupling=coupling)]
-    for site, members in zip(sites, classes, strict=True):
+    loops = [replace(loop, name=_together_named(subsystems), subsystems=subsystems, coupling=coupling)]
+    for subsystem, members in zip(subsystems, classes, strict=True):
         if len(members) > 1:
             first, second = members[:2]
-            apart = {
-                way: ((rows[first][first] - rows[first][second],),) for way, rows in loop.coupling.items()
+            separation = {
+                coupling_term: ((rows[first][first] - rows[first][second],),)
+                for coupling_term, rows in loop.coupling.items()
             }
             many = loop.multiplicity * (len(members) - 1)
-            loops.append(ModalSystem(f"difference {site.name}", many, (site,), apart))
+            loops.append(ModalSystem(f"difference {subsystem.name}", many, (subsystem,), separation))
     return tuple(loops)
 
 
 def _are_exchangeable(loop: ModalSystem, g: int, h: int) -> bool:
-    """Say whether two sites can change places."""
-    site, other = loop.sites[g], loop.sites[h]
-    if site.lifting is not other.lifting or site.schedule is not other.schedule:
+    """Return whether two subsystems are interchangeable."""
+    subsystem, other = loop.subsystems[g], loop.subsystems[h]
+    if subsystem.lifting is not other.lifting or subsystem.schedule is not other.schedule:
         return False
-    rest = [place for place in range(len(loop.sites)) if place not in (g, h)]
+    rest = [index for index in range(len(loop.subsystems)) if index not in (g, h)]
     return all(
         rows[g][g] == rows[h][h]
         and rows[g][h] == rows[h][g]
@@ -273,17 +298,17 @@ def _are_exchangeable(loop: ModalSystem, g: int, h: int) -> bool:
 
 
 def _weight_of(
-    loop: ModalSystem, way: CouplingTerm, members: Sequence[int], others: Sequence[int]
+    loop: ModalSystem, coupling_term: CouplingTerm, members: Sequence[int], others: Sequence[int]
 ) -> Fraction:
-    """Return what a site of one class hears of a class whose sites all move alike."""
-    row = loop.coupling[way][members[0]]
-    return sum((row[place] for place in others), Fraction(0))
+    """Return the weight with which a subsystem of one class receives a class in common motion."""
+    row = loop.coupling[coupling_term][members[0]]
+    return sum((row[index] for index in others), Fraction(0))
 
 
-def _together(sites: Sequence[PeerClass], exchange: CommunicationGraph) -> PeerClass:
-    """Return equal sites as one group."""
-    peers = PeerIndices(tuple(run for site in sites for run in site.peers.runs))
-    return replace(sites[0], name=group_name(peers, exchange), count=len(peers), peers=peers)
+def _together(subsystems: Sequence[PeerClass], exchange: CommunicationGraph) -> PeerClass:
+    """Return equal subsystems as one group."""
+    peers = PeerIndices(tuple(run for subsystem in subsystems for run in subsystem.peers.runs))
+    return replace(subsystems[0], name=group_name(peers, exchange), count=len(peers), peers=peers)
 
 
 def couple(
@@ -292,49 +317,62 @@ def couple(
     weigh: Callable[[CouplingTerm, int, int], Fraction],
     degrees: Mapping[tuple[str, int], Fraction],
 ) -> Coupling:
-    """Weigh each site's packets at each other, way by way.
+    """Return the coupling weights between subsystems, for each coupling term.
 
     Parameters
     ----------
     groups
-        The sites.
+        The subsystems.
     exchange
         The links.
     weigh
-        The weight of a packet of site h at site g in a plain sum.
+        The weight of a packet of subsystem h at subsystem g in a plain sum.
     degrees
-        What a mean is divided by, by link and site; who hears nobody has no entry.
+        The divisors of a mean, by link and subsystem, without entries for peers that receive nothing.
     """
     coupling = {}
-    for way in used_ways(group.schedule for group in groups):
+    for coupling_term in used_coupling_terms(group.schedule for group in groups):
         rows = []
         for g, group in enumerate(groups):
-            hears = any(heard.way == way for heard in group.schedule.heard)
-            if hears and way.operator == "mean":
-                total = degrees.get((way.link, g))
+            receives = any(received.coupling_term == coupling_term for received in group.schedule.received)
+            if receives and coupling_term.operator == "mean":
+                total = degrees.get((coupling_term.link, g))
                 check_mean(
-                    exchange, group.peers.first, way.link, "mean", total is not None, total or Fraction(0)
+                    exchange,
+                    group.peers.first,
+                    coupling_term.link,
+                    "mean",
+                    total is not None,
+                    total or Fraction(0),
                 )
             row = []
             for h, sender in enumerate(groups):
-                weight = weigh(way, g, h) if hears and sender.sends(way.link) else Fraction(0)
-                if weight and exchange.delay(way.link, sender.role, group.role) == way.delay:
-                    if way.operator == "mean":
-                        weight /= degrees[way.link, g]
-                    elif way.operator in ("max", "min"):  # the one it is taken from counts once
+                weight = (
+                    weigh(coupling_term, g, h)
+                    if receives and sender.sends(coupling_term.link)
+                    else Fraction(0)
+                )
+                if (
+                    weight
+                    and exchange.delay(coupling_term.link, sender.delay_class, group.delay_class)
+                    == coupling_term.delay
+                ):
+                    if coupling_term.operator == "mean":
+                        weight /= degrees[coupling_term.link, g]
+                    elif coupling_term.operator in ("max", "min"):  # the one that is split off counts once
                         weight = Fraction(1 if weight > 0 else -1)
-                    row.append(weight * group.gain(way, sender))
+                    row.append(weight * group.gain(coupling_term, sender))
                 else:
                     row.append(Fraction(0))
             rows.append(tuple(row))
-        coupling[way] = tuple(rows)
+        coupling[coupling_term] = tuple(rows)
     return coupling
 
 
 def complete_degrees(
     groups: Sequence[PeerClass], exchange: CommunicationGraph
 ) -> dict[tuple[str, int], Fraction]:
-    """Return how many others a peer of each group hears over each complete link."""
+    """Return the number of other peers that a peer of each group receives from over each complete link."""
     degrees = {}
     for link in exchange.links:
         total = sum(group.count for group in groups if group.sends(link))

@@ -45,7 +45,7 @@ def residue(number: Fraction | int) -> Any:
 
 
 def null_space_modulo(residues: Matrix) -> list[list[Fraction]]:
-    """Return what `null_space` of rationals with these residues (m, n) is, as far as simple fractions tell.
+    """Return `null_space` of rationals from their residues (m, n), as far as simple fractions determine it.
 
     There are no more vectors than these; whether these are such is to be seen.
 

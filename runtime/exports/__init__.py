@@ -1,1 +1,1 @@
-"""What other tools read: a judged scene as files of theirs."""
+"""Export of a model to the file formats of other tools."""

@@ -1,7 +1,7 @@
-"""A scene handed over as code: a peer in C99, or an FMU of a peer or of all.
+"""A model handed over as code: a peer in C99, or an FMU of a peer or of all.
 
 Takes: a `Model`, a peer's name, a device, a method. Gives: `Code`, `peer_code`, `write_code`;
-`scene_unit`.
+`topology_unit`.
 Guarantees: three texts are written together or not at all: `left.c`, `left.h`, and the driver `left_test.c`.
 Does not: compile what is written as C.
 """
@@ -17,12 +17,12 @@ from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import write_texts
 from apc.exports.c_text import driver, header, source
+from apc.exports.external_force import with_external_force
 from apc.exports.fmu import FmuContent, unit_of
-from apc.exports.peer_step import ExportedPeer, peer_of, refused, sites_of
-from apc.exports.pushed import pushed
-from apc.exports.scene_text import c_scene, one_peer
-from apc.frame.finite_equations import finite_equations
-from apc.loop.peer import number_of
+from apc.exports.peer_step import ExportedPeer, peer_of, refused, subsystems_of
+from apc.exports.topology_text import c_topology, single_peer
+from apc.frame.evaluation_errors import finite_equations
+from apc.realtime.peer import number_of
 from apc.result import Result
 from apc.simulation.settings import DEFAULT, Method, parse_method
 from apc.simulation.simulation import SimulationPlan, plan_of
@@ -30,7 +30,7 @@ from apc.simulation.simulation import SimulationPlan, plan_of
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Code(Result):
-    """One peer of a scene in C, and the method of what moves in it."""
+    """One peer of a model in C, and the method of what moves in it."""
 
     topology: str
     code: ExportedPeer
@@ -44,14 +44,14 @@ def peer_code(system: Model, *, peer: str = "", device: str = "", method: str = 
     Parameters
     ----------
     system
-        The compiled scene.
+        The model.
     peer
-        Its name, such as "left[1]"; it may be left out where all peers are alike.
+        Its name, such as "left[1]"; optional if all peers are equal.
     device
-        The masses that move outside its computer, with commas between, or "none"; found in the equations if
-        not given.
+        The masses that move outside its computer, separated by commas, or "none"; by default determined from
+        the equations.
     method
-        How the states of the peer's computer move between ticks, as for `simulate`.
+        The integration method of the peer's computer between ticks, as for `simulate`.
 
     Raises
     ------
@@ -59,21 +59,23 @@ def peer_code(system: Model, *, peer: str = "", device: str = "", method: str = 
         E963 the peers differ, and no name; E970 no such peer; and as `peer_of`, `parse_method`.
     """
     how, plan = _plan(system, method)
-    if not peer and len(set(sites_of(plan))) > 1:
-        what = "--peer: the peers differ, and a text of C is of one"
+    if not peer and len(set(subsystems_of(plan))) > 1:
+        message = "--peer: the peers differ, and a text of C is of one"
         hint = f'--peer "{plan.exchange.peer_name(0)}"'
-        raise ApcError(Diagnostic("E963", SourceLocation(system.origin.topology), what, hint=hint))
+        raise ApcError(Diagnostic("E963", SourceLocation(system.origin.topology), message, hint=hint))
     result = peer_of(
         plan, number_of(plan.exchange, peer, "--peer") if peer else 0, how, device=device or None
     )
     return Code(system.name, result, str(how))
 
 
-def scene_unit(system: Model, *, peer: str = "", method: str = "") -> FmuContent:
-    """Make an FMU of a scene, or of one peer of it; parameters, and what is raised, as for `peer_code`."""
-    how, plan = _plan(pushed(system), method)
-    scene = one_peer(plan, number_of(plan.exchange, peer, "--peer"), how) if peer else c_scene(plan, how)
-    return unit_of(system, scene, peer=peer)
+def topology_unit(system: Model, *, peer: str = "", method: str = "") -> FmuContent:
+    """Write an FMU of a model, or of one peer of it; parameters and errors as for `peer_code`."""
+    how, plan = _plan(with_external_force(system), method)
+    topology = (
+        single_peer(plan, number_of(plan.exchange, peer, "--peer"), how) if peer else c_topology(plan, how)
+    )
+    return unit_of(system, topology, peer=peer)
 
 
 def _plan(system: Model, method: str) -> tuple[Method, SimulationPlan]:
@@ -88,11 +90,11 @@ _INCLUDED = re.compile(r"[^\x00-\x1f\"\\]+")
 
 
 def write_code(path: Path, code: Code) -> None:
-    """Write a peer's code, its header beside it, and a driver. Raises ApcError (E601) if it can't be."""
+    """Write a peer's code with its header and a driver. Raises ApcError (E601) on failure."""
     include = f"{path.stem}.h"
     if not _INCLUDED.fullmatch(include):
-        what = f"{include} can't be the name of a header in C"
-        raise ApcError(Diagnostic("E601", SourceLocation(str(path)), what, hint="--out peer.c"))
+        message = f"{include} can't be the name of a header in C"
+        raise ApcError(Diagnostic("E601", SourceLocation(str(path)), message, hint="--out peer.c"))
     write_texts(
         {
             path.with_suffix(".h"): header(code.code),

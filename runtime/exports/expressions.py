@@ -1,4 +1,4 @@
-"""A kind's functions as expressions of Modelica.
+"""A peer type's functions as expressions of Modelica.
 
 Takes: a `casadi.Function` of scalar operations, and what its inputs are called.
 Gives: `Text`, `number`, `identifier`, `unit_of_modelica`; `written`.
@@ -16,10 +16,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from apc.compiler.expression_data import straight, walk
 from apc.compiler.interpolation import Interpolation
-from apc.compiler.plain import straight, walk
 
-# How tightly a text binds, loosest first.
+# Operator precedence, loosest first.
 IF, OR, AND, NOT, RELATION, SUM, PRODUCT, POWER, ATOM = range(9)
 
 NONE = "^("  # a unit that Modelica has no words for
@@ -28,7 +28,7 @@ NONE = "^("  # a unit that Modelica has no words for
 LONGEST = 120
 
 # Of Modelica 3.6: the keywords (section 2.3.3), the predefined types (4.9), and the names of operators and
-# functions that need no import (3.7, 10.3, 16, 17). A name of a scene that is one of them is quoted.
+# functions that need no import (3.7, 10.3, 16, 17). A name of a model that is one of them is quoted.
 RESERVED = frozenset(
     re.findall(
         r"\w+",
@@ -101,7 +101,7 @@ def written(
     names: Sequence[Sequence[Text | Callable[[], Text]]],
     keep: Callable[[Text], Text],
 ) -> list[Text]:
-    """Return what a function gives, entry by entry, in the names of what it takes.
+    """Return the results of a function, entry by entry, in the names of its arguments.
 
     Parameters
     ----------
@@ -110,27 +110,27 @@ def written(
     names
         Of each input, those of its entries, or what gives the name of one that the function depends on.
     keep
-        Gives a name to an expression that is long.
+        Assigns a name to a long expression.
     """
     plain = straight(function)
-    taken = Counter(place for _, *places in plain.operations for place in places)
-    used = taken.keys() | set(plain.results[0])
+    occupied = Counter(index for _, *indices in plain.operations for index in indices)
+    used = occupied.keys() | set(plain.results[0])
     values = [
-        name if isinstance(name, Text) else name() if place in used else Text("0")
-        for place, name in enumerate(name for listed in names for name in listed)
+        name if isinstance(name, Text) else name() if index in used else Text("0")
+        for index, name in enumerate(name for listed in names for name in listed)
     ]
     values += [number(value) for value in plain.constants]
-    again = iter([taken[len(values) + len(plain.tables) + k] > 1 for k in range(len(plain.operations))])
+    repeated = iter([occupied[len(values) + len(plain.tables) + k] > 1 for k in range(len(plain.operations))])
 
     def rule(word: str) -> Callable[..., Text]:
         def operation(*operands: Any) -> Text:
             text = _SPECIAL[word](*operands) if word in _SPECIAL else _formed(word, *operands)
-            return keep(text) if next(again) and len(text.text) > LONGEST else text
+            return keep(text) if next(repeated) and len(text.text) > LONGEST else text
 
         return operation
 
     result = walk(plain, values, rule)
-    return [result[place] for place in plain.results[0]]
+    return [result[index] for index in plain.results[0]]
 
 
 def _real(operand: Text) -> Text:
@@ -165,9 +165,9 @@ def _branch(condition: Text, value: Text) -> Text:
 
 
 def _interpolated(table: Interpolation, at: Text) -> Text:
-    """Return a table's value as branches, each chosen by so many conditions as halve the rows to one.
+    """Return a table's value as branches: binary search by nested conditions.
 
-    A simulator stops at conditions on time, and so at each row that it reaches.
+    A simulator has an event at each condition on time, and so at each row.
     """
     ends, numbers, rates = table.times.tolist(), table.numbers.tolist(), table.rates.tolist()
     pieces = []

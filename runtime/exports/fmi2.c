@@ -38,7 +38,7 @@ typedef struct {
 typedef struct {
   model model;
   double begun, time; /* in s: of the experiment's start, and now */
-  int running; /* once the scene has begun, states can't be set */
+  int running; /* once the topology has begun, states can't be set */
   char name[256];
   const fmi2CallbackFunctions *functions;
 } Instance;
@@ -87,12 +87,12 @@ FMI void fmi2FreeInstance(fmi2Component c) { free(c); }
 
 FMI fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean tolerance_given, fmi2Real tolerance, fmi2Real start,
                                    fmi2Boolean stop_given, fmi2Real stop) {
-  Instance *own = c;
+  Instance *instance_of = c;
   (void)tolerance_given;
   (void)tolerance;
   (void)stop_given;
   (void)stop;
-  own->begun = own->time = start;
+  instance_of->begun = instance_of->time = start;
   return fmi2OK;
 }
 
@@ -102,9 +102,9 @@ FMI fmi2Status fmi2EnterInitializationMode(fmi2Component c) {
 }
 
 FMI fmi2Status fmi2ExitInitializationMode(fmi2Component c) {
-  Instance *own = c;
-  own->running = 1;
-  run(&own->model, 0);
+  Instance *instance_of = c;
+  instance_of->running = 1;
+  run(&instance_of->model, 0);
   return fmi2OK;
 }
 
@@ -114,39 +114,39 @@ FMI fmi2Status fmi2Terminate(fmi2Component c) {
 }
 
 FMI fmi2Status fmi2Reset(fmi2Component c) {
-  Instance *own = c;
-  begin(&own->model);
-  own->begun = own->time = 0;
-  own->running = 0;
+  Instance *instance_of = c;
+  begin(&instance_of->model);
+  instance_of->begun = instance_of->time = 0;
+  instance_of->running = 0;
   return fmi2OK;
 }
 
 FMI fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference which[], size_t count, fmi2Real values[]) {
-  Instance *own = c;
+  Instance *instance_of = c;
   for (size_t i = 0; i < count; i++) {
-    const double *value = real(&own->model, which[i]);
-    if (!value) return complain(own, "no number of this value reference");
+    const double *value = real(&instance_of->model, which[i]);
+    if (!value) return complain(instance_of, "no number of this value reference");
     values[i] = *value;
   }
   return fmi2OK;
 }
 
 FMI fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference which[], size_t count, const fmi2Real values[]) {
-  Instance *own = c;
+  Instance *instance_of = c;
   for (size_t i = 0; i < count; i++) {
-    const int settable = given(which[i]) || (!own->running && moving(which[i]));
-    double *value = settable ? real(&own->model, which[i]) : 0;
-    if (!value) return complain(own, "no number that can be set has this value reference");
+    const int settable = given(which[i]) || (!instance_of->running && moving(which[i]));
+    double *value = settable ? real(&instance_of->model, which[i]) : 0;
+    if (!value) return complain(instance_of, "no number that can be set has this value reference");
     *value = values[i];
   }
   return fmi2OK;
 }
 
 FMI fmi2Status fmi2GetBoolean(fmi2Component c, const fmi2ValueReference which[], size_t count, fmi2Boolean values[]) {
-  Instance *own = c;
+  Instance *instance_of = c;
   for (size_t i = 0; i < count; i++) {
-    const int *value = flag(&own->model, which[i]);
-    if (!value) return complain(own, "no flag of this value reference");
+    const int *value = flag(&instance_of->model, which[i]);
+    if (!value) return complain(instance_of, "no flag of this value reference");
     values[i] = *value;
   }
   return fmi2OK;
@@ -154,10 +154,10 @@ FMI fmi2Status fmi2GetBoolean(fmi2Component c, const fmi2ValueReference which[],
 
 FMI fmi2Status fmi2SetBoolean(fmi2Component c, const fmi2ValueReference which[], size_t count,
                               const fmi2Boolean values[]) {
-  Instance *own = c;
+  Instance *instance_of = c;
   for (size_t i = 0; i < count; i++) {
-    int *value = flag(&own->model, which[i]);
-    if (!value) return complain(own, "no flag of this value reference");
+    int *value = flag(&instance_of->model, which[i]);
+    if (!value) return complain(instance_of, "no flag of this value reference");
     *value = values[i] != 0;
   }
   return fmi2OK;
@@ -202,11 +202,11 @@ FMI fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *state) {
 }
 
 FMI fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate state) {
-  Instance *own = c;
+  Instance *instance_of = c;
   const Instance *other = state;
-  own->model = other->model;
-  own->begun = other->begun;
-  own->time = other->time;
+  instance_of->model = other->model;
+  instance_of->begun = other->begun;
+  instance_of->time = other->time;
   return fmi2OK;
 }
 
@@ -267,11 +267,11 @@ FMI fmi2Status fmi2GetRealOutputDerivatives(fmi2Component c, const fmi2ValueRefe
 }
 
 FMI fmi2Status fmi2DoStep(fmi2Component c, fmi2Real at, fmi2Real step, fmi2Boolean keep) {
-  Instance *own = c;
+  Instance *instance_of = c;
   (void)keep;
-  if (!(step >= 0)) return complain(own, "a step goes forward");
-  own->time = at + step;
-  run(&own->model, instant(own->time - own->begun));
+  if (!(step >= 0)) return complain(instance_of, "a step goes forward");
+  instance_of->time = at + step;
+  run(&instance_of->model, instant(instance_of->time - instance_of->begun));
   return fmi2OK;
 }
 
@@ -285,9 +285,9 @@ FMI fmi2Status fmi2GetStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Sta
 }
 
 FMI fmi2Status fmi2GetRealStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Real *value) {
-  const Instance *own = c;
+  const Instance *instance_of = c;
   if (kind != fmi2LastSuccessfulTime) return fmi2Discard;
-  *value = own->time;
+  *value = instance_of->time;
   return fmi2OK;
 }
 

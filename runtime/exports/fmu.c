@@ -1,12 +1,12 @@
-% include "scene.c"
+% include "topology.c"
 
 % for type, what, flag in [("double", "real", false), ("int", "flag", true)]
 static ${type} *${what}(model *m, unsigned which) {
   (void)m;
   switch (which) {
-% for one in scene.variables
-% if (one.role == "flag") == flag
-    case ${loop.index0}: return &m->${one.member};
+% for item in topology.variables
+% if (item.role == "flag") == flag
+    case ${loop.index0}: return &m->${item.member};
 % endif
 % endfor
     default: return 0;
@@ -20,11 +20,11 @@ static int given(unsigned which) {
   return ${"which < %du" % inputs if inputs else 0};
 }
 
-/* Whether it is a state or a parameter, which can be set until the scene begins. */
+/* Whether it is a state or a parameter, which can be set until the topology begins. */
 static int moving(unsigned which) {
   switch (which) {
-% for one in scene.variables
-% if one.role in ("state", "parameter")
+% for item in topology.variables
+% if item.role in ("state", "parameter")
     case ${loop.index0}: return 1;
 % endif
 % endfor
@@ -32,8 +32,8 @@ static int moving(unsigned which) {
   }
 }
 
-#define QUANTA ${scene.quantum.denominator | float}
-#define SECONDS ${scene.quantum.numerator | float}
+#define QUANTA ${topology.quantum.denominator | float}
+#define SECONDS ${topology.quantum.numerator | float}
 #define GUID "${guid}"
 
 % include "fmi2.c"

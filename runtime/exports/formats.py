@@ -1,4 +1,4 @@
-"""What a scene can be handed over as: the table of formats, and who makes each.
+"""The table of export formats, with their export functions.
 
 Takes: a `Model`, where it goes and what is asked of it.
 Gives: `Format`, `FORMATS`; `ExportRequest`; `format_of`, `export`.
@@ -7,7 +7,7 @@ format is refused; a maker is imported when it is asked for.
 Does not: make anything itself.
 
 A new format is a line of the table, its name, its suffix, what it is, the options it takes, and a case of
-`_makers`: a function that makes a result of a compiled scene and what is asked, and one that writes it.
+`_makers`: a function that makes a result of a model and what is asked, and one that writes it.
 """
 
 from __future__ import annotations
@@ -19,20 +19,22 @@ from typing import Any
 
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
-from apc.network.nominal import refuse_range
+from apc.network.nominal_criterion import refuse_range
 from apc.result import Result
 from apc.suffixes import check_suffix
 
 
 @dataclass(frozen=True, slots=True)
 class ExportRequest:
-    """What is asked of an export, each "" or () where it is not: where to `cut` the loop, `free` numbers.
+    """The options of an export, each "" or () by default.
 
-    `peer` is one alone, `device` what its computer doesn't move, `method` how it moves the others.
+    `open_at` is the link or coupler where the loop is cut, `symbolic` are the parameters that stay symbolic.
+    `peer` is the only exported peer, `device` its external device, `method` the integration of its other
+    parts.
     """
 
-    cut: str = ""
-    free: tuple[str, ...] = ()
+    open_at: str = ""
+    symbolic: tuple[str, ...] = ()
     peer: str = ""
     device: str = ""
     method: str = ""
@@ -40,26 +42,26 @@ class ExportRequest:
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """A format: its name, its suffix, what it is, and which fields of `ExportRequest` apply to it."""
+    """A format: its name, its suffix, its description, and the applicable fields of `ExportRequest`."""
 
     name: str
     suffix: str
-    about: str
+    description: str
     takes: tuple[str, ...]
 
 
 FORMATS = (
-    Format("control", ".py", "a script that makes a control.StateSpace", ("cut",)),
-    Format("mat", ".mat", "a state space for MATLAB and SciPy", ("cut", "free")),
-    Format("npz", ".npz", "a state space for NumPy", ("cut", "free")),
+    Format("control", ".py", "a script that makes a control.StateSpace", ("open_at",)),
+    Format("mat", ".mat", "a state space for MATLAB and SciPy", ("open_at", "symbolic")),
+    Format("npz", ".npz", "a state space for NumPy", ("open_at", "symbolic")),
     Format("modelica", ".mo", "a flat model of Modelica 3.3 with clocks", ()),
     Format("c", ".c", "one tick of a peer in C99, a header and a driver", ("peer", "device", "method")),
-    Format("fmu", ".fmu", "a scene or a peer for co-simulation", ("peer", "method")),
+    Format("fmu", ".fmu", "a topology or a peer for co-simulation", ("peer", "method")),
 )
 
 
 def _makers(name: str) -> tuple[Callable[..., Result], Callable[[Path, Any], None]]:
-    """Return what makes a format of a compiled scene and what is asked of it, and what writes it."""
+    """Return the export function of a format for a model and its options, and the function that writes it."""
     match name:
         case "modelica":
             from apc.exports.modelica import modelica, write_modelica
@@ -70,32 +72,32 @@ def _makers(name: str) -> tuple[Callable[..., Result], Callable[[Path, Any], Non
 
             return peer_code, write_code
         case "fmu":
-            from apc.exports.code import scene_unit
+            from apc.exports.code import topology_unit
             from apc.exports.fmu import write_fmu
 
-            return scene_unit, write_fmu
-    from apc.exports.free import state_space_of
+            return topology_unit, write_fmu
     from apc.exports.state_space_files import write_mat, write_npz, write_script
+    from apc.exports.symbolic_parameters import state_space_of
 
     return state_space_of, {"control": write_script, "mat": write_mat, "npz": write_npz}[name]
 
 
 def format_of(to: str | None, out: Path | None, *, option: str = "--") -> Format:
-    """Return the format that a name or a suffix says.
+    """Return the format given by a name or a suffix.
 
     Parameters
     ----------
     to
-        The name, None if the suffix says it.
+        The name, None to use the suffix.
     out
         The file, None if nothing is written.
     option
-        How options are written: "--" before or "=" behind.
+        The notation of options: "--" before or "=" behind.
 
     Raises
     ------
     ApcError
-        E952 no such format; E878 a suffix that is none, or another one's.
+        E952 no such format; E878 an unknown suffix, or that of another format.
     """
     names = [item.name for item in FORMATS]
     written = "--out" if option == "--" else "out="
@@ -111,43 +113,46 @@ def format_of(to: str | None, out: Path | None, *, option: str = "--") -> Format
     result = next((item for item in FORMATS if item.name == to), None)
     if result is None:
         near = nearest(to, names) or names[0]
-        place = SourceLocation("--to" if option == "--" else "to")
+        location = SourceLocation("--to" if option == "--" else "to")
         raise ApcError(
-            Diagnostic("E952", place, "a format", f"one of {', '.join(names)}", to[:40], f"{place} {near}")
+            Diagnostic(
+                "E952", location, "a format", f"one of {', '.join(names)}", to[:40], f"{location} {near}"
+            )
         )
     if out is not None:
         check_suffix(out, [result.suffix], written)
     return result
 
 
-def export(system: Model, chosen: Format, asked: ExportRequest, out: Path | None = None) -> Result:
-    """Make what a format says of a scene, and write it.
+def export(system: Model, chosen: Format, request: ExportRequest, out: Path | None = None) -> Result:
+    """Create the export of a model in a format, and write it.
 
     Parameters
     ----------
     system
-        The compiled scene.
-    chosen, asked
-        The format, from `format_of`, and what is asked of it.
+        The model.
+    chosen, request
+        The format, from `format_of`, and the export options.
     out
         The file; None writes nothing.
 
     Raises
     ------
     ApcError
-        E953 an option that means nothing to the format; E899 a delay that is a range; E601 the file can't
-        be written; and the maker's.
+        E953 an option that the format does not have; E899 a delay that is a range; E601 the file can't be
+        written; and those of the export function.
     """
     for name in ExportRequest.__slots__:
-        if getattr(asked, name) and name not in chosen.takes:
+        if getattr(request, name) and name not in chosen.takes:
             able = ", ".join(item.name for item in FORMATS if name in item.takes)
-            what = f"--{name} means nothing to the format {chosen.name}"
+            option = f"--{name.replace('_', '-')}"
+            message = f"{option} means nothing to the format {chosen.name}"
             raise ApcError(
-                Diagnostic("E953", SourceLocation(f"--{name}"), what, hint=f"--to {able}" if able else "")
+                Diagnostic("E953", SourceLocation(option), message, hint=f"--to {able}" if able else "")
             )
     refuse_range(system)
     make, write = _makers(chosen.name)
-    parameter = make(system, **{name: getattr(asked, name) for name in chosen.takes})
+    parameter = make(system, **{name: getattr(request, name) for name in chosen.takes})
     if out is not None:
         write(out, parameter)
     return parameter

@@ -1,9 +1,9 @@
-"""Names out of a scene as other tools want them.
+"""Identifiers for other tools from the names of a model.
 
 Takes: names such as `left[2].cube.x`. Gives: `ExportedSignal`, `words`; `identifier`; `prefixed`; `unique`.
 Guarantees: an identifier is made of letters, digits and `_`, begins with a letter, and is no reserved word of
 C; of several no two are equal. A prefixed identifier is no word or macro of C or C++ either.
-Does not: say which tool wants that.
+Does not: select the tool.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ def prefixed(prefix: str, names: Iterable[str]) -> tuple[str, ...]:
     )
 
 
-def unique(names: Iterable[str], taken: Iterable[str] = ()) -> tuple[str, ...]:
+def unique(names: Iterable[str], occupied: Iterable[str] = ()) -> tuple[str, ...]:
     """Return names of which none is equal to another or taken: a repeated one gets a number behind."""
-    used, texts, counts = set(taken), list[str](), dict[str, int]()
+    used, texts, counts = set(occupied), list[str](), dict[str, int]()
     for base in names:
         name, count = base, counts.get(base, 1)
         while name in used:

@@ -1,9 +1,9 @@
-"""A scene as one flat model of Modelica 3.3, its clocks as clocked partitions (chapter 16).
+"""A model as one flat model of Modelica 3.3, its clocks as clocked partitions (chapter 16).
 
-Takes: a `Model`. Gives: `ModelicaModel`, `modelica`.
-Guarantees: the equations are those that `apc simulate` plays, not their slopes; a packet is heard, and a
-force acts, at the tick and the instant that the scene says; times are rationals. What Modelica has no words
-for is refused by name.
+Takes: a `Model`. Gives: `modelica`, a `ModelicaModel`; `write_modelica`.
+Guarantees: the equations are those that `apc simulate` integrates, not linearized. Packets are received, and
+forces take effect, at the scheduled tick and instant; times are rationals. Constructs without a Modelica
+equivalent are refused by name.
 Does not: write files, or run the model.
 
     sampled    sample(x, clock)                   the value just before the tick, as here
@@ -39,19 +39,19 @@ from apc.exports.expressions import (
     written,
 )
 from apc.exports.identifiers import identifier as word
-from apc.exports.peer_step import computing, heard_of
+from apc.exports.peer_step import computing, received_by
 from apc.exports.texts import filled, quoted
-from apc.frame.ages import stamped
-from apc.frame.exchange import CommunicationGraph, build_exchange, check_mean
-from apc.frame.finite_equations import finite_equations
+from apc.frame.communication_graph import CommunicationGraph, build_exchange, check_mean
+from apc.frame.data_age import stamped
+from apc.frame.evaluation_errors import finite_equations
 from apc.frame.jacobians import jacobians
 from apc.frame.linearize import start_sends
 from apc.frame.parameters import resolve
-from apc.network.nominal import chance, unreliable
+from apc.network.nominal_criterion import chance, unreliable
 from apc.result import Result
 from apc.simulation.trajectory import texts_of
 
-# Terms of all that is heard, and variables, that a file is written for: a tool flattens each of them.
+# The largest number of received terms and variables in a file; Modelica tools flatten each of them.
 MOST_TERMS = 20_000
 
 # Of a counter of a clock: Modelica's Integer has 32 bits in most tools.
@@ -63,7 +63,7 @@ TIME, ZERO = Text("time", unit="s"), number(0.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelicaModel(Result):
-    """A scene as text of Modelica: the model's `name`, its `text`, and what it has.
+    """A model as Modelica text: its `name`, its `text`, and its contents.
 
     `clocks` are the lines that declare them.
     """
@@ -84,17 +84,17 @@ def write_modelica(path: Path, modelica_model: ModelicaModel) -> None:
 
 
 def modelica(system: Model) -> ModelicaModel:
-    """Write a scene as a Modelica model.
+    """Write a model in Modelica.
 
     Parameters
     ----------
     system
-        The compiled scene.
+        The model.
 
     Raises
     ------
     ApcError
-        E955 what the scene says and Modelica has no words for; E801, E802 a mean that can't be.
+        E955 a construct without a Modelica equivalent; E801, E802 an undefined mean.
     """
     with finite_equations(system.name):
         return _ModelicaWriter(stamped(system)).model()
@@ -110,11 +110,11 @@ class _ModelicaWriter:
         timing = self.numbers.timings
         self.grids = {clock.name: (timing[clock.period], timing[clock.phase]) for clock in system.clocks}
         self.clock_of = {link.name: link.clock for link in system.links}
-        self.taken: set[str] = set()
+        self.used: set[str] = set()
         self.parameters: dict[str, tuple[Text, str]] = {}
         self.declared: list[str] = []
         self.equations: list[str] = []
-        _refuse_what_has_no_words(system, self.exchange)
+        _refuse_unsupported(system, self.exchange)
         self.clocks, self.clock_lines = self._clocks()
         self.named: dict[Any, Text] = {}  # variables that are written once for all who need them
         self.sent: dict[tuple[int, str], list[tuple[Text, str]]] = {}  # and its channel
@@ -128,19 +128,19 @@ class _ModelicaWriter:
             peer.declare()
         for peer in peers:
             self.comment(f"{peer.name}: what moves")
-            rates = written(peer.kind.derivative, [peer.x, peer.u, peer.p, [TIME]], peer.keep)
+            rates = written(peer.peer_type.derivative, [peer.x, peer.u, peer.p, [TIME]], peer.keep)
             for state, rate in zip(peer.x, rates, strict=True):
                 self.define(f"der({state.text})", rate.text)
         for peer in peers:
             peer.sends()
         for peer in peers:
-            for partition in peer.kind.clocks:
+            for partition in peer.peer_type.clocks:
                 peer.tick(partition)
         text = filled(
             "modelica.jinja",
             name=name,
             system=system,
-            title=system.about or system.name,
+            title=system.description or system.name,
             version=program_version(),
             texts=texts_of(system),
             parameters=[line for _, line in self.parameters.values()],
@@ -149,7 +149,8 @@ class _ModelicaWriter:
             equations=self.equations,
             duration=float(system.experiment.duration or SECOND),
             step=float(min((period for period, _ in self.grids.values()), default=SECOND / 1000)),
-            about=f"The equations that apc compiled of {system.name}: all peers, every tick and packet.",
+            description=f"The equations that apc compiled of {system.name}: "
+            "all peers, every tick and packet.",
         )
         return ModelicaModel(
             topology=system.name,
@@ -160,14 +161,16 @@ class _ModelicaWriter:
             clocks=tuple(line.strip() for line in self.clock_lines),
         )
 
-    def name(self, wanted: str) -> str:
+    def name(self, requested: str) -> str:
         """Return a name that nothing else has, of letters that Modelica takes in quotes."""
-        wanted = name = "".join(text if text.isascii() and text.isprintable() else "_" for text in wanted)
+        requested = name = "".join(
+            text if text.isascii() and text.isprintable() else "_" for text in requested
+        )
         count = 1
-        while name in self.taken:
+        while name in self.used:
             count += 1
-            name = f"{wanted} ({count})"
-        self.taken.add(name)
+            name = f"{requested} ({count})"
+        self.used.add(name)
         return identifier(name)
 
     def declare(
@@ -206,12 +209,12 @@ class _ModelicaWriter:
     def comment(self, text: str) -> None:
         self.equations += ["", f"  // {text}"]
 
-    def parameter(self, label: str, value: float, unit: str, about: str) -> Text:
+    def parameter(self, label: str, value: float, unit: str, description: str) -> Text:
         """Return a parameter, which is declared once for all who share it."""
         if label not in self.parameters:
             name, modelica_unit = self.name(label), unit_of_modelica(unit)
             modifier = f'(unit="{modelica_unit}")' if modelica_unit else ""
-            comment = f" {quoted(about)}" if about else ""
+            comment = f" {quoted(description)}" if description else ""
             line = f"  parameter Real {name}{modifier} = {number(value).text}{comment};"
             self.parameters[label] = Text(name), line
         return self.parameters[label][0]
@@ -224,8 +227,8 @@ class _ModelicaWriter:
             self.named[key] = self.let(f"{bare} at {clock}", value, variable.unit)
         return self.named[key]
 
-    def late(self, value: Text, label: str, clock: str, delay: Fraction) -> Text:
-        """Return a clocked value so much later: whole ticks by previous, what is left by shiftSample."""
+    def delayed(self, value: Text, label: str, clock: str, delay: Fraction) -> Text:
+        """Return a delayed clocked value: whole ticks by previous, the rest by shiftSample."""
         ticks, rest = divmod(delay / self.grids[clock][0], 1)
         for count in range(int(ticks)):
             ago = f"{label} {count + 1} tick{'s' if count else ''} ago"
@@ -236,8 +239,8 @@ class _ModelicaWriter:
             value = self.like(value, f"{label} late", shifted)
         return value
 
-    def heard(self, sender: int, link: str, channel: int, timing: str, clock: str) -> Text:
-        """Return what a peer sent, so much later, as a clock of another sees it."""
+    def received(self, sender: int, link: str, channel: int, timing: str, clock: str) -> Text:
+        """Return a delayed sent value, as sampled by another clock."""
         key = (sender, link, channel, timing, self.clocks[clock])
         if key not in self.named:
             self.named[key] = self._crossing(sender, link, channel, self.numbers.timings[timing], clock)
@@ -251,31 +254,33 @@ class _ModelicaWriter:
         after = f"{label} after {float(delay) * 1e3:.6g} ms"
         (slow, first), (fast, second) = self.grids[sends_at], self.grids[clock]
         if first == second and delay % slow == 0:
-            value, ratio = self.late(value, f"{label} sent", sends_at, delay), slow / fast
+            value, ratio = self.delayed(value, f"{label} sent", sends_at, delay), slow / fast
             for operator, factor in (("superSample", ratio.numerator), ("subSample", ratio.denominator)):
                 if factor > 1:
                     self._check(factor)
                     last = operator == "subSample" or ratio.denominator == 1
-                    seen = f"{after} {'at' if last else 'for'} {clock}"
-                    value = self.like(value, seen, f"{operator}({value.text}, {factor})")
+                    observed = f"{after} {'at' if last else 'for'} {clock}"
+                    value = self.like(value, observed, f"{operator}({value.text}, {factor})")
             return value
         if not delay and (second - first) % _grid([slow, fast]) == 0:
-            what = f"{link} without delay to {clock}: their ticks meet, and begin at different times"
-            raise _refused(self.system, what, f'--set {link}.delay="…", or clocks of one phase')
+            message = f"{link} without delay to {clock}: their ticks meet, and begin at different times"
+            raise _refused(self.system, message, f'--set {link}.delay="…", or clocks of one phase')
         early = delay - _grid([slow, fast, first, second, delay]) / 2 if delay else delay
-        value = self.late(value, f"{label} sent for {clock}", sends_at, early)
+        value = self.delayed(value, f"{label} sent for {clock}", sends_at, early)
         acting = self.like(value, f"{after} for {clock}", f"hold({value.text})")
         return self.like(acting, f"{after} at {clock}", f"sample({acting.text}, {self.clocks[clock]})")
 
     def _check(self, *counters: int) -> None:
         if max(counters) > LARGEST_COUNTER:
-            what = f"a clock that counts to {max(counters):,}, more than an Integer of Modelica holds,"
-            raise _refused(self.system, what, "times that are simple multiples of one another")
+            message = f"a clock that counts to {max(counters):,}, more than an Integer of Modelica holds,"
+            raise _refused(self.system, message, "times that are simple multiples of one another")
 
     def _clocks(self) -> tuple[dict[str, str], list[str]]:
-        """Return what each clock is called, and the lines that declare them, the fastest first."""
-        used = {part.clock for kind in self.system.kinds for part in kind.clocks}
-        used |= {self.clock_of[sending.link] for kind in self.system.kinds for sending in kind.sends}
+        """Return the name of each clock, and the lines that declare them, the fastest first."""
+        used = {part.clock for peer_type in self.system.peer_types for part in peer_type.clocks}
+        used |= {
+            self.clock_of[sending.link] for peer_type in self.system.peer_types for sending in peer_type.sends
+        }
         made: dict[tuple[Fraction, Fraction], str] = {}
         names: dict[str, str] = {}
         lines: list[str] = []
@@ -307,46 +312,46 @@ class _ModelicaWriter:
             part, base = phase / period, self.name(f"{clock} from 0")
             lines.append(f"  Clock {base} = {value};")
             derived = f"shiftSample({base}, {part.numerator}, {part.denominator})"
-        about = quoted(f"every {float(period) * 1e3:.6g} ms, from {float(phase) * 1e3:.6g} ms")
-        lines.append(f"  Clock {name} = {derived or value} {about};")
+        description = quoted(f"every {float(period) * 1e3:.6g} ms, from {float(phase) * 1e3:.6g} ms")
+        lines.append(f"  Clock {name} = {derived or value} {description};")
         return name
 
 
 class _Peer:
-    """What one peer has in a model: its parameters `p`, states `x` and what its holds put out, `u`."""
+    """The variables of one peer: its parameters `p`, states `x` and hold outputs `u`."""
 
     def __init__(self, writer: _ModelicaWriter, number: int, group: int) -> None:
         self.writer, self.number, self.group = writer, number, writer.system.groups[group]
         system, numbers, exchange = writer.system, writer.numbers, writer.exchange
-        self.kind, self.name = system.kinds[self.group.kind], exchange.peer_name(number)
-        self.role = exchange.role(group)
+        self.peer_type, self.name = system.peer_types[self.group.peer_type], exchange.peer_name(number)
+        self.role = exchange.delay_class(group)
         rows = numbers.parameters[group]
         self.vector = rows[numbers.rows[group][number - int(exchange.starts[group])]].tolist()
         described = {parameter.name: parameter for parameter in system.parameters}
-        begins = {state.start for state in self.kind.states}
+        begins = {state.start for state in self.peer_type.states}
         self.p: list[Text] = []
-        for place, (name, value) in enumerate(zip(self.kind.parameters, self.vector, strict=True)):
+        for index, (name, value) in enumerate(zip(self.peer_type.parameters, self.vector, strict=True)):
             declared, label = described.get(name), name
-            if (rows[:, place] != value).any():
+            if (rows[:, index] != value).any():
                 label = f"{self.name}.{name}"
             elif declared is None or declared.value != value:
                 label = f"{self.group.name}.{name}"
             label += " at the start" if name in begins else ""
-            unit, about = (declared.unit, declared.about) if declared else ("1", "")
-            self.p.append(writer.parameter(label, value, unit, about))
-        self.place = {name: self.p[place] for place, name in enumerate(self.kind.parameters)}
-        self.units = {clock.clock: clock.units for clock in self.kind.clocks}
+            unit, description = (declared.unit, declared.description) if declared else ("1", "")
+            self.p.append(writer.parameter(label, value, unit, description))
+        self.location = {name: self.p[index] for index, name in enumerate(self.peer_type.parameters)}
+        self.units = {clock.clock: clock.units for clock in self.peer_type.clocks}
 
     def declare(self) -> None:
         """Declare what moves, and what acts on it."""
-        declare, kind = self.writer.declare, self.kind
+        declare, peer_type = self.writer.declare, self.peer_type
         self.x = [
-            declare(f"{self.name}.{state.name}", state.unit, self.place[state.start], fixed=True)
-            for state in kind.states
+            declare(f"{self.name}.{state.name}", state.unit, self.location[state.start], fixed=True)
+            for state in peer_type.states
         ]
         self.u = [
             declare(f"{self.name}.{hold.name} acting", self.units[hold.clock][hold.output])
-            for hold in kind.holds
+            for hold in peer_type.holds
         ]
 
     def keep(self, long: Text) -> Text:
@@ -364,9 +369,9 @@ class _Peer:
         ]
 
     def sends(self) -> None:
-        """Write what it sends."""
-        begin = start_sends(jacobians(self.kind), self.vector, float) if self.kind.sends else {}
-        for sending in self.kind.sends:
+        """Write the sends."""
+        begin = start_sends(jacobians(self.peer_type), self.vector, float) if self.peer_type.sends else {}
+        for sending in self.peer_type.sends:
             self.writer.comment(f"{self.name}: what it sends over {sending.link}")
             x, u, t = self._sampled(self.writer.clock_of[sending.link])
             values = written(sending.send, [x, u, self.p, t], self.keep)
@@ -377,9 +382,9 @@ class _Peer:
             self.writer.sent[self.number, sending.link] = [*zip(variables, sending.channels, strict=True)]
 
     def tick(self, partition: ClockPartition) -> None:
-        """Write what it computes at a clock's ticks, and how it acts."""
+        """Write the computation at a clock's ticks, and its holds."""
         writer, name, outputs, units = self.writer, self.name, partition.outputs, partition.units
-        starts = dict(zip(partition.memories, map(self.place.__getitem__, partition.starts), strict=True))
+        starts = dict(zip(partition.memories, map(self.location.__getitem__, partition.starts), strict=True))
         writer.comment(f"{name}: what it computes at {partition.clock}")
         x, u, t = self._sampled(partition.clock)
         y = [
@@ -394,31 +399,31 @@ class _Peer:
         values = written(partition.tick, [x, u, m, r, self.p, t], self.keep)
         for variable, value in zip(y, values, strict=True):
             writer.define(variable.text, value.text)
-        for acting, hold in zip(self.u, self.kind.holds, strict=True):
+        for acting, hold in zip(self.u, self.peer_type.holds, strict=True):
             if hold.clock == partition.clock:
                 value, label = y[hold.output], f"{name}.{hold.name}"
-                if hold.output in starts:  # what was never computed acts as zero, whatever it starts from
+                if hold.output in starts:  # values not yet computed are zero, for any start value
                     value = writer.let(f"{label} to act", value.text, value.unit, ZERO)
                 delay = writer.numbers.timings[hold.delay]
-                value = writer.late(value, label, partition.clock, delay)
+                value = writer.delayed(value, label, partition.clock, delay)
                 writer.define(acting.text, f"hold({value.text})")
 
     def _received(self, receive: Receive, clock: str, inside: Sequence[Any], t: Sequence[Any]) -> Text:
-        """Write what it makes of what it hears."""
+        """Write the equations of the received values."""
         writer, link, exchange = self.writer, receive.link, self.writer.exchange
         terms, weights, unit = [], [], NONE
-        for sender, inexact in heard_of(writer.system, exchange, link, self.number):
-            weight, role = exact_weight(inexact), exchange.role(exchange.group_of(sender))
+        for sender, inexact in received_by(writer.system, exchange, link, self.number):
+            weight, role = exact_weight(inexact), exchange.delay_class(exchange.group_of(sender))
             timing = exchange.delay(link, role, self.role)
-            heard = [
-                functools.partial(writer.heard, sender, link, channel, timing, clock)
+            received = [
+                functools.partial(writer.received, sender, link, channel, timing, clock)
                 for channel in range(len(writer.sent[sender, link]))
             ]
             if receive.edge is None:
-                terms.append(heard[receive.channel]())
+                terms.append(received[receive.channel]())
                 unit = terms[-1].unit
             else:
-                terms.append(written(receive.edge, [*inside, heard, self.p, t], self.keep)[0])
+                terms.append(written(receive.edge, [*inside, received, self.p, t], self.keep)[0])
             weights.append(weight)
         total = sum(weights, Fraction(0))
         if receive.operator in ("mean", "max", "min"):
@@ -439,15 +444,17 @@ class _Peer:
         return writer.let(f"{self.name}.{receive.name}", value or "0", unit)
 
 
-def _refuse_what_has_no_words(system: Model, exchange: CommunicationGraph) -> None:
-    """Refuse what the equations of a model can't say: ApcError E955."""
+def _refuse_unsupported(system: Model, exchange: CommunicationGraph) -> None:
+    """Refuse constructs that Modelica equations cannot express: ApcError E955."""
     for link, law in unreliable(system):
-        what = f"{chance(link, law)}: luck that is drawn packet by packet"
-        raise _refused(system, what, "a link without it, or apc simulate")
-    for kind in system.kinds:
-        for function, _, what, _ in [(kind.derivative, "", "what moves", ""), *computing(kind)]:
+        message = f"{chance(link, law)}: luck that is drawn packet by packet"
+        raise _refused(system, message, "a link without it, or apc simulate")
+    for peer_type in system.peer_types:
+        for function, _, message, _ in [(peer_type.derivative, "", "what moves", ""), *computing(peer_type)]:
             if not function.is_a("SXFunction"):
-                solved = f"the nonlinear loop of {kind.name} that Newton's method solves for {what[:120]}"
+                solved = (
+                    f"the nonlinear loop of {peer_type.name} that Newton's method solves for {message[:120]}"
+                )
                 raise _refused(system, solved, "a coupler without a loop")
     peers = exchange.peers
     terms = sum(
@@ -455,13 +462,13 @@ def _refuse_what_has_no_words(system: Model, exchange: CommunicationGraph) -> No
         for link in exchange.links
     )
     if max(terms, peers) > MOST_TERMS:
-        what = f"{peers:,} peers, who hear {terms:,} times of one another, one by one"
-        raise _refused(system, what, f"fewer peers: --set {system.groups[0].name}.count=10")
+        message = f"{peers:,} peers, who hear {terms:,} times of one another, one by one"
+        raise _refused(system, message, f"fewer peers: --set {system.groups[0].name}.count=10")
 
 
-def _refused(system: Model, what: str, hint: str) -> ApcError:
+def _refused(system: Model, subject: str, hint: str) -> ApcError:
     return ApcError(
-        Diagnostic("E955", SourceLocation(system.origin.topology), f"not in Modelica: {what}", hint=hint)
+        Diagnostic("E955", SourceLocation(system.origin.topology), f"not in Modelica: {subject}", hint=hint)
     )
 
 

@@ -7,13 +7,13 @@
 #pragma STDC FP_CONTRACT OFF
 #endif
 
-% for own, label, value in constants
-#define ${own} ${value | number} /* ${label | comment} [${units[label] | comment}] */
+% for local, label, value in constants
+#define ${local} ${value | number} /* ${label | comment} [${units[label] | comment}] */
 % endfor
 
 /* Which kind of instant the next one is, and how long it is until the one after, in quanta. */
 static int ${name}_kind(const ${name} *peer) {
-  static const short kinds[${peer.instants | length}] = {${kind_of | row}};
+  static const short kinds[${peer.instants | length}] = {${peer_type_of | row}};
   return kinds[peer->instant];
 }
 
@@ -22,7 +22,7 @@ static double ${name}_now(const ${name} *peer) {
 }
 
 % for line in peer.sending
-% set send = peer.kind.sends[line.sending]
+% set send = peer.peer_type.sends[line.sending]
 % set lines, values = computed(send.send)
 static void ${name}_own_${line.name}(const ${name} *peer, const ${name}_in *in, ${name}_${line.name} *packet) {
   const double t = ${name}_now(peer);
@@ -41,8 +41,8 @@ static void ${name}_own_${line.name}(const ${name} *peer, const ${name}_in *in, 
 
 % endfor
 % for p in ticking
-% set partition = peer.kind.clocks[p]
-% set own_of, receives = heard(p)
+% set partition = peer.peer_type.clocks[p]
+% set own_of, receives = received(p)
 /* A tick of ${partition.clock | comment}. */
 static void ${name}_tick_${p}(${name} *peer, const ${name}_in *in, double t) {
   (void)in;
@@ -51,30 +51,30 @@ static void ${name}_tick_${p}(${name} *peer, const ${name}_in *in, double t) {
   ${name}_${line.name} own_${line.name};
   ${name}_own_${line.name}(peer, in, &own_${line.name});
 % endfor
-% for one in receives
+% for item in receives
 % set r = "r" ~ loop.index0
-% if not one.line
+% if not item.line
   const double ${r} = 0.0;
   (void)${r};
 % else
-% if one.extreme
+% if item.extreme
   double ${r} = NAN;
 % else
-  static const double weights_${loop.index0}[${one.weights | length}] = {${one.weights | row}};
+  static const double weights_${loop.index0}[${item.weights | length}] = {${item.weights | row}};
   double ${r} = 0.0;
 % endif
-  for (int k = 0; k < ${one.weights | length}; k++) {
-% for text in one.lines
+  for (int k = 0; k < ${item.weights | length}; k++) {
+% for text in item.lines
     ${text}
 % endfor
-% if one.extreme
-    ${r} = f${one.extreme}(${r}, ${one.value});
+% if item.extreme
+    ${r} = f${item.extreme}(${r}, ${item.value});
 % else
-    ${r} += weights_${loop.index0}[k] * ${one.value};
+    ${r} += weights_${loop.index0}[k] * ${item.value};
 % endif
   }
-% if one.divided
-  ${r} /= ${one.weights | length | float};
+% if item.divided
+  ${r} /= ${item.weights | length | float};
 % endif
 % endif
 % endfor
@@ -85,9 +85,9 @@ static void ${name}_tick_${p}(${name} *peer, const ${name}_in *in, double t) {
 % for value in values
   peer->${member(p, loop.index0)} = ${value};
 % endfor
-% for hold in peer.kind.holds if hold.clock == partition.clock
-% set late = "peer->late[" ~ peer.kind.holds.index(hold) ~ "]"
-  for (int k = ${kept - 1}; k > 0; k--) ${late}[k] = ${late}[k - 1];
+% for hold in peer.peer_type.holds if hold.clock == partition.clock
+% set late = "peer->late[" ~ peer.peer_type.holds.index(hold) ~ "]"
+  for (int k = ${stored - 1}; k > 0; k--) ${late}[k] = ${late}[k - 1];
   ${late}[0] = peer->${member(p, hold.output)};
 % endfor
 }
@@ -113,7 +113,7 @@ void ${name}_start(${name} *peer) {
   *peer = begin;
 }
 
-void ${name}_unheard(${name}_in *in) {
+void ${name}_clear(${name}_in *in) {
   (void)in;
 % for line in peer.lines
 % for sender in line.senders
@@ -142,9 +142,9 @@ void ${name}_send(const ${name} *peer, const ${name}_in *in, ${name}_out *out) {
   out->sent_${line.name} = 0;
 % endfor
   switch (${name}_kind(peer)) {
-% for one in kinds
+% for item in peer_types
   case ${loop.index0}:
-% for partition in one.sends
+% for partition in item.sends
     ${name}_own_${over[partition]}(peer, in, &out->${over[partition]});
     out->sent_${over[partition]} = 1;
 % endfor
@@ -159,28 +159,28 @@ void ${name}_force(${name} *peer, const ${name}_in *in, ${name}_out *out) {
   (void)out;
   (void)t;
   switch (${name}_kind(peer)) {
-% for one in kinds
+% for item in peer_types
   case ${loop.index0}:
-% for p in one.ticks
+% for p in item.ticks
     ${name}_tick_${p}(peer, in, t);
 % endfor
-% for act in one.acts
+% for act in item.acts
     peer->u[${act.hold}] = peer->late[${act.hold}][${act.lag}];
 % endfor
     break;
 % endfor
   }
-% for own, value in forces
-  out->${own} = ${value};
+% for local, value in forces
+  out->${local} = ${value};
 % endfor
 }
 
 void ${name}_move(${name} *peer) {
   const long long next = ${name}_next(peer);
   switch (${name}_kind(peer)) {
-% for one in kinds
+% for item in peer_types
   case ${loop.index0}:
-    ${name}_move_${one.move}(peer);
+    ${name}_move_${item.move}(peer);
     break;
 % endfor
   }

@@ -23,8 +23,8 @@ int missing | 1: it is late, and what this peer would send stands in for it
 /* What a peer measures and hears. All numbers are in SI units. */
 typedef struct {
 % filter members
-% for place, own in peer.measured.items()
-double ${own} | ${states[place].name} [${states[place].unit}]
+% for place, local in peer.measured.items()
+double ${local} | ${states[place].name} [${states[place].unit}]
 % endfor
 % for line in peer.lines if line.senders
 ${name}_${line.name} ${line.name}[${line.senders | length}] | the newest packets of ${line.senders[:8] | join(", ", "name")}${", ..." if line.senders | length > 8 else ""}
@@ -35,8 +35,8 @@ ${name}_${line.name} ${line.name}[${line.senders | length}] | the newest packets
 /* What it puts out: forces on what moves outside, and what it sends. */
 typedef struct {
 % filter members
-% for own, force in peer.forces.items()
-double ${own} | the force on ${force.name.rpartition(".")[0]} [N]
+% for local, force in peer.forces.items()
+double ${local} | the force on ${force.name.rpartition(".")[0]} [N]
 % endfor
 % for line in peer.sending
 ${name}_${line.name} ${line.name} | what it sends
@@ -53,7 +53,7 @@ typedef struct {
 double x[${states | length or 1}] | ${inside | join(", ")}
 double y[${computed | length or 1}] | ${computed | join(", ")}
 double u[${holds | length or 1}] | what acts of ${holds | join(", ", "name")}
-double late[${holds | length or 1}][${kept}] | what was computed of these, the newest first
+double late[${holds | length or 1}][${stored}] | what was computed of these, the newest first
 double p[${peer.settable | length or 1}] | parameters that ticks read: ${settings | join(", ")}
 % endfilter
 } ${name};
@@ -62,7 +62,7 @@ double p[${peer.settable | length or 1}] | parameters that ticks read: ${setting
 void ${name}_start(${name} *peer);
 
 /* Hear of everybody what stands for packets that have not arrived yet: where they start. */
-void ${name}_unheard(${name}_in *in);
+void ${name}_clear(${name}_in *in);
 
 /* The time of its next instant, in s. */
 double ${name}_time(const ${name} *peer);

@@ -1,16 +1,16 @@
-"""One peer apart from the others: what it measures and hears, computes, sends, and moves by itself.
+"""One peer separately: its inputs, computations, packets and continuous dynamics.
 
-Takes: a `Model`, which of its peers, how its states move between events.
-Gives: `ExportedPeer`, `peer_of`, `sites_of`, `lines_of`, `first_packet`, `heard_of`, `has_edge`, `computing`,
-`refused`; its parts `Instant`, `ForceUpdate`, `PeerLink`, `Sender`, `Force`, `Move`.
-Guarantees: the functions, transitions and instants are those that `simulate` plays; what stands in no finite
-list of arithmetic is refused, by the name of what moves or is computed so.
-Does not: write anything (see `c_text`), or carry packets from peer to peer (see `scene_text`).
+Takes: a `Model`, a peer of it, an integration method between events.
+Gives: `ExportedPeer`, `peer_of`, `subsystems_of`, `lines_of`, `first_packet`, `received_by`, `has_edge`,
+`computing`, `refused`; its parts `Instant`, `ForceUpdate`, `PeerLink`, `Sender`, `Force`, `Move`.
+Guarantees: the functions, transitions and instants are those of `simulate`. Computations other than finite
+arithmetic are refused, with the name of the state or variable.
+Does not: write anything (see `c_text`), or transfer packets between peers (see `topology_text`).
 
-A peer's states fall into sets that equations tie to each other. The set that a hand holds is a device; where
-no hand says so, the one with a mass that others are not told of, since what they are told of is a copy of
-what all hold. A device moves by itself, and what is computed from it is measured; a copy moves in the peer's
-computer. A device that is tied to a copy by more than forces computed at ticks can't be told apart from it.
+A peer's states form sets coupled by equations. The hand-held set is the device. Without a hand it is the set
+with a mass that is not sent to other peers, since a set that is sent is an object copy. A device is physical
+and measured; a copy is integrated in the peer's computer. A device coupled to a copy by more than forces
+computed at ticks cannot be separated from it.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from apc.compiler.interpolation import jacobian
 from apc.compiler.language.vectors import whole_and_index
 from apc.exports.identifiers import identifier, prefixed
 from apc.frame import schedule as frames
+from apc.frame.communication_graph import CommunicationGraph
 from apc.frame.devices import Device, coupled_directly, find_device, find_devices
 from apc.frame.discretize import moved_together
-from apc.frame.exact import evaluate_exact
-from apc.frame.exchange import CommunicationGraph
+from apc.frame.exact_arithmetic import evaluate_exact
 from apc.frame.jacobians import SubsystemJacobians, edge_name, structural_pattern
 from apc.frame.linearize import start_arguments, start_values
 from apc.frame.parameters import exact_numbers
@@ -48,13 +48,13 @@ from apc.simulation.signals import LocalSignal, local_signals
 from apc.simulation.simulation import SimulationPlan
 
 NO_DEVICE = "none"  # the word for a peer that moves nothing outside its computer
-MOST_HEARD = 20_000  # peers that one hears: each is a line of the text
+MOST_RECEIVED = 20_000  # senders to one peer: each is a line of the text
 STEPS = "--method rk4:0.1ms"  # a method that is arithmetic, whatever moves
 
 
 @dataclass(frozen=True, slots=True)
 class ForceUpdate:
-    """Hold `hold` puts out what was computed for it `lag` ticks ago."""
+    """Hold `hold` outputs the value computed `lag` ticks ago."""
 
     hold: int
     lag: int
@@ -62,7 +62,7 @@ class ForceUpdate:
 
 @dataclass(frozen=True, slots=True)
 class Instant:
-    """What happens at once, in this order; then nothing for the `move`-th of the peer's lengths of time.
+    """The simultaneous events of an instant, in order; followed by the `move`-th interval of the peer.
 
     `sends` and `ticks` are partitions.
     """
@@ -75,9 +75,9 @@ class Instant:
 
 @dataclass(frozen=True, slots=True)
 class Sender:
-    """Another peer, by its number, that is heard: its name, what its packets are weighed by.
+    """Another peer, by number, that is received: its name, and the weights of its packets.
 
-    `start` is what is heard of it before a packet arrives, a number a channel.
+    `start` are the values used before its first packet arrives, one number per channel.
     """
 
     peer: int
@@ -88,7 +88,7 @@ class Sender:
 
 @dataclass(frozen=True, slots=True)
 class PacketEntry:
-    """An entry of a packet: its channel's name, its unit, and what it is called in C."""
+    """An entry of a packet: its channel's name, its unit, and its C name."""
 
     name: str
     unit: str
@@ -97,10 +97,10 @@ class PacketEntry:
 
 @dataclass(frozen=True, slots=True)
 class PeerLink:
-    """A link as one peer has it: what a packet holds, who is heard, whether it can miss a packet.
+    """A link of one peer: packet contents, senders, and whether packets can be missing.
 
-    In C the line is called `name`. `sending` is the peer's own send partition, −1 if it sends nothing there;
-    `complete` says that everybody hears everybody.
+    In C the line is called `name`. `sending` is the peer's own send partition, −1 if it does not send;
+    `complete` is whether the graph is complete.
     """
 
     link: str
@@ -119,7 +119,7 @@ class PeerLink:
 
 @dataclass(frozen=True, slots=True)
 class Force:
-    """What pushes a device along an axis, in N: `terms` are (hold, factor)."""
+    """The force on a device along an axis, in N: `terms` are (hold, factor)."""
 
     name: str
     terms: tuple[tuple[int, float], ...]
@@ -127,7 +127,7 @@ class Force:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Move:
-    """What the computer's states do in `quanta`: x⁺ = matrix · (x, u, 1) row by row, or by `flow`.
+    """The motion of the computer's states over `quanta`: x⁺ = matrix · (x, u, 1) row by row, or by `flow`.
 
     `flow` (x, u, p, t) -> x⁺ is of the states `flowing`.
     """
@@ -140,20 +140,20 @@ class Move:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExportedPeer:
-    """A peer. `number` counts from 0 over all groups; `parameters` (n_p,) are its kind's.
+    """A peer. `number` is its zero-based index over all groups; `parameters` (n_p,) are its type's.
 
-    In C it is called `identifier`. `outside` are the states that its computer does not move, `measured` those
-    of them that it looks at, by what they are called in C, and `forces` likewise. `channels` are, by clock
-    partition and receive, the places of what is heard among those of its line; a receive that nothing reads
-    has none. `start` are the states', `memories` those of each clock partition's remembered outputs.
-    `settable` are the places of the parameters that only ticks read, see `_settable`.
+    In C it is called `identifier`. `outside` are the states that its computer does not integrate, `measured`
+    the measured ones of them by C name, and `forces` likewise. `channels` are, by clock partition and
+    receive, the indices of the received channels on its line; an unused receive has none. `start` are the
+    start states, `memories` the start values of each clock partition's stored outputs. `settable` are the
+    indices of the parameters used only in ticks, see `_settable`.
     """
 
     system: Model
     name: str
     identifier: str
     number: int
-    kind: PeerType
+    peer_type: PeerType
     schedule: Schedule
     parameters: Any
     outside: frozenset[int]
@@ -169,13 +169,13 @@ class ExportedPeer:
 
     @property
     def signals(self) -> tuple[LocalSignal, ...]:
-        """What there is to look at: states that its computer moves, what is computed, what acts later."""
+        """The readable variables: integrated states, computed values, pending values."""
         outside = {("state", (row,)) for row in self.outside}
-        every = local_signals(self.kind, self.schedule)
+        every = local_signals(self.peer_type, self.schedule)
         return tuple(
             local_signal
             for local_signal in every
-            if local_signal.role != "limited" and (local_signal.role, local_signal.place) not in outside
+            if local_signal.role != "limited" and (local_signal.role, local_signal.index) not in outside
         )
 
     @property
@@ -184,56 +184,57 @@ class ExportedPeer:
         return tuple(line for line in self.lines if line.sending >= 0)
 
     def line(self, link: str) -> PeerLink:
-        """Return what it has of a link."""
+        """Return the peer's data of a link."""
         return next(line for line in self.lines if line.link == link)
 
 
 def peer_of(
     plan: SimulationPlan, number: int, method: Method, *, device: str | None = NO_DEVICE, name: str = ""
 ) -> ExportedPeer:
-    """Take a peer out of its scene.
+    """Extract a peer from its model.
 
     Parameters
     ----------
     plan
-        What the peers of the scene do in a frame.
+        The frame plan of all peers.
     number
-        Which, counted from 0 over all groups.
+        The zero-based index over all groups.
     method
-        How the states move that no exact transition moves.
+        The integration method of states without an exact transition.
     device
-        The part that moves outside the computer, `NO_DEVICE` if none does; None: what others are not told of.
+        The part outside the computer, `NO_DEVICE` if none; None: the set that is not sent to others.
     name
-        What it is called in C; follows from its name in the scene if not given.
+        The C name; by default derived from the peer's name.
 
     Raises
     ------
     ApcError
-        E960 it does what is not arithmetic, or has no ticks; E961 no device, or one that can't be told apart.
+        E960 the peer is not finite arithmetic, or has no ticks; E961 no device, or one that cannot be
+        separated.
     """
     system, group = plan.system, plan.exchange.group_of(number)
-    place = system.groups[group].kind
-    kind, site, schedule = system.kinds[place], plan.sites[place], plan.schedules[group]
+    index = system.groups[group].peer_type
+    peer_type, subsystem, schedule = system.peer_types[index], plan.subsystems[index], plan.schedules[group]
     vector, label = _parameters(plan, number), plan.exchange.peer_name(number)
-    _refuse_what_iterates(system, label, kind)
-    outside = _outside(system, label, site, vector, device)
+    _refuse_iterations(system, label, peer_type)
+    outside = _outside(system, label, subsystem, vector, device)
     instants, lengths = _instants(schedule)
     lines, channels = lines_of(plan, number)
-    looked_at = sorted(outside & _read(kind))
-    measured = prefixed("measured", (kind.states[row].name for row in looked_at))
-    forces = _forces(system, label, site, vector, outside)
+    evaluated_at = sorted(outside & _read(peer_type))
+    measured = prefixed("measured", (peer_type.states[row].name for row in evaluated_at))
+    forces = _forces(system, label, subsystem, vector, outside)
     pushed = prefixed("force", (force.name for force in forces))
-    x, _, memories = start_values(site, [float(item) for item in vector])
+    x, _, memories = start_values(subsystem, [float(item) for item in vector])
     return ExportedPeer(
         system=system,
         name=label,
         identifier=name or identifier(label),
         number=number,
-        kind=kind,
+        peer_type=peer_type,
         schedule=schedule,
         parameters=vector,
         outside=outside,
-        measured=dict(zip(looked_at, measured, strict=True)),
+        measured=dict(zip(evaluated_at, measured, strict=True)),
         forces=dict(zip(pushed, forces, strict=True)),
         lines=lines,
         channels=channels,
@@ -241,7 +242,7 @@ def peer_of(
         moves=_moves(plan, label, group, outside, lengths, method, vector),
         start=tuple(x),
         memories=tuple(map(tuple, memories)),
-        settable=_settable(kind),
+        settable=_settable(peer_type),
     )
 
 
@@ -252,18 +253,17 @@ def _parameters(plan: SimulationPlan, number: int) -> Any:
     return plan.numbers.parameters[group][int(row)]
 
 
-def _settable(kind: PeerType) -> tuple[int, ...]:
-    """Return the places of the parameters that only ticks read: how states move, what they and packets start
-    with, is the same whatever these are."""
+def _settable(peer_type: PeerType) -> tuple[int, ...]:
+    """Return the indices of the parameters used only in ticks, not in transitions or start values."""
     ticks = [
         function
-        for clock in kind.clocks
+        for clock in peer_type.clocks
         for function in (clock.tick, *(each.edge for each in clock.receives))
         if function
     ]
-    others = [kind.derivative, *(sending.send for sending in kind.sends)]
-    fixed = {state.start for state in kind.states} | {
-        start for clock in kind.clocks for start in clock.starts
+    others = [peer_type.derivative, *(sending.send for sending in peer_type.sends)]
+    fixed = {state.start for state in peer_type.states} | {
+        start for clock in peer_type.clocks for start in clock.starts
     }
     read, moves = (
         np.any(
@@ -275,74 +275,74 @@ def _settable(kind: PeerType) -> tuple[int, ...]:
         )
         for functions in (ticks, others)
     )
-    places = np.flatnonzero(read & ~moves).tolist()
-    return tuple(place for place in places if kind.parameters[place] not in fixed)
+    indices = np.flatnonzero(read & ~moves).tolist()
+    return tuple(index for index in indices if peer_type.parameters[index] not in fixed)
 
 
-def sites_of(plan: SimulationPlan) -> tuple[int, ...]:
-    """Return of every peer the first one of its group and numbers that hears others by the same weights."""
+def subsystems_of(plan: SimulationPlan) -> tuple[int, ...]:
+    """Return for every peer the first one of its group with equal parameters and weights."""
     first: dict[Any, int] = {}
     numbers = []
     graphs = [link for link in plan.exchange.links if not plan.exchange.is_complete(link)]
     for number in range(plan.exchange.peers):
-        heard = tuple(
-            tuple(weight for _, weight in heard_of(plan.system, plan.exchange, link, number))
+        received = tuple(
+            tuple(weight for _, weight in received_by(plan.system, plan.exchange, link, number))
             for link in graphs
         )
-        key = plan.exchange.group_of(number), _parameters(plan, number).tobytes(), heard
+        key = plan.exchange.group_of(number), _parameters(plan, number).tobytes(), received
         numbers.append(first.setdefault(key, number))
     return tuple(numbers)
 
 
-def refused(system: Model, what: str, hint: str = "", code: str = "E960") -> ApcError:
-    """Return the message of what can't be written as C."""
-    return ApcError(Diagnostic(code, SourceLocation(system.origin.topology), what, hint=hint))
+def refused(system: Model, message: str, hint: str = "", code: str = "E960") -> ApcError:
+    """Return the message for an expression that cannot be written in C."""
+    return ApcError(Diagnostic(code, SourceLocation(system.origin.topology), message, hint=hint))
 
 
-def _refuse_what_iterates(system: Model, name: str, kind: PeerType) -> None:
+def _refuse_iterations(system: Model, name: str, peer_type: PeerType) -> None:
     """Refuse a peer of which something is solved by Newton's method."""
-    for function, when, what, where in computing(kind):
+    for function, when, message, where in computing(peer_type):
         if not function.is_a("SXFunction"):
-            what = f"{name}: {when}{what}{where} are solved for by iteration, which is not written as C"
-            raise refused(system, what, "equations that can be solved for these")
-    if not kind.clocks:
-        what = f"{name} computes nothing at any tick of a clock: there is nothing to write as C"
-        raise refused(system, what)
+            message = f"{name}: {when}{message}{where} are solved for by iteration, which is not written as C"
+            raise refused(system, message, "equations that can be solved for these")
+    if not peer_type.clocks:
+        message = f"{name} computes nothing at any tick of a clock: there is nothing to write as C"
+        raise refused(system, message)
 
 
 # ---- what moves outside
 
 
 def _outside(
-    system: Model, name: str, site: SubsystemJacobians, vector: Any, device: str | None
+    system: Model, name: str, subsystem: SubsystemJacobians, vector: Any, device: str | None
 ) -> frozenset[int]:
     """Return the states that the peer's computer does not move."""
-    kind = site.kind
+    peer_type = subsystem.peer_type
     if device == NO_DEVICE:
         return frozenset()
-    parts = [whole_and_index(state.name)[0].rpartition(".")[0] for state in kind.states]
-    masses = {part for row, part in enumerate(parts) if _is_position(kind, site, row)}
-    sent = {parts[int(row)] for send in site.pattern.sends for row in np.flatnonzero(send.x.any(axis=0))}
-    pattern = structural_pattern(kind.derivative.jac_sparsity(0, 0)).astype(float)
+    parts = [whole_and_index(state.name)[0].rpartition(".")[0] for state in peer_type.states]
+    masses = {part for row, part in enumerate(parts) if _is_position(peer_type, subsystem, row)}
+    sent = {parts[int(row)] for send in subsystem.pattern.sends for row in np.flatnonzero(send.x.any(axis=0))}
+    pattern = structural_pattern(peer_type.derivative.jac_sparsity(0, 0)).astype(float)
     tied = [set(rows.tolist()) for rows in moved_together(pattern)]
     if device is not None:
         chosen = {part.strip() for part in device.split(",")}
         for mass in sorted(chosen - masses):
             near = nearest(mass, masses) or min(masses, default=NO_DEVICE)
-            what = f"--device: no mass of {name} is called {mass[:40] or 'so'}"
-            raise refused(system, what, f"--device {near}", "E961")
+            message = f"--device: no mass of {name} is called {mass[:40] or 'so'}"
+            raise refused(system, message, f"--device {near}", "E961")
     else:
         unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
-        devices = find_devices(site, vector, unit_of, direct=coupled_directly(system.kinds))
+        devices = find_devices(subsystem, vector, unit_of, direct=coupled_directly(system.peer_types))
         chosen = {device.rpartition(".")[0] if device.endswith("]") else device for device in devices}
     if not chosen:
         hint = f"--device {NO_DEVICE} if its computer moves them all, or --device "
-        what = f"{name} has no device: others are told of every mass of it"
-        raise refused(system, what, hint + min(masses, default=NO_DEVICE), "E961")
+        message = f"{name} has no device: others are told of every mass of it"
+        raise refused(system, message, hint + min(masses, default=NO_DEVICE), "E961")
     listed = sorted(chosen)
-    if device is None and not kind.held and len(listed) > 1:
-        what = f"{name}: {' and '.join(listed)} may be devices, or copies that its computer moves"
-        raise refused(system, what, f"--device {','.join(listed)} or --device {listed[0]}", "E961")
+    if device is None and not peer_type.held and len(listed) > 1:
+        message = f"{name}: {' and '.join(listed)} may be devices, or copies that its computer moves"
+        raise refused(system, message, f"--device {','.join(listed)} or --device {listed[0]}", "E961")
     outside: set[int] = set()
     for rows in tied:
         inside = {parts[row] for row in rows}
@@ -350,60 +350,66 @@ def _outside(
             continue
         if copies := sorted((inside & sent) - chosen):
             moving, copied = " and ".join(sorted(inside & chosen)), " and ".join(copies)
-            what = (
+            message = (
                 f"{name}: {moving} and {copied} are tied to each other between ticks: no computer can move "
                 f"{copied} where {moving} moves by itself"
             )
             hint = f"a part with a clock between them, as SampledSpringDamper, or --device {NO_DEVICE}"
-            raise refused(system, what, hint, "E961")
+            raise refused(system, message, hint, "E961")
         outside |= rows
     return frozenset(outside)
 
 
-def _is_position(kind: PeerType, site: SubsystemJacobians, row: int) -> bool:
-    """Say whether a state is a place whose rate is another state, as of a mass."""
-    return kind.states[row].unit == "m" and site.pattern.a[row].sum() == 1 and not site.pattern.b[row].any()
+def _is_position(peer_type: PeerType, subsystem: SubsystemJacobians, row: int) -> bool:
+    """Return whether a state is a position, with another state as its rate, as of a mass."""
+    return (
+        peer_type.states[row].unit == "m"
+        and subsystem.pattern.a[row].sum() == 1
+        and not subsystem.pattern.b[row].any()
+    )
 
 
-def _read(kind: PeerType) -> frozenset[int]:
+def _read(peer_type: PeerType) -> frozenset[int]:
     """Return the states that anything computed at an instant looks at."""
-    reads = [structural_pattern(function.jac_sparsity(0, 0)).any(axis=0) for function, *_ in computing(kind)]
+    reads = [
+        structural_pattern(function.jac_sparsity(0, 0)).any(axis=0) for function, *_ in computing(peer_type)
+    ]
     return frozenset(np.flatnonzero(np.any(reads, axis=0)).tolist())
 
 
 def _forces(
-    system: Model, name: str, site: SubsystemJacobians, vector: Any, outside: frozenset[int]
+    system: Model, name: str, subsystem: SubsystemJacobians, vector: Any, outside: frozenset[int]
 ) -> tuple[Force, ...]:
-    """Return what pushes the devices, as sums of what holds put out."""
-    kind = site.kind
+    """Return the forces on the devices, as sums of hold outputs."""
+    peer_type = subsystem.peer_type
     if not outside:
         return ()
     unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
-    x, u, p, t = kind.derivative.sx_in()
-    slopes = jacobian(kind.derivative(x, u, p, t), u)
+    x, u, p, t = peer_type.derivative.sx_in()
+    slopes = jacobian(peer_type.derivative(x, u, p, t), u)
     varying = casadi.vertcat(x, u, t)
-    numbers = start_arguments(site, exact_numbers(kind, vector), Fraction, None)
+    numbers = start_arguments(subsystem, exact_numbers(peer_type, vector), Fraction, None)
     forces = []
     for row in sorted(outside):
-        if not _is_position(kind, site, row):
+        if not _is_position(peer_type, subsystem, row):
             continue
-        velocity = int(np.flatnonzero(site.pattern.a[row])[0])
-        if not site.pattern.b[velocity].any():
+        velocity = int(np.flatnonzero(subsystem.pattern.a[row])[0])
+        if not subsystem.pattern.b[velocity].any():
             continue
-        state = kind.states[row].name
+        state = peer_type.states[row].name
         axis = slopes[velocity, :]
         if casadi.depends_on(axis, varying):
-            what = f"{name}: what pushes {state} is no sum of what ticks compute: it bends with the motion"
+            message = f"{name}: what pushes {state} is no sum of what ticks compute: it bends with the motion"
             hint = "a motor without a limit, which the real one has"
-            raise refused(system, what, hint, "E961")
-        device = find_device(site, vector, unit_of, part=state)
+            raise refused(system, message, hint, "E961")
+        device = find_device(subsystem, vector, unit_of, part=state)
         if not isinstance(device, Device):
             raise refused(system, f"{name}: {device or f'{state} is no mass'}", code="E961")
         function = casadi.Function("slopes", [x, u, p, t], [casadi.densify(axis)])
         values = evaluate_exact(function, [numbers[0], numbers[1], numbers[4], numbers[5]])[0]
         terms = tuple((h, float(value / device.inverse)) for h, value in enumerate(values) if value)
-        part, _, own = state.rpartition(".")
-        forces.append(Force(f"{part}.f{own.removeprefix(whole_and_index(own)[0])}", terms))
+        part, _, local = state.rpartition(".")
+        forces.append(Force(f"{part}.f{local.removeprefix(whole_and_index(local)[0])}", terms))
     return tuple(forces)
 
 
@@ -419,36 +425,40 @@ def _moves(
     method: Method,
     vector: Any,
 ) -> tuple[Move, ...]:
-    """Return what the computer's states do in every length of time, in quanta."""
-    system, place = plan.system, plan.system.groups[group].kind
-    kind, site, quantum = system.kinds[place], plan.sites[place], plan.schedules[group].quantum
-    flowing = [row for row in rows_to_move(kind, method) if row not in outside]
-    names = ", ".join(kind.states[row].name for row in flowing)
+    """Return the transitions of the computer's states for every interval length, in quanta."""
+    system, index = plan.system, plan.system.groups[group].peer_type
+    peer_type, subsystem, quantum = (
+        system.peer_types[index],
+        plan.subsystems[index],
+        plan.schedules[group].quantum,
+    )
+    flowing = [row for row in rows_to_move(peer_type, method) if row not in outside]
+    names = ", ".join(peer_type.states[row].name for row in flowing)
     if flowing and method.step is None:
-        what = f"{name}: between ticks {names} move by CVODES, which is not written as C"
-        raise refused(system, what, STEPS)
-    if flowing and not kind.derivative.is_a("SXFunction"):
-        what = f"{name}: the rates of {names} are solved for by iteration, which is not written as C"
-        raise refused(system, what, "equations that can be solved for these")
+        message = f"{name}: between ticks {names} move by CVODES, which is not written as C"
+        raise refused(system, message, STEPS)
+    if flowing and not peer_type.derivative.is_a("SXFunction"):
+        message = f"{name}: the rates of {names} are solved for by iteration, which is not written as C"
+        raise refused(system, message, "equations that can be solved for these")
     every = zip(system.groups, plan.numbers.parameters, strict=True)
-    numbers = [row for group, rows in every if group.kind == place for row in rows]
-    flow = flow_of(kind, method, flowing, state_scales(system, kind, site, numbers))
-    linear = rates(kind, [*sorted(outside), *flowing])
+    numbers = [row for group, rows in every if group.peer_type == index for row in rows]
+    flow = flow_of(peer_type, method, flowing, state_scales(system, peer_type, subsystem, numbers))
+    linear = rates(peer_type, [*sorted(outside), *flowing])
     if linear.timed:
         inputs = linear.rate.sx_in()
         g = linear.rate(*inputs)
         rows = [row for row in range(g.numel()) if casadi.depends_on(g[row], inputs[1])]
-        pushed = ", ".join(kind.states[row].name for row in rows)
-        what = f"{name}: {pushed} is pushed by a force that changes with time between ticks"
-        raise refused(system, f"{what}; its exact integral is not written as C", STEPS)
+        pushed = ", ".join(peer_type.states[row].name for row in rows)
+        message = f"{name}: {pushed} is pushed by a force that changes with time between ticks"
+        raise refused(system, f"{message}; its exact integral is not written as C", STEPS)
     seconds = [length * quantum for length in lengths]
     matrices = transition_rows(linear, vector[None], seconds)
     moves = []
     for length, duration, matrix in zip(lengths, seconds, matrices, strict=True):
         function = flow.over(duration) if flow is not None else None
         if function is not None and not function.is_a("SXFunction"):
-            what = f"{name}: {names} take too many steps of {method} from one instant to the next"
-            raise refused(system, f"{what} to be written", STEPS)
+            message = f"{name}: {names} take too many steps of {method} from one instant to the next"
+            raise refused(system, f"{message} to be written", STEPS)
         moves.append(Move(length, matrix[0], tuple(flowing), function))
     return tuple(moves)
 
@@ -475,7 +485,7 @@ def _instants(schedule: Schedule) -> tuple[tuple[Instant, ...], tuple[int, ...]]
     return tuple(instants), tuple(lengths)
 
 
-# ---- what is heard
+# ---- received values
 
 
 def lines_of(
@@ -483,45 +493,49 @@ def lines_of(
 ) -> tuple[tuple[PeerLink, ...], dict[tuple[int, int], tuple[int, ...]]]:
     """Return the links of a peer, and for every receive the places of its channels on its line."""
     system, exchange, group = plan.system, plan.exchange, plan.exchange.group_of(number)
-    site, schedule = plan.sites[system.groups[group].kind], plan.schedules[group]
-    kind = site.kind
+    subsystem, schedule = plan.subsystems[system.groups[group].peer_type], plan.schedules[group]
+    peer_type = subsystem.peer_type
     read = {
-        (event.partition, place): kind.clocks[event.partition].receives[place].link
+        (event.partition, index): peer_type.clocks[event.partition].receives[index].link
         for event in schedule.events
         if isinstance(event, frames.Tick)
-        for place, rows in enumerate(event.heard)
+        for index, rows in enumerate(event.input_rows)
         if rows
     }
     lines: list[PeerLink] = []
-    places: dict[tuple[int, int], tuple[int, ...]] = {}
+    indices: dict[tuple[int, int], tuple[int, ...]] = {}
     for name, (link, declared) in zip(prefixed("link", exchange.links), exchange.links.items(), strict=True):
         sent = {sent.channel for sent in schedule.sent if sent.link == link}
-        of = {key: site.pattern.ticks[key[0]].channels[key[1]] for key, text in read.items() if text == link}
-        hears = {channel for channels in of.values() for channel in channels}
-        if not hears and not sent:
+        of = {
+            key: subsystem.pattern.ticks[key[0]].channels[key[1]]
+            for key, text in read.items()
+            if text == link
+        }
+        receives = {channel for channels in of.values() for channel in channels}
+        if not receives and not sent:
             continue
-        place, send_partition = next(
-            (place, send)
-            for each in (kind, *system.kinds)
-            for place, send in enumerate(each.sends)
+        index, send_partition = next(
+            (index, send)
+            for each in (peer_type, *system.peer_types)
+            for index, send in enumerate(each.sends)
             if send.link == link
         )
-        used = [i for i, channel in enumerate(send_partition.channels) if i in hears or channel in sent]
-        places |= {key: tuple(map(used.index, channels)) for key, channels in of.items()}
+        used = [i for i, channel in enumerate(send_partition.channels) if i in receives or channel in sent]
+        indices |= {key: tuple(map(used.index, channels)) for key, channels in of.items()}
         channels = tuple(send_partition.channels[i] for i in used)
         members = prefixed("value", channels)
-        senders = [*heard_of(plan.system, plan.exchange, link, number)] if hears else []
-        if len(senders) > MOST_HEARD:
-            what = f"{exchange.peer_name(number)} hears {len(senders):,} peers over {link}"
-            what = f"{what}; {MOST_HEARD:,} fit a text of C"
-            raise refused(system, what, "fewer peers, or a graph that is not complete")
+        senders = [*received_by(plan.system, plan.exchange, link, number)] if receives else []
+        if len(senders) > MOST_RECEIVED:
+            message = f"{exchange.peer_name(number)} hears {len(senders):,} peers over {link}"
+            message = f"{message}; {MOST_RECEIVED:,} fit a text of C"
+            raise refused(system, message, "fewer peers, or a graph that is not complete")
         law = declared.channel
         lines.append(
             PeerLink(
                 link=link,
                 name=name,
                 packet=tuple(map(PacketEntry, channels, [send_partition.units[i] for i in used], members)),
-                sending=place if sent else -1,
+                sending=index if sent else -1,
                 senders=tuple(
                     Sender(
                         number, exchange.peer_name(number), weight, first_packet(plan, link, number, channels)
@@ -532,48 +546,52 @@ def lines_of(
                 complete=exchange.is_complete(link),
             )
         )
-    return tuple(lines), places
+    return tuple(lines), indices
 
 
 def first_packet(plan: SimulationPlan, link: str, number: int, channels: Sequence[str]) -> tuple[float, ...]:
-    """Return what is heard of a peer over a link before any packet of it arrives, channel by channel."""
-    site = plan.sites[plan.system.groups[plan.exchange.group_of(number)].kind]
+    """Return the values used for a peer over a link before its first packet arrives, channel by channel."""
+    subsystem = plan.subsystems[plan.system.groups[plan.exchange.group_of(number)].peer_type]
     sent: dict[str, float] = {}
-    for sending in site.kind.sends:
+    for sending in subsystem.peer_type.sends:
         if sending.link == link:
             vector = [float(matrix) for matrix in _parameters(plan, number)]
-            x, u, _ = start_values(site, vector)
+            x, u, _ = start_values(subsystem, vector)
             values = np.asarray(sending.send(x, u, vector, 0.0), np.float64).ravel().tolist()
             sent = dict(zip(sending.channels, values, strict=True))
     return tuple(sent.get(channel, 0.0) for channel in channels)
 
 
-def heard_of(
+def received_by(
     system: Model, exchange: CommunicationGraph, link: str, number: int
 ) -> Iterator[tuple[int, float]]:
-    """Yield the peers that one hears over a link, with their weights, in the scene's order."""
+    """Yield the senders to a peer over a link, with their weights, in the model's order."""
     if exchange.is_complete(link):
         listed = [(index, 1.0) for index in range(exchange.peers) if index != number]
     else:
         pairs, weights = exchange.arcs(link)
         mine = np.flatnonzero(pairs[:, 1] == number)
         listed = sorted(zip(pairs[mine, 0].tolist(), weights[mine].tolist(), strict=True))
-    kinds = [system.kinds[group.kind] for group in system.groups]
-    sends = [any(sending.link == link for sending in kind.sends) for kind in kinds]
+    peer_types = [system.peer_types[group.peer_type] for group in system.groups]
+    sends = [any(sending.link == link for sending in peer_type.sends) for peer_type in peer_types]
     return ((number, weight) for number, weight in listed if sends[exchange.group_of(number)])
 
 
-def computing(kind: PeerType) -> list[tuple[Any, str, str, str]]:
-    """Return all that a peer computes at instants: each function, when, what it gives, over which link."""
+def computing(peer_type: PeerType) -> list[tuple[Any, str, str, str]]:
+    """Return all computations of a peer at instants: function, time, results, link."""
     result = [
-        (clock.tick, f"at a tick of {clock.clock} ", ", ".join(clock.outputs), "") for clock in kind.clocks
+        (clock.tick, f"at a tick of {clock.clock} ", ", ".join(clock.outputs), "")
+        for clock in peer_type.clocks
     ]
-    edges = [each.edge for clock in kind.clocks for each in clock.receives if each.edge is not None]
+    edges = [each.edge for clock in peer_type.clocks for each in clock.receives if each.edge is not None]
     result += [(edge, "", "a look at others", "") for edge in edges]
-    return [*result, *((send.send, "", ", ".join(send.channels), f" of {send.link}") for send in kind.sends)]
+    return [
+        *result,
+        *((send.send, "", ", ".join(send.channels), f" of {send.link}") for send in peer_type.sends),
+    ]
 
 
-def has_edge(kind: PeerType, partition: int, receive: int) -> bool:
-    """Say whether a receive looks at each sender by itself."""
-    clock = kind.clocks[partition]
+def has_edge(peer_type: PeerType, partition: int, receive: int) -> bool:
+    """Return whether a receive is a pairwise reduction."""
+    clock = peer_type.clocks[partition]
     return bool(edge_name(clock, clock.receives[receive]))

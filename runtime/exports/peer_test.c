@@ -11,7 +11,7 @@ int main(int count, char **words) {
   ${name}_in in = {0};
   ${name}_out out = {0};
   ${name}_start(&peer);
-  ${name}_unheard(&in);
+  ${name}_clear(&in);
   if (count > 1) {
     const long ticks = atol(words[1]);
     const clock_t begin = clock();
@@ -19,11 +19,11 @@ int main(int count, char **words) {
     printf("%g s an instant\n", (double)(clock() - begin) / CLOCKS_PER_SEC / (double)ticks);
     return 0;
   }
-  while ({% for form, own, label in read %}scanf("${form}", &in.${own}) == 1${" &&\n      " if not loop.last else ""}{% else %}!feof(stdin) && scanf("%*[^\n]") != EOF && getchar() != EOF{% endfor %}) {
+  while ({% for form, local, label in read %}scanf("${form}", &in.${local}) == 1${" &&\n      " if not loop.last else ""}{% else %}!feof(stdin) && scanf("%*[^\n]") != EOF && getchar() != EOF{% endfor %}) {
     printf("%.17g", ${name}_time(&peer));
     ${name}_tick(&peer, &in, &out);
-% for form, own, label in shown
-    printf(" ${form}", ${own});
+% for form, local, label in shown
+    printf(" ${form}", ${local});
 % endfor
     printf("\n");
     fflush(stdout);

@@ -1,7 +1,7 @@
 """A state space as python-control's, and as files that Python, SciPy and MATLAB read.
 
 Takes: a `StateSpace`. Gives: `as_control`; `write_script`, `write_mat`, `write_npz`.
-Guarantees: a file is there whole or not at all; no name out of a scene is read as Python's text; nothing is
+Guarantees: a file is there whole or not at all; no name out of a model is read as Python's text; nothing is
 pickled. All hold the same: A, B, C, D, dt in seconds, names and SI units, and what made them.
 Does not: compute.
 """
@@ -53,8 +53,8 @@ def write_script(path: Path, state_space: StateSpace) -> None:
 def write_mat(path: Path, state_space: StateSpace) -> None:
     """Write a MAT-file. Raises ApcError: E601 where it can't be, E951 where it is too large."""
     if max(matrix.nbytes for matrix in state_space.matrices) > LARGEST_MAT:
-        what = "a variable of a MAT-file holds less than 2 GiB, and A is larger"
-        raise ApcError(Diagnostic("E951", SourceLocation(str(path)), what, hint="--to npz"))
+        message = "a variable of a MAT-file holds less than 2 GiB, and A is larger"
+        raise ApcError(Diagnostic("E951", SourceLocation(str(path)), message, hint="--to npz"))
     from scipy.io import savemat
 
     variables = {
@@ -80,21 +80,21 @@ def write_npz(path: Path, state_space: StateSpace) -> None:
 
 
 def _named(state_space: StateSpace) -> list[tuple[str, tuple[ExportedSignal, ...]]]:
-    """Return what a state space has by names, under the word for it."""
+    """Return the names in a state space, by category."""
     return [("states", state_space.states), ("inputs", state_space.inputs), ("outputs", state_space.outputs)]
 
 
 def _variables(state_space: StateSpace) -> dict[str, Any]:
-    """Return what a file of arrays holds, by name."""
+    """Return the contents of a file of arrays, by name."""
     variables: dict[str, Any] = dict(zip("ABCD", state_space.matrices, strict=True))
     variables["dt"] = state_space.frame_s
     for name, ports in _named(state_space):
         variables[name] = [port.name for port in ports]
         variables[f"{name.removesuffix('s')}_units"] = [port.unit for port in ports]
-    variables["cut"], variables["notes"] = state_space.cut, [state_space.meaning, *state_space.notes]
+    variables["open_at"], variables["notes"] = state_space.open_at, [state_space.meaning, *state_space.notes]
     variables["provenance"] = state_space.made_by
-    if state_space.free:
-        variables["free"] = [port.name for port in state_space.free]
-        variables["free_units"] = [port.unit for port in state_space.free]
+    if state_space.symbolic:
+        variables["symbolic"] = [port.name for port in state_space.symbolic]
+        variables["symbolic_units"] = [port.unit for port in state_space.symbolic]
         variables["casadi_function"] = state_space.function.serialize()
     return variables

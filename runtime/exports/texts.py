@@ -1,9 +1,9 @@
-"""Texts of C, XML and Python from the templates beside this module, by Jinja2.
+"""Texts of C, XML and Python from the templates in this folder, by Jinja2.
 
-Takes: the name of a template, what it is of. Gives: `filled`; `number`, `quoted`.
-Guarantees: a number is read as the very same double; nothing in a comment ends it; a name that a template
-has and nobody gave is an error.
-Does not: know what a text means.
+Takes: the name of a template, its data. Gives: `filled`; `number`, `quoted`.
+Guarantees: numbers round-trip to the same double. No text ends a comment early. An undefined name in a
+template is an error.
+Does not: interpret texts.
 
 A line of a template that begins with % is a statement of Jinja2, ${…} is an expression, and all else is
 the text.
@@ -24,7 +24,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 
 def filled(file: str, /, **values: object) -> str:
-    """Return the text of a template with values in the place of its names."""
+    """Return the text of a template with its names replaced by values."""
     return _templates().get_template(file).render(values)
 
 
@@ -52,12 +52,12 @@ def number(value: float) -> str:
 
 
 def row(values: Iterable[Any]) -> str:
-    """Return what stands between the braces of an array, which has at least one entry."""
+    """Return the elements of an array initializer, with at least one entry."""
     return ", ".join(number(value) if isinstance(value, float) else str(value) for value in values) or "0"
 
 
 def comment(text: str) -> str:
-    """Return a text that can stand in a comment of C."""
+    """Return a text that is safe within a C comment."""
     shown = "".join(c if c.isascii() and c.isprintable() else "?" for c in text)
     return shown.replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?")
 
@@ -74,13 +74,13 @@ def quoted(text: str) -> str:
 
 
 def quotable(text: str) -> str:
-    """Return a text that can't end the text of Python it stands in."""
+    """Return a text that is safe within a Python string literal."""
     return text.replace("\\", "/").replace('"', "'")
 
 
 def _members(text: str) -> str:
-    """Return the members of a structure of C, given as lines `declaration | what it is`."""
+    """Return the members of a C structure, given as lines `declaration | description`."""
     rows = [line.split(" | ", 1) for line in text.strip("\n").split("\n") if line]
     rows = rows or [["char none", "nothing"]]
     width = max(len(declared) for declared, _ in rows) + 1
-    return "".join(f"  {declared + ';':<{width}} /* {comment(what)} */\n" for declared, what in rows)
+    return "".join(f"  {declared + ';':<{width}} /* {comment(subject)} */\n" for declared, subject in rows)

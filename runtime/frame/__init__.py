@@ -1,1 +1,1 @@
-"""One peer over one frame: equations linearized, intervals put together, in floats and exactly."""
+"""One peer over one frame: linearization, discretization and lifting, in floats and exactly."""

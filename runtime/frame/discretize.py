@@ -1,18 +1,18 @@
-"""What a linear system does in a while: the exact matrix exponential, inputs held.
+"""Discretization: the exact matrix exponential of a linear system with held inputs.
 
-Takes: the matrices of dx/dt = A x + B u, exact, or of many sites at once in floats.
-Gives: `discretize`, `moved_together`, `refuse_many`; `exponential`, in any numbers; `step_balls`.
-Guarantees: every entry of `discretize` of one site is right to the last digit but one, proved by ball
-arithmetic, whether a mode dies out in a nanosecond or never; of many sites at once, or of many states that
-move together, steps are taken in floats. Every step comes with a bound.
-Does not: know when anything happens (see `scheduling`).
+Takes: the matrices of dx/dt = A x + B u, exact, or of many subsystems in floats.
+Gives: `discretize`, `moved_together`, `refuse_many`; `exponential`, in any number type; `step_balls`.
+Guarantees: every entry of `discretize` of one subsystem is correct to the last digit but one, proved by ball
+arithmetic, for any time constants; for many subsystems, or many coupled states, steps are computed in floats.
+Every step comes with a bound.
+Does not: schedule events (see `scheduling`).
 
     x(t + T) = F x(t) + G u        [F G; 0 I] = exp([A B; 0 0] T)
 
 (Van Loan, Computing integrals involving the matrix exponential, IEEE Trans. Autom. Control 1978.) The
 textbook form (1 − e^{−bT/m}) m/b loses every digit as b goes to 0, and scaling and squaring in double
 precision loses log₂(bT/m) bits where the mass is tiny. Arb's exponential (Johansson, IEEE Trans. Computers
-2017) in enough bits loses none, and says so.
+2017) with enough bits loses none, with a proved bound.
 """
 
 from __future__ import annotations
@@ -25,43 +25,52 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
-from apc.frame.radius import FLOATS, RADII, UNIT, Arithmetic, radius_of, rounded, value_of, with_radius
+from apc.frame.interval_arithmetic import (
+    FLOATS,
+    MIDPOINT_RADIUS,
+    UNIT_ROUNDOFF,
+    Arithmetic,
+    error_radius,
+    rounded,
+    value_of,
+    with_error_radius,
+)
 from apc.threads import load_pool
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
 Integers = NDArray[np.int64]
 
-# Bits tried in turn. A mode that dies out within T at rate a needs about 53 + 2·log₂(aT) of them.
+# Precisions in bits, tried in turn. A mode of decay rate a needs about 53 + 2·log₂(aT) bits.
 PRECISIONS = (128, 256, 512, 1024, 2048)
 
-# Radius asked of every ball, relative to the largest entry: far below a rounding of double precision.
+# The required radius of every ball, relative to the largest entry: far below a rounding of double precision.
 RADIUS = 2.0**-80
 
 
-# States of one peer, whose matrices hold a rational an entry.
+# The limit of states of one peer, whose matrices store one rational per entry.
 MOST_STATES = 1000
 
-# States that move together whose exponential is one of balls: of more, floats are looked at first, as balls
-# cost 30 times as much, and only up to so many are there balls where floats say too little: some seconds.
+# The number of coupled states whose exponential is computed in balls first: for more, floats are tried first,
+# as balls cost 30 times as much. Beyond the second number balls are never used: they take some seconds.
 FEW_TOGETHER, MOST_TOGETHER = 64, 250
 
-# How many times as much as composing rounds a step in floats may be off by, where balls are too many.
+# The largest error of a step in floats, relative to composition's rounding, where balls are too many.
 DOUBTFUL = 1e4
 
-# Inputs beside fewer states: each is a row more of the exponential.
+# Inputs in one group with fewer states: each is one more row of the exponential.
 FEWEST_INPUTS = 8
 
-# Rounding errors charged to every coefficient a site's functions give, in units of UNIT: CasADi evaluates
-# short polynomials of the parameters, a few roundings an entry.
+# Rounding errors charged to every coefficient from a subsystem's functions, in units of UNIT: CasADi
+# evaluates short polynomials of the parameters, with a few roundings per entry.
 COEFFICIENT_ROUNDINGS = 8
 
-# With ‖X‖ ≤ 1/2 the Taylor series of φ₁ is cut off after so many terms. The factor I + X/18 + … by which the
-# last is off, with all that follows, differs from I by less than this. No more squarings are of use.
+# With ‖X‖ ≤ 1/2 the Taylor series of φ₁ is truncated after this number of terms. The factor I + X/18 + … of
+# the last term, with the remainder, differs from I by less than `LAST`. More squarings have no use.
 TERMS, LAST, MOST_SQUARINGS = 16, 2.0**-5, 64
 
 TOO_LARGE = (
-    "one frame of this scene leaves the range of floating point numbers: "
+    "one frame of this topology leaves the range of floating point numbers: "
     "a stiffness or delay is too large for it, or a mass too small"
 )
 
@@ -72,49 +81,49 @@ def discretize(a: Matrix, b: Matrix, durations: Sequence[Fraction]) -> tuple[Mat
     Parameters
     ----------
     a, b
-        A (n_x, n_x) and B (n_x, n_u), entries exact: `Fraction` or float taken at its word. Or those of many
-        sites in floats (k, …), which may be off by `COEFFICIENT_ROUNDINGS`.
+        A (n_x, n_x) and B (n_x, n_u), entries exact: `Fraction` or float taken as exact. Or those of many
+        subsystems in floats (k, …), with errors up to `COEFFICIENT_ROUNDINGS`.
     durations
         T in seconds.
 
     Raises
     ------
     ApcError
-        E806 an entry of the exponential is too large for a float: something grows without measure within T;
-        E812 too many states, or too many that move together.
+        E806 an entry of the exponential overflows: a mode grows too fast within T; E812 too many states, or
+        too many coupled states.
     """
     *many, n_x, n_u = b.shape
     steps = np.zeros((len(durations), *many, 2, n_x, n_x + n_u))
-    sites = tuple(range(len(many)))
-    filled = (np.asarray(matrix.astype(np.bool_).any(axis=sites)) for matrix in (a, b))
+    subsystems = tuple(range(len(many)))
+    filled = (np.asarray(matrix.astype(np.bool_).any(axis=subsystems)) for matrix in (a, b))
     for states, inputs in _pieces(*filled):
         moved, pushed = a[..., states[:, None], states], b[..., states[:, None], inputs]
         exponentiate = _in_floats if many else _steps
-        places = states[:, None], np.concatenate([states, n_x + inputs])
+        indices = states[:, None], np.concatenate([states, n_x + inputs])
         for step, piece in zip(steps, exponentiate(moved, pushed, durations), strict=True):
-            step[..., *places] = piece
+            step[..., *indices] = piece
     return tuple(steps)
 
 
-def refuse_many(states: int, place: SourceLocation) -> None:
-    """Refuse more states of one peer than are exponentiated: ApcError E812."""
+def refuse_many(states: int, location: SourceLocation) -> None:
+    """Raise ApcError E812 for a peer with more states than the limit."""
     if states > MOST_STATES:
-        what = f"one peer has {states:,} states, and {MOST_STATES:,} are the most that are analysed"
-        raise ApcError(Diagnostic("E812", place, what, hint="smaller arrays, as count: 100"))
+        message = f"one peer has {states:,} states, and {MOST_STATES:,} are the most that are analysed"
+        raise ApcError(Diagnostic("E812", location, message, hint="smaller arrays, as count: 100"))
 
 
 def _pieces(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> Iterator[tuple[Integers, Integers]]:
-    """Yield states that move together with a few of the inputs that move them, until all are had.
+    """Yield sets of coupled states with a few of the inputs that act on them, until all are covered.
 
-    What moves by itself has an exponential of its own, and so has each input's column of G: an array of a
-    thousand parts costs a thousand small cubes, not one of its own.
+    An uncoupled set of states has an exponential of its own, and so has each input's column of G: an array of
+    a thousand parts costs a thousand small cubes, not one large one.
 
     Raises
     ------
     ApcError
         E812 too many states.
     """
-    refuse_many(len(a), SourceLocation("the scene"))
+    refuse_many(len(a), SourceLocation("the topology"))
     for states in moved_together(a):
         inputs = np.flatnonzero(b[states].any(axis=0))
         step = max(len(states), FEWEST_INPUTS)
@@ -123,43 +132,43 @@ def _pieces(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> Iterator[tuple[Intege
 
 
 def _in_floats(a: Floats, b: Floats, durations: Sequence[Fraction]) -> Iterator[Matrix]:
-    """Yield the steps of many sites; what all of them have in common is exponentiated once."""
+    """Yield the steps of many subsystems; blocks common to all are exponentiated once."""
     some = slice(1 if all((values == values[:1]).all() for values in (a, b)) else len(a))
     a, b = (rounded(values[some], COEFFICIENT_ROUNDINGS) for values in (a, b))
     for duration in durations:
-        yield exponential(a, b, float(duration), RADII)
+        yield exponential(a, b, float(duration), MIDPOINT_RADIUS)
 
 
 def _steps(a: Matrix, b: Matrix, durations: Sequence[Fraction]) -> list[Matrix]:
-    """Return the steps of states that move together: in floats where they are many, else in balls.
+    """Return the steps of coupled states: in floats where they are many, else in balls.
 
     Raises
     ------
     ApcError
-        E806 as `discretize`; E812 too many for balls where floats say too little.
+        E806 as `discretize`; E812 too many for balls where floats are too inaccurate.
     """
     if len(a) > FEW_TOGETHER:
         steps = _balanced_steps(a.astype(np.float64), b.astype(np.float64), durations)
         if steps is not None:
             return steps
         if len(a) > MOST_TOGETHER:
-            what = (
+            message = (
                 f"{len(a)} states of one peer move together in continuous time, so fast that floats lose "
                 f"them in a step, and {MOST_TOGETHER} such states are the most that are analysed"
             )
             hint = "smaller arrays, as count: 100, or shorter periods"
-            raise ApcError(Diagnostic("E812", SourceLocation("the scene"), what, hint=hint))
+            raise ApcError(Diagnostic("E812", SourceLocation("the topology"), message, hint=hint))
     generator = _generator(a, b)
     return [_step(generator * _rational(duration), len(a)) for duration in durations]
 
 
 def _balanced_steps(a: Floats, b: Floats, durations: Sequence[Fraction]) -> list[Matrix] | None:
-    """Return the steps in floats; None where one may be off by much more than composing it rounds.
+    """Return the steps in floats; None where the error may be much larger than the rounding of composition.
 
     Notes
     -----
-    In units in which the rows of a large A are as large as its columns, powers of 2 of those given, its
-    exponential takes the fewest squarings, and the largest of it says how far any of it may be off.
+    In units that balance the rows and columns of a large A, by powers of 2, its exponential takes the fewest
+    squarings, and its largest entry bounds the error of all.
     """
     allowed = 2.0 if len(a) <= MOST_TOGETHER else DOUBTFUL
     a, (units, _) = load_pool("scipy.linalg").matrix_balance(a, permute=False, separate=True)
@@ -168,33 +177,32 @@ def _balanced_steps(a: Floats, b: Floats, durations: Sequence[Fraction]) -> list
     steps = []
     for duration in durations:
         with np.errstate(all="ignore"):
-            step = exponential(a, b, float(duration), RADII)
+            step = exponential(a, b, float(duration), MIDPOINT_RADIUS)
             size = np.abs(value_of(step)).max()
-            if not radius_of(step).max() <= allowed * step.shape[-1] * UNIT * size < np.inf:
+            if not error_radius(step).max() <= allowed * step.shape[-1] * UNIT_ROUNDOFF * size < np.inf:
                 return None
             steps.append(whole * step)
     return steps
 
 
 def exponential(a: Matrix, b: Matrix, seconds: float | Matrix, numbers: Arithmetic = FLOATS) -> Matrix:
-    """Return [F G] (…, n_x, n_x + n_u) of matrices of any numbers, x(t + T) = F x(t) + G u.
+    """Return [F G] (…, n_x, n_x + n_u) in any number type, x(t + T) = F x(t) + G u.
 
     Parameters
     ----------
     a, b
         A (…, n_x, n_x) and B (…, n_x, n_u), in `numbers`.
     seconds
-        T, a float that is off by one rounding; in floats one for each matrix, too.
+        T, a float with one rounding error; in floats one for each matrix, too.
     numbers
-        What the matrices are of: floats, real or complex, with their radii, or over cells.
+        The number type: floats, real or complex, with their radii, or over cells.
 
     Notes
     -----
     By scaling and squaring: with X = A T/2^s, ‖X‖ ≤ 1/2, and Y = φ₁(X) by Horner's rule, E = F − I = X Y and
-    G = Y B T/2^s; then s times E ← 2 E + E² and G ← 2 G + E G. What is slow beside what is fast so keeps the
-    digits that 1 would take from it with each squaring; what it is off by goes on another way (see `radius`).
-    What the series leaves out is as if its last factor, I + X/18 + …, were off by less than `LAST` where
-    states move one another.
+    G = Y B T/2^s; then s times E ← 2 E + E² and G ← 2 G + E G. Slow modes thereby keep the digits that adding
+    1 would cancel in each squaring; the error is propagated separately (see `interval_arithmetic`). The
+    truncation error equals an error below `LAST` of the last factor, I + X/18 + …, for coupled states.
     """
     n_x, n_u = a.shape[-1], b.shape[-1]
     norm = float((numbers.size(a) * seconds).sum(axis=-2).real.max(initial=0.0))
@@ -217,7 +225,7 @@ def exponential(a: Matrix, b: Matrix, seconds: float | Matrix, numbers: Arithmet
 
 
 def moved_together(a: NDArray[Any]) -> Iterator[Integers]:
-    """Yield the states in sets between which A has no entry."""
+    """Yield the sets of states between which A has no entry."""
     neighbours: list[set[int]] = [set() for _ in a]
     for row, column in np.argwhere(a.astype(np.bool_)).tolist():
         neighbours[row].add(column)
@@ -236,12 +244,12 @@ def moved_together(a: NDArray[Any]) -> Iterator[Integers]:
 
 
 def step_balls(a: NDArray[Any], b: NDArray[Any], duration: Fraction) -> NDArray[Any]:
-    """Return [F G] (n_x, n_x + n_u) of one duration as balls at python-flint's present precision.
+    """Return [F G] (n_x, n_x + n_u) of one duration as balls at python-flint's current precision.
 
     Parameters
     ----------
     a, b
-        A and B, entries exact or balls (`flint.arb`), which the step then holds for every value of.
+        A and B, entries exact or balls (`flint.arb`); the step then encloses that of every value in them.
     duration
         T in seconds.
     """
@@ -259,7 +267,7 @@ def step_balls(a: NDArray[Any], b: NDArray[Any], duration: Fraction) -> NDArray[
 
 def _generator(a: NDArray[Any], b: NDArray[Any]) -> Any:
     """Return [A B; 0 0] as an exact matrix."""
-    # Imported here: commands that never discretize need not wait for it.
+    # Imported here: commands without discretization do not load it.
     import flint
 
     n_x, n_u = b.shape
@@ -276,7 +284,7 @@ def _rational(value: Any) -> Any:
 
 
 def _step(scaled: Any, n_x: int) -> Matrix:
-    """Exponentiate in rising precision until every ball is small."""
+    """Return the exponential, in increasing precision until every ball is small."""
     import flint
 
     precision = flint.ctx.prec
@@ -289,10 +297,12 @@ def _step(scaled: Any, n_x: int) -> Matrix:
             radius = np.array([[float(ball.rad()) for ball in row] for row in balls]).reshape(n_x, width)
             largest = float(np.abs(middle).max(initial=1.0))
             if np.isfinite(largest) and radius.max(initial=0.0) <= RADIUS * largest:
-                # What falls below the floats' range is off by the least of them; an exact 0 is not.
+                # A value below the range of floats has an error of the smallest float; an exact 0 has none.
                 tiny = np.finfo(np.float64).tiny
                 least = np.array([[0.0 if ball.is_zero() else tiny for ball in row] for row in balls])
-                return with_radius(middle, UNIT * np.abs(middle) + radius + least.reshape(middle.shape))
+                return with_error_radius(
+                    middle, UNIT_ROUNDOFF * np.abs(middle) + radius + least.reshape(middle.shape)
+                )
     finally:
         flint.ctx.prec = precision
-    raise ApcError(Diagnostic("E806", SourceLocation("the scene"), TOO_LARGE))
+    raise ApcError(Diagnostic("E806", SourceLocation("the topology"), TOO_LARGE))

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class DisplayUnit(str):
-    """A unit in SI by its text, with the unit in which people are shown a value: the one the scene uses.
+    """A unit in SI by its text, with the unit for display: that of the topology.
 
     Results hold values in SI and this unit, so that plain data is in SI; texts convert by `as_shown`.
     """
@@ -37,13 +37,13 @@ class DisplayUnit(str):
 
 
 def as_shown(value: float, unit: str) -> tuple[Fraction, str]:
-    """Return what a number in SI is multiplied by to be shown, and the unit it then has.
+    """Return the factor from SI to the unit in which a number is shown, and that unit.
 
-    That is the unit in which the scene writes it; without one a time below 1 s is shown in ms.
+    The display unit is that of the topology; without one a time below 1 s is shown in ms.
     """
     display = getattr(unit, "display", "")
     if display and display != unit:
-        # Imported here: the language of quantities, which a scene in SI never needs.
+        # Imported here: the language of quantities, which a topology in SI never needs.
         from apc.compiler.language.units import parse_unit
 
         return 1 / parse_unit(display, SourceLocation("")).scale, display

@@ -1,9 +1,10 @@
-"""Exact time: the quantum that all times are multiples of, and the hyperperiod of the clocks, the frame.
+"""Exact time: the common quantum of all times, and the hyperperiod of the clocks, called the frame.
 
-Takes: a `Model`, its timings as exact rationals, what matters of its kinds.
+Takes: a `Model`, its timings as exact rationals, the live parts of its peer types.
 Gives: `Times`, `ClockGrid`, `times_in_use`.
-Guarantees: every period, phase and delay in use is a whole number of quanta; what nobody uses takes no part.
-Does not: say what happens at an instant (see `scheduling`).
+Guarantees: every period, phase and delay in use is an integer number of quanta; unused clocks and delays have
+no effect.
+Does not: list the events at an instant (see `scheduling`).
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ from fractions import Fraction
 from apc.compiler.compiled import Clock, Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.multiples import common_divisor, common_multiple
+from apc.frame.linear_subsystem import LinearSubsystem
 from apc.frame.liveness import ReceptionPattern, live_holds
-from apc.frame.site import LinearSubsystem
 
 MOST_TICKS = 20_000  # in a frame: each is a step of the lifting
 
@@ -41,7 +42,7 @@ class ClockGrid:
 
 @dataclass(frozen=True, slots=True)
 class Times:
-    """Every time of the system in quanta."""
+    """All times of a model, in quanta."""
 
     quantum: Fraction
     frame: int
@@ -54,18 +55,18 @@ def times_in_use(
     timings: Mapping[str, Fraction],
     patterns: Sequence[LinearSubsystem],
     live: Sequence[frozenset[tuple[int, int]]],
-    hearing: Sequence[ReceptionPattern],
+    reception: Sequence[ReceptionPattern],
 ) -> Times:
-    """Find the quantum of which every period, phase and delay in use is a multiple, and the frame.
+    """Return the quantum that divides every period, phase and delay in use, and the frame.
 
     Parameters
     ----------
     system, timings
-        The compiled scene, and seconds by the name of the timing.
+        The compiled model, and seconds by the name of the timing.
     patterns, live
-        The structural pattern of each kind, and its outputs that matter (see `liveness`).
-    hearing
-        What the receives of each group hear.
+        The structural pattern of each peer type, and its live outputs (see `liveness`).
+    reception
+        The coupling terms of each group's receives.
 
     Raises
     ------
@@ -78,15 +79,17 @@ def times_in_use(
     delays: dict[str, Fraction] = {}
     for pattern, outputs in zip(patterns, live, strict=True):
         for partition, _ in outputs:
-            name = pattern.kind.clocks[partition].clock
+            name = pattern.peer_type.clocks[partition].clock
             clocks[name] = clock_of[name]
-        for hold, used in zip(pattern.kind.holds, live_holds(pattern, outputs), strict=True):
+        for hold, used in zip(pattern.peer_type.holds, live_holds(pattern, outputs), strict=True):
             if used:
                 delays[hold.delay] = timings[hold.delay]
-    for way, _ in (pair for own in hearing for partition in own for receive in partition for pair in receive):
-        clock = link_of[way.link].clock
+    for coupling_term, _ in (
+        pair for local in reception for partition in local for receive in partition for pair in receive
+    ):
+        clock = link_of[coupling_term.link].clock
         clocks[clock] = clock_of[clock]
-        delays[way.delay] = timings[way.delay]
+        delays[coupling_term.delay] = timings[coupling_term.delay]
     for name, delay in delays.items():
         if delay < 0:
             got = f"{float(delay):g} s"
@@ -118,11 +121,11 @@ def _check_frame_length(
     frame: int,
     quantum: Fraction,
 ) -> None:
-    """Refuse clocks that stand as before only after too many ticks to step through."""
+    """Raise an error for clocks whose hyperperiod has too many ticks."""
     ticks = sum(frame // number for number in count.values())
     if ticks > MOST_TICKS:
         clocks = ", ".join(f"{name} {float(value) * 1e3:.9g} ms" for name, value in period.items() if name)
-        what = (
+        message = (
             f"the clocks' common period is {float(frame * quantum):.6g} s, {ticks} ticks "
             f"({clocks}); at most {MOST_TICKS} can be analysed"
         )
@@ -134,12 +137,12 @@ def _check_frame_length(
             periods = (1000 * frame * quantum / ticks for ticks in fits)
             short = (f"{float(ms):g} ms" for ms in periods if Fraction(f"{float(ms):.3g}") == ms)
             hint = f"{fastest}: {next(short, f'{frame * quantum / fits[0]} s')}"
-        place = SourceLocation(system.origin.topology, odd.line, odd.column)
-        raise ApcError(Diagnostic("E805", place, what, hint=hint))
+        location = SourceLocation(system.origin.topology, odd.line, odd.column)
+        raise ApcError(Diagnostic("E805", location, message, hint=hint))
 
 
 def _fastest_that_fits(count: Mapping[str, int], frame: int) -> range:
-    """Return how often the fastest clock may tick in the frame of all others, the most first."""
+    """Return the possible tick counts of the fastest clock in the frame of all others, largest first."""
     others = [frame // number for number in sorted(count.values())[1:]]
     step = math.lcm(*others)
     return range((MOST_TICKS - sum(others)) // step * step, 0, -step)

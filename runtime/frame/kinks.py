@@ -1,12 +1,12 @@
 """Kinks: points where an equation of a peer has different slopes on different sides.
 
-Takes: a kind of a `Model`, a point at which it is linearized.
-Gives: `Point`, `LinearPiece`, `pieces_at`, `one_sided`, `names_of`; `tie_indicators`, `refuse_kinks`,
-`at_a_kink`.
+Takes: a peer type of a `Model`, a point at which it is linearized.
+Gives: `Point`, `LinearPiece`, `linear_pieces_at`, `one_sided_peer_type`, `names_of`; `tie_indicators`,
+`refuse_kinks`, `at_a_kink`; `equal`.
 Guarantees: a piece is selected by some direction of motion away from the point, to first order: slopes that
-no side has are never returned. A one-sided kind has the values of the kind itself, and at the point the
+no side has are never returned. A one-sided peer type has the values of the original, and at the point the
 slopes of its piece.
-Does not: linearize, or combine the pieces of several peers (see `analysis.sides`).
+Does not: linearize, or combine the pieces of several peers (see `analysis.one_sided_slopes`).
 
 At a tie of max(a, b) a symbolic derivative is the mean of both slopes. A linearization with it describes no
 motion: on either side one of the two acts.
@@ -28,20 +28,20 @@ from scipy.optimize import linprog
 from apc.compiler.compiled import PeerType
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.interpolation import jacobian
-from apc.frame.decisions import SwitchedPeerType, decided_kind, find_switches
-from apc.frame.finite_equations import part_of
+from apc.frame.branch_conditions import SwitchedPeerType, decided_peer_type, find_switches
+from apc.frame.evaluation_errors import part_of
 
 # A guard of this size relative to its terms is zero: its evaluation rounds some ten times.
 TIE = 2.0**-46
-# What a guard of zeros alone is shifted by: any number that changes no other sum.
+# The shift of a guard of zeros alone: any number that changes no other sum.
 SMALLEST = 1e-300
 # Slopes and values that differ by less, relative to themselves or to the largest, are equal: expressions are
 # rounded in another order on each side.
 EQUAL, ROUNDED = 1e-12, 1e-14
 # Ties at one point: each doubles the pieces to be tried.
 MOST_TIES = 8
-# Kinds whose guards are remembered.
-KEPT = 64
+# Peer types with cached guards.
+CACHE_SIZE = 64
 
 _GENERATED = re.compile(r"\.held\d+$")  # names of expressions that are held
 
@@ -59,7 +59,7 @@ class LinearPiece:
     `values` are those of all functions at the point, `slopes` over everything that moves.
     """
 
-    taken: tuple[tuple[int, bool], ...]
+    selected: tuple[tuple[int, bool], ...]
     moving: Moving
     values: Floats
     slopes: Floats
@@ -67,15 +67,15 @@ class LinearPiece:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Guards:
-    """Guards, slopes and values of a kind as functions of its columns and of the decisions' symbols."""
+    """Guards, slopes and values of a peer type as functions of its columns and of the decisions' symbols."""
 
     guards: Any  # casadi.Function -> (guards (n,), their slopes (n, moving), size of their terms (n,))
     slopes: Any  # casadi.Function -> (values, slopes, size of the values' terms), of all functions in a row
 
 
-@functools.lru_cache(maxsize=KEPT)
+@functools.lru_cache(maxsize=CACHE_SIZE)
 def _guards(switched: SwitchedPeerType) -> _Guards:
-    """Return the functions of a kind that `pieces_at` evaluates."""
+    """Return the functions of a peer type that `linear_pieces_at` evaluates."""
     columns = list(switched.columns.values())
     symbols = [decision.symbol for decision in switched.decisions]
     everything = casadi.vertcat(*columns)
@@ -92,13 +92,15 @@ def _guards(switched: SwitchedPeerType) -> _Guards:
     )
 
 
-def pieces_at(switched: SwitchedPeerType, point: Point, *, every: bool = False) -> tuple[LinearPiece, ...]:
+def linear_pieces_at(
+    switched: SwitchedPeerType, point: Point, *, every: bool = False
+) -> tuple[LinearPiece, ...]:
     """Return the pieces that meet a point, those of equal slopes once; one without ties where it is smooth.
 
     Parameters
     ----------
     switched
-        The kind with its decisions laid open.
+        The peer type with symbols for its decisions.
     point
         Where it is linearized; columns that are left out are zero.
     every
@@ -122,26 +124,26 @@ def pieces_at(switched: SwitchedPeerType, point: Point, *, every: bool = False) 
 
     def follow(symbols: list[float], tied: dict[int, bool]) -> None:
         """Try both sides of each tie, in the order in which guards depend on earlier decisions."""
-        place = len(symbols)
-        if place == count:
+        index = len(symbols)
+        if index == count:
             leaves.append(tied)
             return
-        guards, _, terms = functions.guards(*columns, [*symbols, *[0.0] * (count - place)])
-        guard, tie = float(guards[place]), max(TIE * float(terms[place]), SMALLEST)
+        guards, _, terms = functions.guards(*columns, [*symbols, *[0.0] * (count - index)])
+        guard, tie = float(guards[index]), max(TIE * float(terms[index]), SMALLEST)
         if not abs(guard) <= tie or not np.isfinite(tie):
-            follow([*symbols, float(bool(switched.decisions[place].holds(guard)))], tied)
+            follow([*symbols, float(bool(switched.decisions[index].holds(guard)))], tied)
             return
-        if switched.decisions[place].point:
-            follow([*symbols, 0.0], {**tied, place: False})
+        if switched.decisions[index].point:
+            follow([*symbols, 0.0], {**tied, index: False})
             return
         if len(tied) == MOST_TIES:
-            raise _refused(switched, [*tied, place], f"takes more than {MOST_TIES} decisions there")
+            raise _refused(switched, [*tied, index], f"takes more than {MOST_TIES} decisions there")
         for side in (True, False):
-            follow([*symbols, float(side)], {**tied, place: side})
+            follow([*symbols, float(side)], {**tied, index: side})
 
     follow([], {})
     # The value at the point itself, where it is compared with "==": elsewhere one of the sides has it.
-    points = {place for place, decision in enumerate(switched.decisions) if decision.point}
+    points = {index for index, decision in enumerate(switched.decisions) if decision.point}
     result: list[LinearPiece] = []
     for tied in leaves:
         symbols = _symbols(switched, functions, columns, tied)
@@ -170,9 +172,9 @@ def _symbols(
 ) -> list[float]:
     """Return the value of every decision's symbol on one side of the ties."""
     symbols: list[float] = [0.0] * len(switched.decisions)
-    for place, decision in enumerate(switched.decisions):
+    for index, decision in enumerate(switched.decisions):
         guards, *_ = functions.guards(*columns, symbols)
-        symbols[place] = float(tied.get(place, bool(decision.holds(float(guards[place])))))
+        symbols[index] = float(tied.get(index, bool(decision.holds(float(guards[index])))))
     return symbols
 
 
@@ -182,32 +184,32 @@ def _reachable(switched: SwitchedPeerType, rows: Floats, tied: Mapping[int, bool
     Parameters
     ----------
     switched
-        The kind.
+        The peer type.
     rows
         The slopes of all guards (n, moving). A guard without slope restricts no direction.
     tied
         The sides.
     """
-    wanted = []
-    for place, side in tied.items():
-        size = float(np.abs(rows[place]).max(initial=0.0))
-        if size > 0 and np.isfinite(size) and not switched.decisions[place].point:
-            sign = 1.0 if side is switched.decisions[place].above else -1.0
-            wanted.append(sign * rows[place] / size)
-    if len(wanted) < 2:
+    requested = []
+    for index, side in tied.items():
+        size = float(np.abs(rows[index]).max(initial=0.0))
+        if size > 0 and np.isfinite(size) and not switched.decisions[index].point:
+            sign = 1.0 if side is switched.decisions[index].above else -1.0
+            requested.append(sign * rows[index] / size)
+    if len(requested) < 2:
         return True
-    matrix = np.array(wanted)
+    matrix = np.array(requested)
     if np.linalg.matrix_rank(matrix, tol=1e-6) == len(matrix):
         return True  # every combination of signs
     # A direction d with matrix d ≥ 1 exists, in a box large enough for rows that are nearly opposite.
-    found = linprog(
+    result = linprog(
         np.zeros(matrix.shape[1]),
         A_ub=-matrix,
         b_ub=-np.ones(len(matrix)),
         bounds=(-1e9, 1e9),
         method="highs",
     )
-    return bool(found.status == 0)
+    return bool(result.status == 0)
 
 
 def equal(first: Floats, second: Floats) -> bool:
@@ -219,41 +221,41 @@ def _small(values: Floats) -> float:
     return ROUNDED * float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
 
 
-def names_of(switched: SwitchedPeerType, places: Sequence[int]) -> tuple[str, ...]:
-    """Return the names of what some decisions change, each once; of a held expression its part's."""
+def names_of(switched: SwitchedPeerType, indices: Sequence[int]) -> tuple[str, ...]:
+    """Return the names of the outputs that decisions change, each once; of a held expression its part's."""
     return tuple(
         dict.fromkeys(
-            _GENERATED.sub("", name) for place in places for name in switched.decisions[place].changes
+            _GENERATED.sub("", name) for index in indices for name in switched.decisions[index].changes
         )
     )
 
 
-def _refused(switched: SwitchedPeerType, places: Sequence[int], why: str) -> ApcError:
-    names = names_of(switched, places)
+def _refused(switched: SwitchedPeerType, indices: Sequence[int], why: str) -> ApcError:
+    names = names_of(switched, indices)
     if not names:  # a comparison with "==" has no sides to name
-        symbols = [switched.decisions[place].symbol for place in places]
+        symbols = [switched.decisions[index].symbol for index in indices]
         listed = (name for f in switched.functions for s in symbols for name in f.names(f.output, s))
         names = tuple(dict.fromkeys(_GENERATED.sub("", name) for name in listed))
-    return at_a_kink(switched.kind.name, f"{', '.join(names) or 'an equation'} {why}", names)
+    return at_a_kink(switched.peer_type.name, f"{', '.join(names) or 'an equation'} {why}", names)
 
 
-def at_a_kink(where: str, what: str, names: Sequence[str]) -> ApcError:
+def at_a_kink(where: str, subject: str, names: Sequence[str]) -> ApcError:
     """Return the refusal of a point without a linearization, at which the variables of these names switch."""
-    text = f"{what}: there is no linearization at the start values, only on one side of it"
+    text = f"{subject}: there is no linearization at the start values, only on one side of it"
     subject = part_of(names[0]) if names else ""
     return ApcError(Diagnostic("E808", SourceLocation(where), text, subject=subject))
 
 
-def one_sided(switched: SwitchedPeerType, taken: Mapping[int, bool], moving: Moving) -> PeerType:
-    """Return a kind whose slopes at a point are those of one piece.
+def one_sided_peer_type(switched: SwitchedPeerType, selected: Mapping[int, bool], moving: Moving) -> PeerType:
+    """Return a peer type whose slopes at a point are those of one piece.
 
     The switching point of each tied decision is shifted by twice its tolerance, whatever the parameters are.
 
     Parameters
     ----------
     switched
-        The kind with its decisions laid open.
-    taken
+        The peer type with symbols for its decisions.
+    selected
         For each tied decision whether it is taken at the point.
     moving
         The point.
@@ -261,17 +263,17 @@ def one_sided(switched: SwitchedPeerType, taken: Mapping[int, bool], moving: Mov
     expressions: list[Any] = []
     symbols = casadi.vertcat(*(switched.columns[name] for name, _ in moving))
     point = casadi.DM([value for _, column in moving for value in column])
-    for place, decision in enumerate(switched.decisions):
+    for index, decision in enumerate(switched.decisions):
         guard = _guard(switched, expressions)
         if decision.point:
-            expressions.append(casadi.SX(0) if place in taken else decision.holds(guard))
+            expressions.append(casadi.SX(0) if index in selected else decision.holds(guard))
             continue
-        if place in taken:
+        if index in selected:
             terms = casadi.substitute(_terms(switched, guard), symbols, point)
             shift = 2 * casadi.fmax(TIE * terms, SMALLEST)
-            guard += shift if taken[place] is decision.above else -shift
+            guard += shift if selected[index] is decision.above else -shift
         expressions.append(decision.holds(guard))
-    return decided_kind(switched, expressions)
+    return decided_peer_type(switched, expressions)
 
 
 def _guard(switched: SwitchedPeerType, earlier: Sequence[Any]) -> Any:
@@ -287,15 +289,15 @@ def _terms(switched: SwitchedPeerType, guard: Any) -> Any:
     return casadi.fabs(jacobian(guard, everything)) @ casadi.fabs(everything)
 
 
-@functools.lru_cache(maxsize=KEPT)
-def tie_indicators(kind: PeerType) -> Any | None:
+@functools.lru_cache(maxsize=CACHE_SIZE)
+def tie_indicators(peer_type: PeerType) -> Any | None:
     """Return a function (x, u, m, r, p, t) -> (n,) that is above 0 where a decision is tied.
 
-    Its arguments are those of `SubsystemJacobians.function`. Not every tie is a kink: see `pieces_at`. None
-    where nothing depends on a decision, where a nonlinear loop hides the decisions, or where values of single
-    senders decide.
+    Its arguments are those of `SubsystemJacobians.function`. Not every tie is a kink: see `linear_pieces_at`.
+    None where nothing depends on a decision, where a nonlinear loop hides the decisions, or where values of
+    single senders decide.
     """
-    switched = find_switches(kind)
+    switched = find_switches(peer_type)
     if not switched.decisions:
         return None
     columns = switched.columns
@@ -314,17 +316,17 @@ def tie_indicators(kind: PeerType) -> Any | None:
     if any(casadi.depends_on(column, c) for name, c in columns.items() if name.startswith("s")):
         return None
     m, r = (
-        casadi.vertcat(*(columns.get(f"{letter}{p}", casadi.SX(0, 1)) for p in range(len(kind.clocks))))
+        casadi.vertcat(*(columns.get(f"{letter}{p}", casadi.SX(0, 1)) for p in range(len(peer_type.clocks))))
         for letter in "mr"
     )
     arguments = [columns["x"], columns["u"], m, r, columns["p"], columns["t"]]
     return casadi.Function("ties", arguments, [casadi.densify(column)])
 
 
-def refuse_kinks(kind: PeerType, where: str, point: Point) -> None:
+def refuse_kinks(peer_type: PeerType, where: str, point: Point) -> None:
     """Refuse a point at which slopes differ from side to side: ApcError E808."""
-    switched = find_switches(kind)
-    pieces = pieces_at(switched, point)
+    switched = find_switches(peer_type)
+    pieces = linear_pieces_at(switched, point)
     if len(pieces) > 1:
-        names = names_of(switched, [place for place, _ in pieces[0].taken])
+        names = names_of(switched, [index for index, _ in pieces[0].selected])
         raise at_a_kink(where, f"{', '.join(names) or 'an equation'} of {where} has a kink there", names)

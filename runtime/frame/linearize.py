@@ -1,11 +1,12 @@
-"""The matrices of a site where it starts: of one, or of many at once.
+"""Linearization: the matrices of one subsystem, or of many, at the start values.
 
-Takes: a kind's `SubsystemJacobians`, a parameter vector or many, what the site hears at the start.
-Gives: `linearize`, `linearize_exact`, `linearize_rows`, `of_rows`; `site_of`, `site_of_entries`; what a site
-is and sends at the start (`start_values`, `start_sends`, `start_arguments`, `start_names`, `reaches_start`,
-`sends_nothing`, `at_start`); `InitialReception`.
-Guarantees: a site that is not affine is linearized at its start values; holds put out zero there.
-Does not: decide when anything happens (see `scheduling`); ask who hears whom (see `peers`).
+Takes: the `SubsystemJacobians` of a peer type, one or many parameter vectors, the values received at the
+start.
+Gives: `linearize`, `linearize_exact`, `linearize_rows`, `of_rows`; `subsystem_of`, `subsystem_of_entries`;
+the start values and the values sent at the start (`start_values`, `start_sends`, `start_arguments`,
+`start_names`, `reaches_start`, `sends_nothing`, `at_start`); `InitialReception`; `check_start`.
+Guarantees: a subsystem that is not affine is linearized at its start values, with zero outputs of holds.
+Does not: schedule events (see `scheduling`) or select senders (see `peer_classes`).
 """
 
 from __future__ import annotations
@@ -23,46 +24,49 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import PEERS, Model, PeerType
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
-from apc.frame.exact import evaluate_exact
-from apc.frame.finite_equations import part_of
+from apc.frame.evaluation_errors import part_of
+from apc.frame.exact_arithmetic import evaluate_exact
 from apc.frame.jacobians import SubsystemJacobians
 from apc.frame.kinks import refuse_kinks, tie_indicators
-from apc.frame.names import ParameterRef
+from apc.frame.linear_subsystem import LinearSubsystem, assemble, cut, every_matrix, with_local_parts
+from apc.frame.parameter_names import ParameterRef
 from apc.frame.parameters import exact_numbers, scope_of
-from apc.frame.site import LinearSubsystem, assemble, cut, every_matrix, with_own_parts
 
-# Kinds that are kept as they start, and functions of many sites.
-KEPT = 64
+# Cached peer types at their start, and batch functions of subsystems.
+CACHE_SIZE = 64
 
 
 @dataclass(frozen=True, slots=True)
 class InitialReception:
-    """What a site's receives (of all clocks in a row) are at the start, and their own parts.
+    """The values of a subsystem's receives (of all clocks) at the start, and their slopes.
 
-    `values` (n_r,) are exact; `own` are the slopes over (x, u, m) of each receive, None for a plain one.
+    `values` (n_r,) are exact; `values` are the slopes over (x, u, m) of each receive, None for a plain one.
     """
 
     values: tuple[Fraction, ...]
-    own: tuple[tuple[Fraction, ...] | None, ...]
+    local_slopes: tuple[tuple[Fraction, ...] | None, ...]
 
 
 def start_values(
-    site: SubsystemJacobians, parameters: Sequence[Any]
+    subsystem: SubsystemJacobians, parameters: Sequence[Any]
 ) -> tuple[list[Any], list[Any], list[list[Any]]]:
-    """Return x, u and every clock partition's m at the start, where holds put out zero."""
-    place = {name: index for index, name in enumerate(site.kind.parameters)}
-    x = [parameters[place[state.start]] for state in site.kind.states]
-    m = [[parameters[place[start]] for start in partition.starts] for partition in site.kind.clocks]
-    return x, [0] * len(site.kind.holds), m
+    """Return x, u and m of every clock partition at the start, with zero outputs of holds."""
+    position = {name: index for index, name in enumerate(subsystem.peer_type.parameters)}
+    x = [parameters[position[state.start]] for state in subsystem.peer_type.states]
+    m = [
+        [parameters[position[start]] for start in partition.starts]
+        for partition in subsystem.peer_type.clocks
+    ]
+    return x, [0] * len(subsystem.peer_type.holds), m
 
 
 def start_sends(
-    site: SubsystemJacobians, parameters: Sequence[Any], number: Callable[[float], Any] = Fraction
+    subsystem: SubsystemJacobians, parameters: Sequence[Any], number: Callable[[float], Any] = Fraction
 ) -> dict[str, list[Any]]:
-    """Return what a site sends at the start, by link."""
-    x, u, _ = start_values(site, parameters)
+    """Return the values that a subsystem sends at the start, by link."""
+    x, u, _ = start_values(subsystem, parameters)
     sent = {}
-    for sending in site.kind.sends:
+    for sending in subsystem.peer_type.sends:
         if not sending.send.is_a("SXFunction"):
             rounded = sending.send(*([float(value) for value in part] for part in (x, u, parameters, [0.0])))
             sent[sending.link] = [number(float(value)) for value in np.asarray(rounded).ravel()]
@@ -74,256 +78,281 @@ def start_sends(
 
 
 def start_names(system: Model) -> set[str]:
-    """Return the parameters that are start values of states and of what clocks remember."""
-    return {name for kind in system.kinds for name in _starts(kind)}
+    """Return the parameters that are start values of states and of clock memories."""
+    return {name for peer_type in system.peer_types for name in _starts(peer_type)}
 
 
-def _starts(kind: PeerType) -> list[str]:
-    remembered = (name for clock in kind.clocks for name in clock.starts)
-    return [*(state.start for state in kind.states), *remembered]
+def _starts(peer_type: PeerType) -> list[str]:
+    discrete_states_of = (name for clock in peer_type.clocks for name in clock.starts)
+    return [*(state.start for state in peer_type.states), *discrete_states_of]
 
 
 def reaches_start(system: Model, free: ParameterRef) -> bool:
-    """Say whether where a scene starts is, or depends on, this parameter."""
+    """Return whether the start values depend on this parameter."""
     starts = start_names(system)
     return free.name in starts or free.name in scope_of(system).needed(sorted(starts))
 
 
-def sends_nothing(kind: PeerType, rows: NDArray[np.float64]) -> bool:
-    """Say whether all that peers send at the start is 0, whatever their parameters but the start values.
+def sends_nothing(peer_type: PeerType, rows: NDArray[np.float64]) -> bool:
+    """Return whether all values sent at the start are 0, for any parameters except the start values.
 
     Parameters
     ----------
-    kind
-        The peers' kind.
+    peer_type
+        The peer type.
     rows
-        The parameters of each different one, in SI (k, n_p).
+        The parameters of each distinct peer, in SI (k, n_p).
     """
-    if not all(send.send.is_a("SXFunction") for send in kind.sends):
+    if not all(send.send.is_a("SXFunction") for send in peer_type.sends):
         return False
-    place = {name: index for index, name in enumerate(kind.parameters)}
-    starts = sorted({place[name] for name in _starts(kind)})
-    symbols = [casadi.SX.sym(name) for name in kind.parameters]
+    position = {name: index for index, name in enumerate(peer_type.parameters)}
+    starts = sorted({position[name] for name in _starts(peer_type)})
+    symbols = [casadi.SX.sym(name) for name in peer_type.parameters]
     for values in np.unique(rows[:, starts], axis=0).tolist():
         known = dict(zip(starts, values, strict=True))
         listed = [known.get(index, symbol) for index, symbol in enumerate(symbols)]
-        x = casadi.vertcat(*(listed[place[state.start]] for state in kind.states))
-        arguments = [x, casadi.SX.zeros(len(kind.holds)), casadi.vertcat(*listed), casadi.SX(0)]
-        if not all(send.send(*arguments).is_zero() for send in kind.sends):
+        x = casadi.vertcat(*(listed[position[state.start]] for state in peer_type.states))
+        arguments = [x, casadi.SX.zeros(len(peer_type.holds)), casadi.vertcat(*listed), casadi.SX(0)]
+        if not all(send.send(*arguments).is_zero() for send in peer_type.sends):
             return False
     return True
 
 
-@lru_cache(maxsize=KEPT)
-def at_start(site: SubsystemJacobians, *, silent: bool = False) -> SubsystemJacobians | None:
-    """Return a kind's Jacobians where it starts, which follow from its parameters alone.
+@lru_cache(maxsize=CACHE_SIZE)
+def at_start(subsystem: SubsystemJacobians, *, silent: bool = False) -> SubsystemJacobians | None:
+    """Return a peer type's Jacobians at its start values, as functions of its parameters alone.
 
-    Start values are parameters, too. None where what is heard decides as well, or a nonlinear loop does;
-    with `silent` all that is heard at the start is 0.
+    Start values are parameters, too. None where received values or a nonlinear loop matter as well; with
+    `silent` all values received at the start are 0.
     """
-    if site.parameters_suffice:
-        return site
-    if site.edges or not site.walkable:
+    if subsystem.parameters_suffice:
+        return subsystem
+    if subsystem.edges or not subsystem.walkable:
         return None
-    symbols = site.function.sx_in()
-    parameters, heard = symbols[4], symbols[3]
-    x, u, memories = start_values(site, casadi.vertsplit(parameters) if parameters.numel() else [])
+    symbols = subsystem.function.sx_in()
+    parameters, received = symbols[4], symbols[3]
+    x, u, memories = start_values(subsystem, casadi.vertsplit(parameters) if parameters.numel() else [])
     m = [value for memory in memories for value in memory]
-    flat = site.function(casadi.vertcat(*x), casadi.vertcat(*u), casadi.vertcat(*m), heard, parameters, 0)
-    if flat.numel() and casadi.depends_on(flat, heard):
+    flat = subsystem.function(
+        casadi.vertcat(*x), casadi.vertcat(*u), casadi.vertcat(*m), received, parameters, 0
+    )
+    if flat.numel() and casadi.depends_on(flat, received):
         if not silent:
             return None
-        flat = casadi.substitute(flat, heard, casadi.SX.zeros(heard.shape))
-    built = replace(site, function=casadi.Function("jacobians", symbols, [flat]), affine=True, timed=False)
-    ties = tie_indicators(site.equations)
+        flat = casadi.substitute(flat, received, casadi.SX.zeros(received.shape))
+    built = replace(
+        subsystem, function=casadi.Function("jacobians", symbols, [flat]), affine=True, timed=False
+    )
+    ties = tie_indicators(subsystem.equations)
     if ties is None:
         return built
     point = [casadi.vertcat(*x), casadi.vertcat(*u), casadi.vertcat(*m)]
-    column = ties(*point, casadi.SX.zeros(heard.shape) if silent else heard, parameters, 0)
-    if casadi.depends_on(column, heard):
+    column = ties(*point, casadi.SX.zeros(received.shape) if silent else received, parameters, 0)
+    if casadi.depends_on(column, received):
         return None
     return replace(built, ties=casadi.Function("ties", symbols, [column]))
 
 
 def start_arguments(
-    site: SubsystemJacobians,
+    subsystem: SubsystemJacobians,
     parameters: list[Any],
     number: Callable[[float], Any],
-    listening: InitialReception | None,
+    initial_reception: InitialReception | None,
 ) -> list[list[Any]]:
-    """Return (x, u, m, r, p, t) at the start: holds put out zero.
+    """Return (x, u, m, r, p, t) at the start, with zero outputs of holds.
 
-    The Jacobians of an affine site look at nothing but the parameters: zeros will do.
+    The Jacobians of an affine subsystem depend on the parameters alone: the other arguments are zeros.
     """
-    kind, zero = site.kind, number(0.0)
-    if site.affine:
-        sizes = [site.function.numel_in(argument) for argument in range(4)]
+    peer_type, zero = subsystem.peer_type, number(0.0)
+    if subsystem.affine:
+        sizes = [subsystem.function.numel_in(argument) for argument in range(4)]
         x, u, m, r = ([zero] * size for size in sizes)
         return [x, u, m, r, parameters, [zero]]
-    x, u, memories = start_values(site, parameters)
+    x, u, memories = start_values(subsystem, parameters)
     m = [value for memory in memories for value in memory]
-    if listening is not None:
-        r = [number(value) for value in listening.values]  # type: ignore[arg-type] # Fraction and float take both
+    if initial_reception is not None:
+        r = [number(value) for value in initial_reception.values]  # type: ignore[arg-type] # Fraction and float take both
         return [x, u, m, r, parameters, [zero]]
-    place = {name: index for index, name in enumerate(kind.parameters)}
-    sent = start_sends(site, parameters, number)
-    others = parameters[place[PEERS]] - 1 if PEERS in place else number(1.0)
+    position = {name: index for index, name in enumerate(peer_type.parameters)}
+    sent = start_sends(subsystem, parameters, number)
+    others = parameters[position[PEERS]] - 1 if PEERS in position else number(1.0)
     r = [
-        sent[heard.link][heard.channel] * (others if heard.operator == "sum" else number(1.0))
-        for partition in kind.clocks
-        for heard in partition.receives
+        sent[received.link][received.channel] * (others if received.operator == "sum" else number(1.0))
+        for partition in peer_type.clocks
+        for received in partition.receives
     ]
     return [x, u, m, r, parameters, [zero]]
 
 
 def linearize(
-    site: SubsystemJacobians, parameters: NDArray[np.float64], listening: InitialReception | None = None
+    subsystem: SubsystemJacobians,
+    parameters: NDArray[np.float64],
+    initial_reception: InitialReception | None = None,
 ) -> LinearSubsystem:
-    """Return the matrices of a site, in floats.
+    """Return the matrices of a subsystem, in floats.
 
     Parameters
     ----------
-    site
-        The kind's Jacobians.
+    subsystem
+        The peer type's Jacobians.
     parameters
-        The site's vector (n_p,), in the order of `PeerType.parameters`.
-    listening
-        What the site hears at the start. Left out, the others stand where this site stands; a site with edge
-        functions can't do without.
+        The subsystem's parameters (n_p,), in the order of `PeerType.parameters`.
+    initial_reception
+        The values received at the start. By default the other peers have the start values of this subsystem;
+        required for a subsystem with edge functions.
     """
-    if listening is not None and site.edges:
-        # A sum of slopes over many peers: rounded once, whatever cancels in it.
-        exact = linearize_exact(site, parameters, listening)
+    if initial_reception is not None and subsystem.edges:
+        # A sum of slopes over many peers: rounded once, whatever the cancellation.
+        exact = linearize_exact(subsystem, parameters, initial_reception)
         return every_matrix(exact, lambda matrix: matrix.astype(np.float64))
-    return site_of(site, _finite_slopes(site, parameters, listening))
+    return subsystem_of(subsystem, _finite_slopes(subsystem, parameters, initial_reception))
 
 
 def linearize_exact(
-    site: SubsystemJacobians, parameters: NDArray[np.float64], listening: InitialReception | None = None
+    subsystem: SubsystemJacobians,
+    parameters: NDArray[np.float64],
+    initial_reception: InitialReception | None = None,
 ) -> LinearSubsystem:
     """Return the same matrices as `linearize` in exact rationals, as object arrays of `Fraction`, and 0.
 
     Parameters
     ----------
-    site, parameters, listening
+    subsystem, parameters, initial_reception
         As for `linearize`.
     """
-    assert listening is not None or not site.edges, "who is heard decides what an edge function does"
-    assert site.function.is_a("SXFunction"), "the solution of a nonlinear loop is no rational number"
-    _finite_slopes(site, parameters, listening)
-    arguments = start_arguments(site, exact_numbers(site.kind, parameters), Fraction, listening)
-    exact = site_of_entries(site, evaluate_exact(site.function, arguments)[0], 0)
-    if listening is None:
+    assert initial_reception is not None or not subsystem.edges, (
+        "who is heard decides what an edge function does"
+    )
+    assert subsystem.function.is_a("SXFunction"), "the solution of a nonlinear loop is no rational number"
+    _finite_slopes(subsystem, parameters, initial_reception)
+    arguments = start_arguments(
+        subsystem, exact_numbers(subsystem.peer_type, parameters), Fraction, initial_reception
+    )
+    exact = subsystem_of_entries(subsystem, evaluate_exact(subsystem.function, arguments)[0], 0)
+    if initial_reception is None:
         return exact
-    rest = iter(listening.own)
-    own = [
+    rest = iter(initial_reception.local_slopes)
+    local = [
         [None if (part := next(rest)) is None else np.array(part, dtype=object) for _ in partition.receives]
-        for partition in site.kind.clocks
+        for partition in subsystem.peer_type.clocks
     ]
-    return with_own_parts(exact, own, np.add, np.multiply.outer)
+    return with_local_parts(exact, local, np.add, np.multiply.outer)
 
 
 def _finite_slopes(
-    site: SubsystemJacobians, parameters: NDArray[np.float64], listening: InitialReception | None
+    subsystem: SubsystemJacobians, parameters: NDArray[np.float64], initial_reception: InitialReception | None
 ) -> NDArray[np.float64]:
-    """Return the site's function at the start, in floats.
+    """Return the subsystem's function at the start, in floats.
 
     Raises
     ------
     ApcError
-        E808 a value of the site, or a slope of one, that is not finite.
+        E808 a value of the subsystem, or a slope, that is not finite.
     """
-    if site.parameters_suffice:
-        rows = linearize_rows(site, np.asarray(parameters, dtype=np.float64)[None])
+    if subsystem.parameters_suffice:
+        rows = linearize_rows(subsystem, np.asarray(parameters, dtype=np.float64)[None])
         flat: NDArray[np.float64] = rows[0]
     else:
-        if not site.affine:  # else the start is anywhere
-            check_start(site, parameters, listening)
-            _refuse_kinks(site, parameters, listening)
-        arguments = start_arguments(site, [float(value) for value in parameters], float, listening)
-        flat = np.asarray(site.function(*arguments), dtype=np.float64).ravel()
-    if site.ties is not None and np.isnan(flat).all():
-        refuse_kinks(site.equations, site.kind.name, _start_point(site, parameters))
-    _refuse_infinite(site, flat)
+        if not subsystem.affine:  # else any start will do
+            check_start(subsystem, parameters, initial_reception)
+            _refuse_kinks(subsystem, parameters, initial_reception)
+        arguments = start_arguments(
+            subsystem, [float(value) for value in parameters], float, initial_reception
+        )
+        flat = np.asarray(subsystem.function(*arguments), dtype=np.float64).ravel()
+    if subsystem.ties is not None and np.isnan(flat).all():
+        refuse_kinks(subsystem.equations, subsystem.peer_type.name, _start_point(subsystem, parameters))
+    _refuse_infinite(subsystem, flat)
     return flat
 
 
 def _refuse_kinks(
-    site: SubsystemJacobians, parameters: NDArray[np.float64], listening: InitialReception | None
+    subsystem: SubsystemJacobians, parameters: NDArray[np.float64], initial_reception: InitialReception | None
 ) -> None:
-    """Refuse a point at which slopes differ from side to side."""
-    ties = tie_indicators(site.equations)
+    """Raise an error for a point at which slopes differ from side to side."""
+    ties = tie_indicators(subsystem.equations)
     if ties is not None:
-        arguments = start_arguments(site, [float(value) for value in parameters], float, listening)
+        arguments = start_arguments(
+            subsystem, [float(value) for value in parameters], float, initial_reception
+        )
         if np.asarray(ties(*arguments)).any():
-            refuse_kinks(site.equations, site.kind.name, _start_point(site, parameters, arguments[3]))
+            refuse_kinks(
+                subsystem.equations,
+                subsystem.peer_type.name,
+                _start_point(subsystem, parameters, arguments[3]),
+            )
 
 
 def _start_point(
-    site: SubsystemJacobians, parameters: NDArray[np.float64], received: Sequence[float] | None = None
+    subsystem: SubsystemJacobians, parameters: NDArray[np.float64], received: Sequence[float] | None = None
 ) -> dict[str, Sequence[float]]:
-    """Return where a site starts, by the columns of `kinks.Point`; by default it receives zeros."""
+    """Return the start of a subsystem, by the columns of `kinks.Point`; by default it receives zeros."""
     numbers = [float(value) for value in parameters]
-    x, u, m = start_values(site, numbers)
+    x, u, m = start_values(subsystem, numbers)
     point: dict[str, Sequence[float]] = {"x": x, "u": u, "p": numbers, "t": [0.0]}
     rest = iter(received or itertools.repeat(0.0))
-    for p, (partition, memory) in enumerate(zip(site.equations.clocks, m, strict=True)):
+    for p, (partition, memory) in enumerate(zip(subsystem.equations.clocks, m, strict=True)):
         point |= {f"m{p}": memory, f"r{p}": [next(rest) for _ in partition.receives]}
     return point
 
 
 def check_start(
-    site: SubsystemJacobians, parameters: NDArray[np.float64], listening: InitialReception | None = None
+    subsystem: SubsystemJacobians,
+    parameters: NDArray[np.float64],
+    initial_reception: InitialReception | None = None,
 ) -> None:
-    """Evaluate the site's equations at the start values.
+    """Evaluate the subsystem's equations at the start values.
 
     Parameters
     ----------
-    site, parameters
-        The site and its numbers (n_p,).
-    listening
-        What it hears where that matters.
+    subsystem, parameters
+        The subsystem and its parameters (n_p,).
+    initial_reception
+        The values that it receives, where they matter.
 
     Raises
     ------
     ApcError
         E808 a value that is not finite, by name.
     """
-    x, u, m, r, p, t = start_arguments(site, [float(value) for value in parameters], float, listening)
-    kind = site.kind
-    values = [("der({})", [state.name for state in kind.states], kind.derivative(x, u, p, t))]
-    memories, heard = iter(m), iter(r)
-    for clock in kind.clocks:
-        pair = [next(memories) for _ in clock.memories], [next(heard) for _ in clock.receives]
+    x, u, m, r, p, t = start_arguments(
+        subsystem, [float(value) for value in parameters], float, initial_reception
+    )
+    peer_type = subsystem.peer_type
+    values = [("der({})", [state.name for state in peer_type.states], peer_type.derivative(x, u, p, t))]
+    memories, received = iter(m), iter(r)
+    for clock in peer_type.clocks:
+        pair = [next(memories) for _ in clock.memories], [next(received) for _ in clock.receives]
         column = clock.tick(x, u, *pair, p, t)
         values.append(("{}", list(clock.outputs) * (column.numel() // len(clock.outputs)), column))
-    values += [("{}", list(send.channels), send.send(x, u, p, t)) for send in kind.sends]
+    values += [("{}", list(send.channels), send.send(x, u, p, t)) for send in peer_type.sends]
     for form, rows, column in values:
-        _check_finite([form.format(row) for row in rows], np.asarray(column).ravel(), "", kind.name)
+        _check_finite([form.format(row) for row in rows], np.asarray(column).ravel(), "", peer_type.name)
 
 
-def _refuse_infinite(site: SubsystemJacobians, flat: NDArray[np.float64]) -> None:
-    """Refuse a slope that is not finite, by name."""
-    kind = site.kind
+def _refuse_infinite(subsystem: SubsystemJacobians, flat: NDArray[np.float64]) -> None:
+    """Raise an error that names a slope that is not finite."""
+    peer_type = subsystem.peer_type
     if not np.isfinite(flat).all():
-        matrices = iter(cut(flat, site.shapes))
-        rates = [f"der({state.name})" for state in kind.states]
+        matrices = iter(cut(flat, subsystem.shapes))
+        rates = [f"der({state.name})" for state in peer_type.states]
         ticks = [
-            (clock.outputs * (clock.tick.numel_out(0) // len(clock.outputs)), 4) for clock in kind.clocks
+            (clock.outputs * (clock.tick.numel_out(0) // len(clock.outputs)), 4) for clock in peer_type.clocks
         ]
         blocks: list[tuple[Sequence[str], int]] = [(rates, 2), *ticks]
-        blocks += [(send.channels, 2) for send in kind.sends]
+        blocks += [(send.channels, 2) for send in peer_type.sends]
         for names, count in blocks:
             for _ in range(count):
-                _check_finite(names, next(matrices).sum(axis=1), "the slope of ", kind.name)
+                _check_finite(names, next(matrices).sum(axis=1), "the slope of ", peer_type.name)
 
 
-def _check_finite(rows: Sequence[str], values: NDArray[np.float64], what: str, where: str) -> None:
-    """Refuse what is not finite, by name."""
+def _check_finite(rows: Sequence[str], values: NDArray[np.float64], subject: str, where: str) -> None:
+    """Raise an error that names a value that is not finite."""
     for row, value in zip(rows, values, strict=True):
         if not np.isfinite(value):
             text = (
-                f"{what}{row} is {value:g} at the start values: a division by zero, a root or logarithm of "
+                f"{subject}{row} is {value:g} at the start values: a division by zero, a root or "
+                "logarithm of "
             )
             hint = "start values at which every equation has a finite value and slope"
             raise ApcError(
@@ -337,86 +366,90 @@ def _check_finite(rows: Sequence[str], values: NDArray[np.float64], what: str, w
             )
 
 
-def linearize_rows(site: SubsystemJacobians, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the matrices of an affine site without edges for many parameter vectors (k, n_p), as rows.
+def linearize_rows(subsystem: SubsystemJacobians, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the matrices of an affine subsystem without edges for parameter vectors (k, n_p), as rows.
 
-    The rows (k, …) hold what `site_of` makes a site of.
+    `subsystem_of` makes a subsystem from the rows (k, …).
     """
-    assert site.parameters_suffice, "the start matters"
-    count, function = len(parameters), site.function
-    width, places = _output(function)
+    assert subsystem.parameters_suffice, "the start matters"
+    count, function = len(parameters), subsystem.function
+    width, indices = _output(function)
     rows = np.zeros((count, width))
     (values,) = of_rows(function, {4: parameters})
-    rows[:, places] = values + 0.0  # −0 and 0 are one number
-    if site.ties is not None:
-        (ties,) = of_rows(site.ties, {4: parameters})
+    rows[:, indices] = values + 0.0  # −0 and 0 are one number
+    if subsystem.ties is not None:
+        (ties,) = of_rows(subsystem.ties, {4: parameters})
         for row in np.flatnonzero((ties > 0).any(axis=1)):
             try:
-                refuse_kinks(site.equations, site.kind.name, _start_point(site, parameters[row]))
+                refuse_kinks(
+                    subsystem.equations, subsystem.peer_type.name, _start_point(subsystem, parameters[row])
+                )
             except ApcError:
                 rows[row] = np.nan
     return rows
 
 
-@lru_cache(maxsize=KEPT)
+@lru_cache(maxsize=CACHE_SIZE)
 def _of_many(function: Any, count: int) -> Any:
-    """Return a CasADi function of so many arguments side by side: to make it takes longer than to call it."""
+    """Return a CasADi function with the given number of arguments side by side, cached."""
     return function.map(count)
 
 
-@lru_cache(maxsize=KEPT)
+@lru_cache(maxsize=CACHE_SIZE)
 def _layout(function: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Return how long a function's arguments are, and how many entries of its outputs are stored."""
-    sizes = tuple(function.numel_in(place) for place in range(function.n_in()))
-    return sizes, tuple(function.nnz_out(place) for place in range(function.n_out()))
+    """Return the lengths of a function's arguments, and the number of stored entries of its outputs."""
+    sizes = tuple(function.numel_in(index) for index in range(function.n_in()))
+    return sizes, tuple(function.nnz_out(index) for index in range(function.n_out()))
 
 
-@lru_cache(maxsize=KEPT)
+@lru_cache(maxsize=CACHE_SIZE)
 def _output(function: Any) -> tuple[int, NDArray[np.int64]]:
-    """Return how long a function's first output is, and where it is not zero."""
+    """Return the length of a function's first output, and the indices of its nonzeros."""
     stored = np.array(function.sparsity_out(0).row(), dtype=np.int64)
     stored.setflags(write=False)
     return function.numel_out(0), stored
 
 
 def of_rows(function: Any, given: Mapping[int, NDArray[np.float64]]) -> list[NDArray[np.float64]]:
-    """Return a CasADi function's outputs at many rows of its arguments, each (k, entries that are stored).
+    """Return a CasADi function's outputs at many rows of its arguments, each (k, stored entries).
 
     Parameters
     ----------
     function
         The function, of dense arguments.
     given
-        Arguments (k, size) by their places; the others are zero.
+        Arguments (k, size) by their indices; the others are zero.
     """
     count = len(next(iter(given.values())))
     sizes, stored = _layout(function)
     result = [np.empty((count, number)) for number in stored]
     if not any(values.size for values in result):
         return result
-    # Evaluated where the numbers stand: CasADi's own matrices are copied entry by entry.
+    # Evaluated in place: CasADi's own matrices would be copied entry by entry.
     buffer, evaluate = _of_many(function, count).buffer()
     numbers = [np.zeros(max(1, count * size)) for size in sizes]
-    for place, rows in given.items():
-        numbers[place] = np.array(rows, dtype=np.float64, order="C").ravel()
-    for place, number in enumerate(numbers):
-        buffer.set_arg(place, number.data)
-    for place, rows in enumerate(result):
-        buffer.set_res(place, rows.reshape(-1).data)
+    for index, rows in given.items():
+        numbers[index] = np.array(rows, dtype=np.float64, order="C").ravel()
+    for index, number in enumerate(numbers):
+        buffer.set_arg(index, number.data)
+    for index, rows in enumerate(result):
+        buffer.set_res(index, rows.reshape(-1).data)
     evaluate()
     return result
 
 
-def site_of(site: SubsystemJacobians, numbers: NDArray[Any]) -> LinearSubsystem:
-    """Return the site of a row of `linearize_rows`, or of many (k, …) as one with a leading axis (k)."""
-    channels = [tick.channels for tick in site.pattern.ticks]
-    return assemble(site.kind, site.affine, cut(numbers, site.shapes), channels)
+def subsystem_of(subsystem: SubsystemJacobians, numbers: NDArray[Any]) -> LinearSubsystem:
+    """Return the subsystem of a row of `linearize_rows`, or of many (k, …) as one with a leading axis (k)."""
+    channels = [tick.channels for tick in subsystem.pattern.ticks]
+    return assemble(subsystem.peer_type, subsystem.affine, cut(numbers, subsystem.shapes), channels)
 
 
-def site_of_entries(site: SubsystemJacobians, result: Sequence[Any], zero: Any) -> LinearSubsystem:
-    """Return the site of a function's output over another kind of number (see `exact`), with its zero."""
-    sparsity = site.function.sparsity_out(0)
+def subsystem_of_entries(subsystem: SubsystemJacobians, result: Sequence[Any], zero: Any) -> LinearSubsystem:
+    """Return the subsystem of a function's output over another number type (see `exact_arithmetic`), with its
+    zero.
+    """
+    sparsity = subsystem.function.sparsity_out(0)
     entries = np.empty(sparsity.numel(), dtype=object)
     entries[:] = [zero]
     entries[sparsity.row()] = result
-    return site_of(site, entries)
+    return subsystem_of(subsystem, entries)

@@ -1,10 +1,10 @@
-"""What of a scene matters: what can reach the motion or the network, what that reads, and whom it hears.
+"""Liveness: the outputs, holds and receives that can affect the motion or the network.
 
-Takes: the structural patterns of a `Model`'s kinds, the exchange.
-Gives: `live_outputs`, `live_holds`, `live_receives`; `ReceptionPattern`, `hearing_of`.
-Guarantees: structure alone decides; no number makes anything live or dead. A way for each delay among the
-senders; nobody who doesn't send is on one.
-Does not: know when anything happens, is sent or heard.
+Takes: the structural patterns of a `Model`'s peer types, the exchange.
+Gives: `live_outputs`, `live_holds`, `live_receives`; `ReceptionPattern`, `reception_of`.
+Guarantees: structure alone decides, never a parameter value. There is one coupling term for each delay among
+the senders, without peers that do not send.
+Does not: know the instants of events.
 """
 
 from __future__ import annotations
@@ -13,40 +13,40 @@ from collections.abc import Sequence
 from fractions import Fraction
 
 from apc.compiler.compiled import Model
-from apc.frame.exchange import CommunicationGraph, check_mean
+from apc.frame.communication_graph import CommunicationGraph, check_mean
 from apc.frame.jacobians import edge_name
+from apc.frame.linear_subsystem import LinearSubsystem
 from apc.frame.schedule import CouplingTerm
-from apc.frame.site import LinearSubsystem
 
 
 def live_outputs(pattern: LinearSubsystem) -> frozenset[tuple[int, int]]:
     """Return the (partition, output) pairs that can reach the motion or the network."""
-    kind = pattern.kind
-    clocks = {partition.clock: index for index, partition in enumerate(kind.clocks)}
+    peer_type = pattern.peer_type
+    clocks = {partition.clock: index for index, partition in enumerate(peer_type.clocks)}
     live: set[tuple[int, int]] = set()
-    holds = {h for h in range(len(kind.holds)) if pattern.b[:, h].any()}
-    holds |= {h for send in pattern.sends for h in range(len(kind.holds)) if send.u[:, h].any()}
+    holds = {h for h in range(len(peer_type.holds)) if pattern.b[:, h].any()}
+    holds |= {h for send in pattern.sends for h in range(len(peer_type.holds)) if send.u[:, h].any()}
     size = -1
     while size != len(live) + len(holds):
         size = len(live) + len(holds)
-        live |= {(clocks[kind.holds[h].clock], kind.holds[h].output) for h in holds}
+        live |= {(clocks[peer_type.holds[h].clock], peer_type.holds[h].output) for h in holds}
         for partition, output in tuple(live):
             tick = pattern.ticks[partition]
-            memories = kind.clocks[partition].memories
+            memories = peer_type.clocks[partition].memories
             live |= {(partition, memories[m]) for m in tick.m[output].nonzero()[0]}
             holds |= set(tick.u[output].nonzero()[0].tolist())
     return frozenset(live)
 
 
 def live_holds(pattern: LinearSubsystem, live: frozenset[tuple[int, int]]) -> tuple[bool, ...]:
-    """Say of each hold whether anybody reads it."""
+    """Return whether each hold is used."""
     return tuple(
         bool(
             pattern.b[:, h].any()
             or any(send.u[:, h].any() for send in pattern.sends)
             or any(pattern.ticks[partition].u[output, h] for partition, output in live)
         )
-        for h in range(len(pattern.kind.holds))
+        for h in range(len(pattern.peer_type.holds))
     )
 
 
@@ -59,53 +59,53 @@ def live_receives(pattern: LinearSubsystem, live: frozenset[tuple[int, int]]) ->
     )
 
 
-# For each clock partition and receive: the ways it hears, and the channel of the link on each.
+# For each clock partition and receive: its coupling terms, and the channel of the link on each.
 ReceptionPattern = tuple[tuple[tuple[tuple[CouplingTerm, str], ...], ...], ...]
 
 
-def hearing_of(
+def reception_of(
     system: Model,
     patterns: Sequence[LinearSubsystem],
     exchange: CommunicationGraph,
     group: int,
     read: Sequence[frozenset[tuple[int, int]]],
 ) -> ReceptionPattern:
-    """Return what the receives of a group hear.
+    """Return the coupling terms of the receives of a group.
 
     Parameters
     ----------
     system, exchange
-        The compiled scene, and who hears whom.
+        The compiled model and its communication graph.
     patterns, read
-        The structural pattern of each kind, and its receives that matter (see `liveness`).
+        The structural pattern of each peer type, and its live receives (see `liveness`).
     group
-        The group's place in the scene.
+        The index of the group.
 
     Raises
     ------
     ApcError
-        E801 a mean, maximum or minimum over nobody.
+        E801 a mean, maximum or minimum over no peers.
     """
-    pattern = patterns[system.groups[group].kind]
+    pattern = patterns[system.groups[group].peer_type]
     everybody: list[tuple[tuple[tuple[CouplingTerm, str], ...], ...]] = []
-    for p, (partition, tick) in enumerate(zip(pattern.kind.clocks, pattern.ticks, strict=True)):
-        own: list[tuple[tuple[CouplingTerm, str], ...]] = []
-        for place, (receive, channels) in enumerate(zip(partition.receives, tick.channels, strict=True)):
-            if (p, place) not in read[system.groups[group].kind] or not channels:
-                own.append(())
+    for p, (partition, tick) in enumerate(zip(pattern.peer_type.clocks, pattern.ticks, strict=True)):
+        local: list[tuple[tuple[CouplingTerm, str], ...]] = []
+        for index, (receive, channels) in enumerate(zip(partition.receives, tick.channels, strict=True)):
+            if (p, index) not in read[system.groups[group].peer_type] or not channels:
+                local.append(())
                 continue
             names = _channels(system, group, receive.link)
             sending = [
-                any(send.link == receive.link for send in system.kinds[group.kind].sends)
+                any(send.link == receive.link for send in system.peer_types[group.peer_type].sends)
                 for group in system.groups
             ]
-            senders = exchange.hears(receive.link, group, sending)
+            senders = exchange.receives(receive.link, group, sending)
             if not senders and receive.operator != "sum":
                 peer = int(exchange.starts[group])
                 check_mean(exchange, peer, receive.link, receive.operator, False, Fraction(0))
             delays = dict.fromkeys(exchange.delay(receive.link, sender, group) for sender in senders)
             edge = edge_name(partition, receive)
-            own.append(
+            local.append(
                 tuple(
                     (
                         CouplingTerm(
@@ -118,12 +118,12 @@ def hearing_of(
                     for c in channels
                 )
             )
-        everybody.append(tuple(own))
+        everybody.append(tuple(local))
     return tuple(everybody)
 
 
 def _channels(system: Model, group: int, link: str) -> tuple[str, ...]:
-    """Return the names of a link's channels, as the group's own kind sends them, or else some other kind."""
-    own = system.groups[group].kind
-    kinds = [system.kinds[own], *system.kinds]
-    return next(send.channels for kind in kinds for send in kind.sends if send.link == link)
+    """Return the names of a link's channels as the group's peer type sends them, or else another type."""
+    local = system.groups[group].peer_type
+    peer_types = [system.peer_types[local], *system.peer_types]
+    return next(send.channels for peer_type in peer_types for send in peer_type.sends if send.link == link)

@@ -2,10 +2,10 @@
 
 Takes: a `Model` and overrides such as `contact.stiffness=800 N/m`.
 Gives: `Override`, `parse_override`, `apply`; `check_bounds`.
-Guarantees: what depends on a changed parameter by a formula changes with it, in exact rationals; the rest
-keeps the very numbers it was compiled with. Every value out of what its component allows is told, all
-together; of a parameter that differs from peer to peer, the first peer's.
-Does not: change what was compiled as structure (which parts there are).
+Guarantees: a parameter that depends on a changed one by a formula changes with it, in exact rationals; the
+others keep their compiled values. All values outside the bounds of their component are reported together; for
+a parameter that differs from peer to peer, the first peer's.
+Does not: change the compiled structure (which parts there are).
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from apc.compiler.compiled import Group, Model, Parameter, Timing, group_count
 from apc.compiler.errors import ApcError, Diagnostic, Mistakes, SourceLocation
 from apc.compiler.language.evaluation import exact_value
 from apc.compiler.peer_counts import peers_of, recounted
-from apc.compiler.words import with_unit
+from apc.compiler.wording import with_unit
 from apc.frame.display_units import DisplayUnit, as_shown
-from apc.frame.names import OVERRIDE, ParameterRef, find, unit_of
+from apc.frame.parameter_names import OVERRIDE, ParameterRef, find, unit_of
 from apc.frame.parameters import ParameterScope, columns_of, scope_of, with_times_of_groups
 
 N = TypeVar("N", Parameter, Timing)
@@ -38,7 +38,7 @@ class Override:
 
 
 def parse_override(system: Model, text: str) -> Override:
-    """Read `NAME=QUANTITY`; the name may start with a group, or with the section it stands in.
+    """Read `NAME=QUANTITY`; the name may start with a group, or with its section of the topology.
 
     Raises
     ------
@@ -56,18 +56,18 @@ def parse_override(system: Model, text: str) -> Override:
         raise ApcError(Diagnostic("E621", OVERRIDE, "an override", "NAME=VALUE", text[:80], form))
     free = find(system, name, OVERRIDE, counts=True, value=value)
     unit = unit_of(system, free.name)
-    result = quantity(value, OVERRIDE, what=name, unit=unit, before=f"{name}=")
+    result = quantity(value, OVERRIDE, subject=name, unit=unit, before=f"{name}=")
     return Override(free, result.value)
 
 
 def apply(system: Model, overrides: Sequence[Override]) -> Model:
-    """Return the system with new values; a parameter set loses its formula, what depends on it follows.
+    """Return the model with new values; a parameter set loses its formula, and its dependents follow.
 
     Raises
     ------
     ApcError
-        E622 a group's own value for what a time of all groups or a count depends on, E624 a value beyond the
-        parameter's bounds, E625 a time that can't be, E626 a number of peers that can't be.
+        E622 a group's own value for a number on which a time of all groups or a count depends, E624 a value
+        beyond the parameter's bounds, E625 an invalid time, E626 an invalid number of peers.
     """
     if not overrides:
         return system
@@ -82,20 +82,20 @@ def apply(system: Model, overrides: Sequence[Override]) -> Model:
     common = _changed(scope_of(system), everywhere)
     groups = []
     for group in system.groups:
-        own = {
+        local = {
             override.free.name: override.value for override in overrides if override.free.group == group.name
         }
         # Set for everybody means for this group as well: its own old value goes. One that follows its own
         # timing stays, and has the timing's new value.
         shared = {name: value for name, value in everywhere.items() if f"{group.name}.{name}" not in timings}
         values = {value.name: value for value in group.values if value.name not in shared}
-        values |= {name: parameters[name] for name in own if name not in values}
-        if own:
-            _check_times(system, group.name, list(values.values()), own)
-        given = {**shared, **own}
+        values |= {name: parameters[name] for name in local if name not in values}
+        if local:
+            _check_times(system, group.name, list(values.values()), local)
+        given = {**shared, **local}
         changed = _changed(scope_of(system, list(values.values())), given)
-        if own:
-            # What a group leaves to everybody is its own as soon as it depends on a value of its own.
+        if local:
+            # A value shared by all groups becomes the group's own once it depends on a value of its own.
             values |= {
                 name: parameter
                 for name, parameter in parameters.items()
@@ -108,7 +108,7 @@ def apply(system: Model, overrides: Sequence[Override]) -> Model:
                 values=tuple(_renewed(value, changed, given) for value in values.values()),
                 # One value for the group, or for everybody, is one for each of its peers.
                 columns=tuple(
-                    column for column in group.columns if column.name not in everywhere.keys() | own.keys()
+                    column for column in group.columns if column.name not in everywhere.keys() | local.keys()
                 ),
             )
         )
@@ -127,19 +127,19 @@ def apply(system: Model, overrides: Sequence[Override]) -> Model:
 
 
 def _counts(system: Model, everywhere: Mapping[str, Fraction]) -> dict[str, Fraction]:
-    """Return how many peers each group has with what is given, nothing if that changes none of them."""
+    """Return the number of peers of each group with the given values, empty if none of them changes."""
     now = {group.name: Fraction(group.count) for group in system.groups}
-    wanted = {group_count(name) for name in now}
+    requested = {group_count(name) for name in now}
     scope = scope_of(system)
-    if scope.needed(wanted).isdisjoint(everywhere):
+    if scope.needed(requested).isdisjoint(everywhere):
         return {}
-    changed = scope.follow(everywhere, exact_value, lambda name: scope.holder[name].number, wanted)
+    changed = scope.follow(everywhere, exact_value, lambda name: scope.holder[name].number, requested)
     result = {name: changed.get(group_count(name), count) for name, count in now.items()}
     return result if result != now else {}
 
 
 def _changed(scope: ParameterScope, given: Mapping[str, Fraction]) -> dict[str, Fraction]:
-    """Return the values given and what follows from them, exactly."""
+    """Return the given values and their dependents, exactly."""
     return scope.follow(given, exact_value, lambda name: scope.holder[name].number)
 
 
@@ -153,24 +153,26 @@ def _renewed(item: N, changed: Mapping[str, Fraction], given: Collection[str]) -
     return replace(item, value=float(value), exact=value, formula=formula)
 
 
-def _check_times(system: Model, group: str, values: Sequence[Parameter], own: Mapping[str, Fraction]) -> None:
-    """Refuse what a group sets for itself where a time for all groups depends on it.
+def _check_times(
+    system: Model, group: str, values: Sequence[Parameter], local: Mapping[str, Fraction]
+) -> None:
+    """Raise an error for a group's own value on which a time for all groups depends.
 
     Parameters
     ----------
     system
-        The scene before any override.
-    group, values, own
-        The group, its own numbers, and what it sets.
+        The model before any override.
+    group, values, local
+        The group, its own parameters, and the values set for it.
     """
-    changed = _changed(scope_of(system, [*values, *system.timings]), own)
+    changed = _changed(scope_of(system, [*values, *system.timings]), local)
     shared = {timing.name: "one time for all groups" for timing in system.timings}
-    shared |= {group_count(group.name): "one number of the scene" for group in system.groups}
+    shared |= {group_count(group.name): "one number of the topology" for group in system.groups}
     for name, meant in shared.items():
         if name in changed:
-            what = f"{name} is {meant}, and depends on what is set for {group}"
+            message = f"{name} is {meant}, and depends on what is set for {group}"
             hint = "the same without the group, or a group with a set of its own"
-            raise ApcError(Diagnostic("E622", OVERRIDE, what, hint=hint))
+            raise ApcError(Diagnostic("E622", OVERRIDE, message, hint=hint))
 
 
 def _check_bounds(system: Model) -> None:
@@ -200,7 +202,11 @@ def _check_bounds(system: Model) -> None:
 
 
 def check_bounds(
-    parameter: Parameter, name: str, mistakes: Mistakes, code: str = "E624", place: SourceLocation = OVERRIDE
+    parameter: Parameter,
+    name: str,
+    mistakes: Mistakes,
+    code: str = "E624",
+    location: SourceLocation = OVERRIDE,
 ) -> None:
     """Record a value below the minimum or above the maximum of a parameter.
 
@@ -209,10 +215,10 @@ def check_bounds(
     parameter
         The parameter, with its value.
     name
-        What it is called in the message.
+        The name in the message.
     mistakes
         Where a mistake is recorded.
-    code, place
+    code, location
         Those of the mistake.
     """
     low, high, value = parameter.minimum, parameter.maximum, parameter.value
@@ -223,10 +229,10 @@ def check_bounds(
 
     def out(expected: str, number: float) -> None:
         mistakes.add(
-            code, place, name, expected=f"{expected} {shown(number)}", got=shown(value), subject=name
+            code, location, name, expected=f"{expected} {shown(number)}", got=shown(value), subject=name
         )
 
-    if low is not None and parameter.open_minimum and value <= low:
+    if low is not None and parameter.exclusive_minimum and value <= low:
         out("more than", low)
     elif low is not None and value < low:
         out("at least", low)
@@ -248,7 +254,7 @@ def _check_columns(system: Model, group: Group, mistakes: Mistakes) -> None:
         values = columns[name]
         low = -np.inf if parameter.minimum is None else parameter.minimum
         high = np.inf if parameter.maximum is None else parameter.maximum
-        below = values <= low if parameter.open_minimum else values < low
+        below = values <= low if parameter.exclusive_minimum else values < low
         wrong = np.flatnonzero(below | (values > high))
         if len(wrong):
             peer, value = f"{group.name}[{int(wrong[0]) + 1}]", float(values[wrong[0]])

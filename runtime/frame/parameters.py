@@ -1,11 +1,11 @@
-"""The numbers with which a compiled system becomes matrices, what follows from others worked out with them.
+"""Parameter values of a model, with the dependent parameters computed from their formulas.
 
-Takes: a `Model`, and new values by name, in any kind of number.
-Gives: `ParameterScope`, `scope_of`, the one resolver of what follows from what; `ResolvedNumbers`, `resolve`,
+Takes: a `Model`, and new values by name, in any number type.
+Gives: `ParameterScope`, `scope_of`, the one resolver of dependent parameters; `ResolvedNumbers`, `resolve`,
 `exact_numbers`; `columns_of`; `free_rows`, `free_values`; `with_times_of_groups`.
-Guarantees: what a value reaches by a formula is worked out with it, in the order settled when the scene was
-compiled; what none reaches keeps the very number it was compiled with. Peers with the same parameters share
-one row. Complex values are complex steps: the imaginary part is a derivative.
+Guarantees: dependents of a changed value are computed in the order fixed at compilation; the others keep
+their compiled values. Peers with the same parameters share one row. Complex values are complex steps: the
+imaginary part is a derivative.
 Does not: read or apply overrides, or check bounds (`overrides`); build a matrix (`linearize`, `scheduling`).
 """
 
@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import Formula, Group, Model, Parameter, PeerType, Timing
 from apc.compiler.errors import ApcError, Diagnostic
 from apc.compiler.language.evaluation import computed
-from apc.frame.exact import ROWS
-from apc.frame.names import OVERRIDE, ParameterRef, times_of
+from apc.frame.exact_arithmetic import ROWS
+from apc.frame.parameter_names import OVERRIDE, ParameterRef, times_of
 
 Floats = NDArray[np.float64]
 V = TypeVar("V")
@@ -42,7 +42,7 @@ class ParameterScope:
         given: Mapping[str, V],
         compute: Callable[[str, Formula, list[Any]], V],
         now: Callable[[str], Any],
-        wanted: Collection[str] | None = None,
+        requested: Collection[str] | None = None,
     ) -> dict[str, V]:
         """Return the values given, and those of all that follows from them.
 
@@ -54,10 +54,10 @@ class ParameterScope:
             Gives the value of a name by its formula, from the values of `Formula.names`.
         now
             Gives the value of a name that nothing given reaches.
-        wanted
-            The names asked for: what none of them follows from is left out. None for all.
+        requested
+            The requested names: other values that none of them depends on are left out. None for all.
         """
-        needed = self.formulas.keys() if wanted is None else self.needed(wanted)
+        needed = self.formulas.keys() if requested is None else self.needed(requested)
         result = dict(given)
         for name, formula in self.formulas.items():
             if name in needed and name not in given and not result.keys().isdisjoint(formula.names):
@@ -65,9 +65,9 @@ class ParameterScope:
                 result[name] = compute(name, formula, values)
         return result
 
-    def needed(self, wanted: Collection[str]) -> set[str]:
+    def needed(self, requested: Collection[str]) -> set[str]:
         """Return some names, and all that these follow from."""
-        needed = set(wanted)
+        needed = set(requested)
         for name in reversed(list(self.formulas)):
             if name in needed:
                 needed.update(self.formulas[name].names)
@@ -75,20 +75,20 @@ class ParameterScope:
 
 
 def scope_of(
-    system: Model, own: Sequence[Parameter | Timing] = (), *, fixed: Collection[str] = ()
+    system: Model, local: Sequence[Parameter | Timing] = (), *, fixed: Collection[str] = ()
 ) -> ParameterScope:
-    """Return the numbers of a scene as they are seen by a group of peers, or by everybody.
+    """Return the parameters of a model for a group of peers, or those common to all.
 
     Parameters
     ----------
     system
-        The compiled scene.
-    own
-        What the group has of its own; of two of a name the later counts.
+        The compiled model.
+    local
+        The group's own values; of two with one name the later counts.
     fixed
         Names that follow from nothing here.
     """
-    numbers: list[Parameter | Timing] = [*system.timings, *system.parameters, *own]
+    numbers: list[Parameter | Timing] = [*system.timings, *system.parameters, *local]
     holder = {number.name: number for number in numbers}
     formulas = {
         name: formula
@@ -103,8 +103,8 @@ def with_times_of_groups(system: Model, given: Mapping[str, V]) -> dict[str, V]:
 
     One value for all groups replaces a group's own. A timing of a group that is given itself keeps its value.
     """
-    own = {time: value for name, value in given.items() for time in times_of(system, name) if time != name}
-    return own | dict(given)
+    local = {time: value for name, value in given.items() for time in times_of(system, name) if time != name}
+    return local | dict(given)
 
 
 def _rows(name: str, formula: Formula, values: list[Any]) -> Any:
@@ -114,15 +114,15 @@ def _rows(name: str, formula: Formula, values: list[Any]) -> Any:
 
 
 def columns_of(
-    system: Model, group: Group, wanted: Collection[str] | None = None, peer: int | None = None
+    system: Model, group: Group, requested: Collection[str] | None = None, peer: int | None = None
 ) -> dict[str, Floats]:
     """Return the parameters of a group that differ from peer to peer, given or by a formula, (count,) each.
 
     Parameters
     ----------
     system, group
-        The group of the scene.
-    wanted
+        The group of peers.
+    requested
         The names asked for; None for all.
     peer
         The only peer (1,) that is asked for, its number in the group from 0.
@@ -130,7 +130,7 @@ def columns_of(
     Raises
     ------
     ApcError
-        E331 what has no finite value for a peer.
+        E331 a value that is not finite for a peer.
     """
     if not group.columns:
         return {}
@@ -143,20 +143,20 @@ def columns_of(
         wrong = np.flatnonzero(~np.isfinite(result))
         if len(wrong):
             where = f"{group.name}[{int(wrong[0]) + (peer or 0) + 1}]"
-            what = f"{name} = {formula.text[:80]} has no finite value for {where}"
-            raise ApcError(Diagnostic("E331", OVERRIDE, what))
+            message = f"{name} = {formula.text[:80]} has no finite value for {where}"
+            raise ApcError(Diagnostic("E331", OVERRIDE, message))
         return result
 
-    return scope.follow(given, compute, lambda name: float(scope.holder[name].value), wanted)
+    return scope.follow(given, compute, lambda name: float(scope.holder[name].value), requested)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResolvedNumbers:
     """Everything a compiled system needs to become matrices.
 
-    `parameters` holds one matrix (k, n_p) a group: its peers' different rows, in the order in which they come
-    first, columns in the order of its kind's parameters; `rows` (count,) says which of them each peer has.
-    `timings` are seconds by name.
+    `parameters` holds one matrix (k, n_p) per group: its peers' distinct rows, in order of first appearance,
+    columns in the order of its peer type's parameters; `rows` (count,) is the row of each peer. `timings` are
+    seconds by name.
     """
 
     parameters: tuple[Floats, ...]
@@ -176,11 +176,11 @@ def resolve(system: Model) -> ResolvedNumbers:
 
 def _different_rows(system: Model, group: Group) -> tuple[Floats, NDArray[np.int64]]:
     """Return a group's different parameter rows (k, n_p) and which of them each peer has (count,)."""
-    names = system.kinds[group.kind].parameters
+    names = system.peer_types[group.peer_type].parameters
     holder = {parameter.name: parameter for parameter in (*system.parameters, *group.values)}
     common = np.array([[holder[name].value for name in names]], dtype=np.float64).reshape(1, -1)
     columns = columns_of(system, group, names)
-    varying = {place: columns[name] for place, name in enumerate(names) if name in columns}
+    varying = {index: columns[name] for index, name in enumerate(names) if name in columns}
     if not varying:
         # A view of one zero: a million equal peers take no memory.
         return common, np.broadcast_to(np.int64(0), (group.count,))
@@ -195,38 +195,38 @@ def _different_rows(system: Model, group: Group) -> tuple[Floats, NDArray[np.int
     return parameters, rows
 
 
-def exact_numbers(kind: PeerType, vector: Floats) -> list[Fraction]:
-    """Return a peer's parameters (n_p,) exactly: as the floats they are, or what these floats round.
+def exact_numbers(peer_type: PeerType, vector: Floats) -> list[Fraction]:
+    """Return a peer's parameters (n_p,) exactly: the floats, or the rationals from which they were rounded.
 
     Parameters
     ----------
-    kind
-        Of the peer: knows what is rounded.
+    peer_type
+        The peer's type, with the exact values of rounded parameters.
     vector
         Its parameters (n_p,), in the order of `PeerType.parameters`.
     """
     numbers = [Fraction(value) for value in vector.tolist()]
-    for place, rationals in kind.rounded:
-        near = bisect_left(rationals, vector[place], key=float)
-        assert float(rationals[near]) == vector[place], f"{kind.parameters[place]} is none of its values"
-        numbers[place] = rationals[near]
+    for index, rationals in peer_type.rounded:
+        near = bisect_left(rationals, vector[index], key=float)
+        assert float(rationals[near]) == vector[index], f"{peer_type.parameters[index]} is none of its values"
+        numbers[index] = rationals[near]
     return numbers
 
 
 def free_rows(
     system: Model, group: Group, peer: int, values: Mapping[ParameterRef, NDArray[Any]]
 ) -> NDArray[Any]:
-    """Return a peer's parameter vector for many values of some parameters, what depends on them included.
+    """Return a peer's parameter vector for many values of some parameters, with their dependents.
 
     Parameters
     ----------
     system
-        The compiled scene.
+        The compiled model.
     group, peer
         The peer: its group, and its number in it, from 0.
     values
-        Values (k,) of each free parameter, as `apply` would set them; complex ones are complex steps, whose
-        imaginary part comes out as the derivative.
+        Values (k,) of each free parameter, as `apply` would set them; the imaginary part of a complex step is
+        returned as the derivative.
 
     Returns
     -------
@@ -236,8 +236,8 @@ def free_rows(
     count = max((len(item) for item in listed if np.ndim(item)), default=1)
     dtype = np.result_type(np.float64, *(item.dtype for item in listed if np.ndim(item)))
     rows = np.empty((count, len(listed)), dtype=dtype)
-    for place, item in enumerate(listed):
-        rows[:, place] = item
+    for index, item in enumerate(listed):
+        rows[:, index] = item
     return rows
 
 
@@ -248,7 +248,7 @@ def free_values(
     values: Mapping[ParameterRef, Any],
     rule: Callable[[str], Callable[..., Any]],
 ) -> list[Any]:
-    """Return a peer's parameters, those that a free one reaches in its kind of number, the others as floats.
+    """Return a peer's parameters: dependents of a free one in its number type, the others as floats.
 
     Parameters
     ----------
@@ -257,10 +257,10 @@ def free_values(
     values
         The value of each free parameter.
     rule
-        What an operation is in their kind of number, as of `plain.walk`.
+        The operations of the number type, as of `expression_data.walk`.
     """
-    wanted = system.kinds[group.kind].parameters
-    columns = columns_of(system, group, wanted, peer)
+    requested = system.peer_types[group.peer_type].parameters
+    columns = columns_of(system, group, requested, peer)
     scope = scope_of(system, group.values, fixed={column.name for column in group.columns})
     given = with_times_of_groups(
         system, {free.name: value for free, value in values.items() if free.group is None}
@@ -274,5 +274,5 @@ def free_values(
         with np.errstate(all="ignore"):
             return computed(formula, values_of, rule)
 
-    result = scope.follow(given, compute, now, wanted)
-    return [result[name] if name in result else now(name) for name in wanted]
+    result = scope.follow(given, compute, now, requested)
+    return [result[name] if name in result else now(name) for name in requested]

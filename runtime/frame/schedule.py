@@ -1,13 +1,14 @@
-"""What one frame of a peer is made of: its events in their order, and what is remembered between frames.
+"""Data types of one frame of a peer: its events in their order, and the values stored between frames.
 
-Takes: what `scheduling` found out.
-Gives: `Schedule` and its events, `Event`; `RepeatedEvents`, `HELD`; the names of what is computed, sent and
-heard; `shifted`, `remembered`; `tick_by_tick`; `ORDER`.
+Takes: the results of `scheduling`.
+Gives: `Schedule` and its events, `Event`: `Tick`, `SendEvent`, `Propagate`, `HoldUpdate`, `RepeatedEvents`,
+`HELD`; the values that they name: `ClockedValue`, `SentSample`, `CouplingTerm`, `ReceivedSample`,
+`UncertainSample`; `shifted`, `discrete_states_of`; `with_per_tick_inputs`; `ORDER`.
 Guarantees: exact time (integers of one quantum).
-Does not: find out what happens when (see `scheduling`).
+Does not: compute the instants of events (see `scheduling`).
 
-Every value a clock computes is one symbol, `ClockedValue(partition, output, index)`: what output `output` was
-at the tick `index`, counted from the frame's first tick of that clock; a negative index is an earlier frame.
+Every value that a clock computes is one symbol, `ClockedValue(partition, output, index)`: output `output` at
+the tick `index`, counted from the frame's first tick of that clock; a negative index is an earlier frame.
 """
 
 from __future__ import annotations
@@ -16,13 +17,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
-# The order of coincident events. Continuous variables are continuous, so sampling needs no place in it.
+# The order of coincident events. Continuous variables are continuous, so sampling has no rank in it.
 ORDER = ("send", "deliver", "tick", "act")
 
 
 @dataclass(frozen=True, slots=True, order=True)
 class ClockedValue:
-    """Output `output` of clock partition `partition` as computed at tick `index` of the frame."""
+    """Output `output` of clock partition `partition`, computed at tick `index` of the frame."""
 
     partition: int
     output: int
@@ -30,15 +31,15 @@ class ClockedValue:
 
 
 def shifted(value: ClockedValue, ticks: Sequence[int]) -> ClockedValue:
-    """Return the value that is called `value` one frame on; `ticks` are of a frame, by clock partition."""
+    """Return the value's symbol one frame later; `ticks` counts the ticks of a frame by clock partition."""
     return ClockedValue(value.partition, value.output, value.index + ticks[value.partition])
 
 
-def remembered(values: Iterable[ClockedValue], ticks: Sequence[int]) -> tuple[ClockedValue, ...]:
-    """Return those of some values that are of earlier frames, and what they were called until they came.
+def discrete_states_of(values: Iterable[ClockedValue], ticks: Sequence[int]) -> tuple[ClockedValue, ...]:
+    """Return the outputs of earlier frames that must be stored as discrete states, sorted.
 
-    A value read at index −j is, one frame before, the value of index n − j; if that is negative too, it is
-    remembered as well.
+    A value read at index −j was computed at index n − j of the previous frame, with n ticks per frame. While
+    that index is negative, the value is stored for one more frame and included too.
     """
     result: set[ClockedValue] = set()
     for value in values:
@@ -59,11 +60,12 @@ class SentSample:
 
 @dataclass(frozen=True, slots=True, order=True)
 class CouplingTerm:
-    """A way from peer to peer, one weight for each pair of peers: `operator` over a link, delayed `delay`.
+    """One coupling term: `operator` over a link with delay `delay`, with a weight for each pair of peers.
 
-    Only those pairs of peers are on it whose delay is the timing `delay`. A receive that weighs every sender
-    apart, by the slope of its edge function, has a way of its own for each channel: `edge` and `channel` name
-    it, and are empty for a plain sum or mean. With `before`, a tick hears on it what the tick before heard.
+    It contains only the pairs of peers whose delay is the timing `delay`. A receive that weights each sender
+    separately, by the slope of its edge function, has one coupling term per channel: `edge` and `channel`
+    name it, and are empty for a plain sum or mean. With `before`, a tick receives the values of the tick
+    before.
     """
 
     operator: str
@@ -76,21 +78,23 @@ class CouplingTerm:
 
 @dataclass(frozen=True, slots=True, order=True)
 class ReceivedSample:
-    """What a site hears on `way`: the other peers' `sent`, of `lag` frames ago (0: this frame)."""
+    """The received sum over `coupling_term` of the other peers' `sent` values, of `lag` frames ago (0: this
+    frame).
+    """
 
-    way: CouplingTerm
+    coupling_term: CouplingTerm
     sent: SentSample
     lag: int
 
 
 @dataclass(frozen=True, slots=True, order=True)
 class UncertainSample:
-    """What tick `tick` of `clock` hears of a channel on a way that loses or delays packets: one that is kept.
+    """The value that tick `tick` of `clock` selects among the stored packets of an unreliable channel.
 
-    With `gap` it is not what is heard but the weight of what is missed.
+    With `gap` it is the total weight of the missing values.
     """
 
-    way: CouplingTerm
+    coupling_term: CouplingTerm
     channel: str
     clock: str
     tick: int
@@ -99,14 +103,14 @@ class UncertainSample:
 
 @dataclass(frozen=True, slots=True)
 class Propagate:
-    """Nothing happens for `duration` quanta."""
+    """Propagation over `duration` quanta without events."""
 
     duration: int
 
 
 @dataclass(frozen=True, slots=True)
 class SendEvent:
-    """The site's send partition `partition` sends; `rows` are (channel, row of s) pairs."""
+    """Send partition `partition` of the subsystem sends; `rows` are (channel, row of s) pairs."""
 
     partition: int
     rows: tuple[tuple[int, int], ...]
@@ -114,18 +118,18 @@ class SendEvent:
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """Clock partition `partition` computes, tick `index`; `heard` are each receive's rows of r, to add.
+    """Clock partition `partition` computes tick `index`; `input_rows` are the rows of r of each receive.
 
-    `variant` is which of the partition's columns it computes (see `ClockPartition.variants`), None of one.
+    `variant` is the column of the partition that it computes (see `compiled.ClockPartition.variants`).
     """
 
     partition: int
     index: int
-    heard: tuple[tuple[int, ...], ...]
+    input_rows: tuple[tuple[int, ...], ...]
     variant: int | None = None
 
     def rows(self, outputs: int) -> slice:
-        """Return its own rows, of a partition's that has so many outputs: all where it has one column."""
+        """Return the rows of this variant among those of a partition with that many outputs."""
         if self.variant is None:
             return slice(None)
         return slice(self.variant * outputs, (self.variant + 1) * outputs)
@@ -142,17 +146,17 @@ class HoldUpdate:
 Event = Propagate | SendEvent | Tick | HoldUpdate
 
 
-# The partition of what a hold puts out, where that is named like a value: `ClockedValue(HELD, hold, −1)`.
+# The partition of a hold's output, where the output is named like a value: `ClockedValue(HELD, hold, −1)`.
 HELD = -1
 
 
 @dataclass(frozen=True, slots=True)
 class RepeatedEvents:
-    """Events that come again and again: `count` times `length` of them, from event `first` on.
+    """Repeated events: `count` times a sequence of `length` events, from event `first` on.
 
-    `ticks` are of one time, by clock partition. `entering` is what one time needs of those before, or what is
-    needed when all are over, indices counted from its own first tick; `staying` the same, of what none of
-    them changes. See `HELD`.
+    `ticks` counts the ticks of one repetition, by clock partition. `entering` are the values that one
+    repetition needs of earlier ones, or that are needed at the end, with indices counted from its own first
+    tick; `staying` are those that no repetition changes. See `HELD`.
     """
 
     first: int
@@ -164,32 +168,32 @@ class RepeatedEvents:
 
     @property
     def end(self) -> int:
-        """The first event after them."""
+        """The index of the first event after the repetitions."""
         return self.first + self.length * self.count
 
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """One frame of the peers of one group.
+    """The schedule of one frame for the peers of one group.
 
-    `acting` is what each hold puts out as the frame begins (None for a hold nobody reads); `carried` are the
-    values of earlier frames that this one needs, the remembered part of z after the continuous states;
-    `heard` names r, and `selected` goes on where packets get lost or come late; `sent` names s and `depths`
-    says how many frames each row of s must be kept; `ticks` counts a clock partition's ticks in a frame;
-    `marks` are the instants, in quanta, of the fastest clock's ticks and the end; `repeats` are events that
-    come again and again, if there are such.
+    `active_at_start` is the value of each hold as the frame begins (None for an unused hold);
+    `discrete_states` are the values of earlier frames that this frame needs, the discrete part of z after the
+    continuous states; `received` names r, and `selected` extends it where packets are lost or late; `sent`
+    names s, and `depths` gives the number of frames for which each row of s is stored; `ticks` counts the
+    ticks of each clock partition; `sample_times` are the instants, in quanta, of the fastest clock's ticks
+    and the end; `repeats` are repeated events, if any.
     """
 
     quantum: Fraction
     frame: int
     events: tuple[Event, ...]
-    acting: tuple[ClockedValue | None, ...]
-    carried: tuple[ClockedValue, ...]
-    heard: tuple[ReceivedSample, ...]
+    active_at_start: tuple[ClockedValue | None, ...]
+    discrete_states: tuple[ClockedValue, ...]
+    received: tuple[ReceivedSample, ...]
     sent: tuple[SentSample, ...]
     depths: tuple[int, ...]
     ticks: tuple[int, ...]
-    marks: tuple[int, ...]
+    sample_times: tuple[int, ...]
     value_names: tuple[str, ...]
     sent_names: tuple[str, ...]
     sent_times: tuple[int, ...]  # in quanta from the frame's start
@@ -202,23 +206,24 @@ class Schedule:
         return self.frame * self.quantum
 
     @property
-    def received(self) -> tuple[ReceivedSample | UncertainSample, ...]:
-        """All that is received, by the rows of r."""
-        return self.heard + self.selected
+    def all_received(self) -> tuple[ReceivedSample | UncertainSample, ...]:
+        """All rows of r: the received and the selected values."""
+        return self.received + self.selected
 
-    def ways(self, partition: int, receive: int) -> tuple[tuple[CouplingTerm, str], ...]:
-        """Return the ways and channels a receive of a clock partition hears, whatever the tick."""
+    def coupling_terms(self, partition: int, receive: int) -> tuple[tuple[CouplingTerm, str], ...]:
+        """Return the coupling terms and channels of a receive of a clock partition, over all ticks."""
         ticks = [event for event in self.events if isinstance(event, Tick) and event.partition == partition]
-        heard = [self.heard[row] for tick in ticks for row in tick.heard[receive]]
-        return tuple(dict.fromkeys((item.way, item.sent.channel) for item in heard))
+        received = [self.received[row] for tick in ticks for row in tick.input_rows[receive]]
+        return tuple(dict.fromkeys((item.coupling_term, item.sent.channel) for item in received))
 
 
-def tick_by_tick(schedule: Schedule) -> Schedule:
-    """Return a schedule that hears what is selected, as if that were the first packet of a frame.
+def with_per_tick_inputs(schedule: Schedule) -> Schedule:
+    """Return a schedule that receives the selected values as if each were the first packet of a frame.
 
     Its rows of r are those of `schedule.selected`, in order.
     """
-    heard = tuple(
-        ReceivedSample(row.way, SentSample(row.way.link, row.channel, 0), 0) for row in schedule.selected
+    received = tuple(
+        ReceivedSample(row.coupling_term, SentSample(row.coupling_term.link, row.channel, 0), 0)
+        for row in schedule.selected
     )
-    return replace(schedule, heard=heard, selected=())
+    return replace(schedule, received=received, selected=())

@@ -1,1 +1,1 @@
-"""Packets of a whole population over unreliable links: which are lost, late, heard, and at which tick."""
+"""Packet timing for a population of peers over unreliable links: losses, delays and reception ticks."""

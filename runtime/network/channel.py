@@ -1,21 +1,21 @@
-"""What an unreliable link does to packets: its law in numbers, and which of them get lost or come how late.
+"""The channel model of an unreliable link: its numerical law, and the loss and delay of each packet.
 
-Takes: a link's `Channel` and the scene's numbers; the two peers of each way, a seed.
+Takes: a link's `Channel` and the model's parameter values; the peer pair of each directed link; a seed.
 Gives: `ChannelLaw`, `channel_law`, `LATEST`; `deviates`, the jitter's distributions; `PacketSource`, the
-delays of packets; `luck_key`.
-Guarantees: one law for all ways of a link with one delay. Equal seeds give equal packets, in any order of the
-ways, whoever else is there, however time is cut into pieces, with every version of NumPy; every way from peer
-to peer is independent of the others.
-Does not: know what is in a packet, or which of them a tick sees (see `timetable`).
+packet delays; `stream_key`, the key of a random stream.
+Guarantees: one law for all directed links of a network link with one delay. Equal seeds give equal packets.
+The result is independent of the order of the directed links, of other links, of the partition of time into
+calls, and of the NumPy version. Directed links are statistically independent.
+Does not: handle packet contents, or select the packets in effect at a tick (see `packet_schedule`).
 
-The luck of packet k of a way is block k + 2 of the stream `numpy.random.Philox` with the key (seed, CRC-32 of
-the link's name + 2³² run) and the counter (0, sender, receiver, 0); its first block is that of the way's
-state at the start. A packet's four words are the change of state after it, its loss, and two for its jitter,
-whatever the channel. So runs of other probabilities meet the same luck: a packet that is lost at some
-probability of independent losses is lost at any larger one.
+The random numbers of packet k of a directed link are block k + 2 of the stream `numpy.random.Philox` with the
+key (seed, CRC-32 of the link's name + 2³² run) and the counter (0, sender, receiver, 0); the first block
+determines the initial channel state. Of a packet's four words, one determines the state change after it, one
+its loss, and two its jitter, for every channel type. Runs with different probabilities therefore use common
+random numbers: a packet lost at one probability of independent losses is lost at every larger one.
 
-A way starts in its stationary state: the first packet is as likely to be lost as any other (in netem, a way
-starts good).
+Each directed link starts in the stationary distribution, so the first packet has the same loss probability as
+any other (netem starts in the good state).
 """
 
 from __future__ import annotations
@@ -33,13 +33,12 @@ from apc.compiler.compiled import Link, Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 
 Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 BLOCK = 4  # words of one counter
 
-# Packets of a way, and of all ways together, whose luck is drawn at a time: to find a way's place in its
-# stream takes longer than a hundred numbers of it.
+# Numbers of packets per directed link, and over all links, that are drawn in one batch. Positioning in a
+# random stream takes longer than drawing a hundred numbers.
 AHEAD, MOST_AHEAD = 64, 2**19
 
 # netem's Pareto table (iproute2, netem/pareto.c): shape 3, its mean 3/2 taken off, times 4/3, and no more
@@ -95,16 +94,16 @@ def channel_law(system: Model, link: Link, delay: Fraction) -> ChannelLaw:
     Parameters
     ----------
     system
-        The compiled scene, with the numbers to use (see `overrides.apply`).
+        The model, with the parameter values to use (see `overrides.apply`).
     link
-        A link of it that has a channel.
+        A link of the model that has a channel.
     delay
-        The delay of the way, in seconds.
+        The delay of the directed link, in seconds.
 
     Raises
     ------
     ApcError
-        E891 a group of peers sets a number of the link for itself.
+        E891 a group of peers sets its own value for a link parameter.
     """
     channel = link.channel
     assert channel is not None, f"{link.name} is reliable"
@@ -116,8 +115,8 @@ def channel_law(system: Model, link: Link, delay: Fraction) -> ChannelLaw:
     for group in system.groups:
         for parameter in group.values:
             if parameter.name in loss:
-                what = f"{parameter.name} is of a link, the same for all peers: {group.name} can't set it"
-                raise ApcError(Diagnostic("E891", SourceLocation(system.origin.topology), what))
+                message = f"{parameter.name} is of a link, the same for all peers: {group.name} can't set it"
+                raise ApcError(Diagnostic("E891", SourceLocation(system.origin.topology), message))
     value = {parameter.name: parameter.value for parameter in system.parameters}
     seconds = {timing.name: float(timing.value) for timing in system.timings}
     p, r, one_minus_h, one_minus_k = (value[name] for name in loss) if loss else (0.0, 1.0, 1.0, 0.0)
@@ -128,7 +127,7 @@ def channel_law(system: Model, link: Link, delay: Fraction) -> ChannelLaw:
 
 
 def deviates(distribution: str, values: Floats, two: Floats) -> Floats:
-    """Return what a jitter of 1 adds to a delay, drawn from a distribution.
+    """Return random jitter values, relative to the jitter, from a distribution.
 
     Parameters
     ----------
@@ -150,13 +149,13 @@ def deviates(distribution: str, values: Floats, two: Floats) -> Floats:
     return np.asarray(np.minimum(late, PARETO_MOST), dtype=np.float64)
 
 
-def luck_key(link: str, seed: int, run: int) -> tuple[int, int]:
-    """Return the key of a link's luck: its name, not its place, as another link changes nothing here."""
+def stream_key(link: str, seed: int, run: int) -> tuple[int, int]:
+    """Return the random-stream key of a link: derived from its name, so that other links do not affect it."""
     return seed, zlib.crc32(link.encode()) + (run << 32)
 
 
 class PacketSource:
-    """The packets of some ways of one link, in the order they are sent; what is taken is gone."""
+    """The packets of a link's directed peer pairs in the order of sending; each packet is returned once."""
 
     def __init__(self, law: ChannelLaw, link: str, pairs: ArrayLike, *, seed: int = 0, run: int = 0) -> None:
         """Start at the first packet.
@@ -164,33 +163,33 @@ class PacketSource:
         Parameters
         ----------
         law
-            The channel's numbers, those of all these ways.
+            The channel law, common to these directed links.
         link
             The link's name.
         pairs
-            The peers (sender, receiver) of each of the M ways (M, 2), by their numbers, from 0.
+            The peers (sender, receiver) of each of the M directed links (M, 2), as zero-based peer indices.
         seed, run
-            The experiment's seed, and which run of it this is; 0 or more.
+            The seed of the experiment and the index of the run, both nonnegative.
         """
         self.law = law
-        self.taken = 0  # packets of each way
-        self._key = luck_key(link, seed, run)
+        self.used = 0  # packets of each directed link
+        self._key = stream_key(link, seed, run)
         self._pairs = np.asarray(pairs, np.int64).reshape(-1, 2)
-        self.ways = len(self._pairs)
+        self.arcs = len(self._pairs)
         self._bad: Flags = self._uniforms(1, 1)[:, 0, 0] < law.bad
-        self._drawn = np.empty((self.ways, 0, BLOCK))  # luck drawn ahead, from packet `taken` on
+        self._drawn = np.empty((self.arcs, 0, BLOCK))  # random numbers drawn ahead, from packet `used` on
 
     def take(self, count: int) -> Floats:
         """Return the delays (M, count) in seconds of the next packets, infinite for those that get lost."""
-        law, first = self.law, self.taken
-        self.taken += count
+        law, first = self.law, self.used
+        self.used += count
         if law.trace is not None:
             recorded = law.trace[np.arange(first, first + count) % law.trace.size]
-            return np.broadcast_to(recorded, (self.ways, count))
-        drawn = self._drawn.shape[1]
-        if count > drawn:
-            more = max(count - drawn, min(AHEAD, MOST_AHEAD // max(self.ways, 1)))
-            self._drawn = np.concatenate([self._drawn, self._uniforms(first + drawn + 2, more)], axis=1)
+            return np.broadcast_to(recorded, (self.arcs, count))
+        samples = self._drawn.shape[1]
+        if count > samples:
+            more = max(count - samples, min(AHEAD, MOST_AHEAD // max(self.arcs, 1)))
+            self._drawn = np.concatenate([self._drawn, self._uniforms(first + samples + 2, more)], axis=1)
         uniforms, self._drawn = self._drawn[:, :count], self._drawn[:, count:]
         bad = self._states(uniforms[..., 0])
         lost = uniforms[..., 1] < np.where(bad, law.one_minus_h, law.one_minus_k)
@@ -199,27 +198,27 @@ class PacketSource:
         return np.where(lost, np.inf, np.maximum(law.delay + law.jitter * late, 0.0))
 
     def _uniforms(self, first: int, count: int) -> Floats:
-        """Return the numbers (M, count, BLOCK) of so many blocks, from 0 to less than 1, of 53 bits each."""
+        """Return `count` blocks per link (M, count, BLOCK) of numbers uniform on [0, 1) with 53 bits."""
         generator = np.random.Philox(key=np.array(self._key, np.uint64))
         state: Any = generator.state
-        words = np.empty((self.ways, count * BLOCK), np.uint64)
+        words = np.empty((self.arcs, count * BLOCK), np.uint64)
         for row, pair in zip(words, self._pairs, strict=True):
             state["state"]["counter"] = np.array([first - 1, *pair, 0], np.uint64)  # it counts, then gives
             generator.state = state
             row[:] = generator.random_raw(count * BLOCK)
-        places = words.reshape(self.ways, count, BLOCK)
-        return np.asarray((places >> np.uint64(11)) * 2.0**-53, dtype=np.float64)
+        indices = words.reshape(self.arcs, count, BLOCK)
+        return np.asarray((indices >> np.uint64(11)) * 2.0**-53, dtype=np.float64)
 
     def _states(self, uniforms: Floats) -> Flags:
-        """Return whether each way is bad at each packet (M, count).
+        """Return whether each directed link is in the bad state at each packet (M, count).
 
         The step after a packet is a map of {good, bad} to itself: one of both constants, the identity, or the
-        exchange. So the state is that of the last constant, exchanged as often as there were exchanges since.
+        exchange. The state is therefore that of the last constant map, inverted once per later exchange.
         """
         turns_bad, turns_good = uniforms < self.law.p, uniforms >= 1 - self.law.r
         steps = np.arange(1, uniforms.shape[1] + 1)
         constant = np.maximum.accumulate(np.where(turns_bad != turns_good, steps, 0), axis=1)
-        none = np.zeros((self.ways, 1), np.int64)
+        none = np.zeros((self.arcs, 1), np.int64)
         exchanges = np.hstack([none, np.cumsum(turns_bad & turns_good, axis=1)])
         first = np.take_along_axis(np.hstack([self._bad[:, None], turns_bad]), constant, axis=1)
         since = exchanges[:, 1:] - np.take_along_axis(exchanges, constant, axis=1)

@@ -1,1 +1,1 @@
-"""The stable region of two parameters: its boundary, its picture, and published conditions beside it."""
+"""The stable region of two parameters: its boundary, its picture, and published conditions for comparison."""

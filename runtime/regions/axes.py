@@ -1,7 +1,7 @@
-"""The axes of a stable region: two parameters of a scene, and their ranges.
+"""The axes of a stable region: two parameters of a model, and their ranges.
 
 Takes: a `Model` and texts such as `contact.stiffness=10 N/m:3000 N/m`.
-Gives: `parse_axes`; `PLACE`.
+Gives: `parse_axes`; `LOCATION`.
 Guarantees: a parameter that can't be an axis is refused, and said why.
 Does not: analyse.
 """
@@ -13,14 +13,14 @@ from fractions import Fraction
 
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
-from apc.compiler.words import with_unit
-from apc.frame.names import Range, overlap, proposed_range, unit_of
+from apc.compiler.wording import with_unit
+from apc.frame.parameter_names import Range, overlap, proposed_range, unit_of
+from apc.parameter_studies.timing_values import refuse_phase
 from apc.sweeps.grid import parse_axis
-from apc.vary.timing_values import refuse_phase
 
-PLACE = SourceLocation("region")
+LOCATION = SourceLocation("region")
 
-# The least width of a range, of its larger end: half the digits of a float are left to tell its points apart.
+# The smallest relative width of a range: half the digits of a float remain to distinguish its points.
 NARROWEST = Fraction(1, 2**26)
 
 _FORM = "contact.stiffness=10 N/m:3000 N/m"
@@ -29,16 +29,16 @@ _FORM = "contact.stiffness=10 N/m:3000 N/m"
 def parse_axes(
     system: Model, x: str | None, y: str | None, *, scale: Fraction = Fraction(1)
 ) -> tuple[Range, Range]:
-    """Read the two axes of a region: `PATH=LOW:HIGH` each, or the scene's own where one is left out.
+    """Read the two axes of a region: `PATH=LOW:HIGH` each, or the model's own where one is left out.
 
     Parameters
     ----------
     system
-        The scene.
+        The model.
     x, y
         `contact.stiffness=10 N/m:3000 N/m`, or None for that of `studies: region:`.
     scale
-        What the range of y is divided by.
+        The divisor of the range of y.
 
     Raises
     ------
@@ -47,42 +47,42 @@ def parse_axes(
         axis, or a range too narrow for floats; E622, E881, E204, E624 as `grid.parse_axis`.
     """
     intervals = []
-    for letter, text, place in (("x", x, 0), ("y", y, 1)):
+    for letter, text, index in (("x", x, 0), ("y", y, 1)):
         if text is None and len(system.region) == 2:
-            own = system.region[place]
-            unit = unit_of(system, own.parameter)
-            text = f"{own.parameter}={float(own.low)!r} {unit}:{float(own.high)!r} {unit}"
+            local = system.region[index]
+            unit = unit_of(system, local.parameter)
+            text = f"{local.parameter}={float(local.low)!r} {unit}:{float(local.high)!r} {unit}"
         if text is None:
-            what = f"the scene has no studies: region:, so that --{letter} must be given"
+            message = f"the topology has no studies: region:, so that --{letter} must be given"
             given = (y if letter == "x" else x) or ""
             other = given.partition("=")[0].strip()
             hint = f'--{letter} "{proposed_range(system, without=other)}"'
-            raise ApcError(Diagnostic("E901", PLACE, what, hint=hint))
+            raise ApcError(Diagnostic("E901", LOCATION, message, hint=hint))
         name, equals, span = (part.strip() for part in text.partition("="))
         if not (equals and name and span.count(":") == 1):
             hint = f'--{letter} "{_FORM}"'
             raise ApcError(
-                Diagnostic("E901", PLACE, f"--{letter}", "PATH=LOW:HIGH", text[:80] or "nothing", hint)
+                Diagnostic("E901", LOCATION, f"--{letter}", "PATH=LOW:HIGH", text[:80] or "nothing", hint)
             )
         try:
             axis = parse_axis(system, name, span, ends=True)
         except ApcError as error:
             raise ApcError(
-                replace(mistake, place=SourceLocation(f"--{letter}")) for mistake in error.mistakes
+                replace(mistake, location=SourceLocation(f"--{letter}")) for mistake in error.mistakes
             ) from None
-        refuse_phase(system, axis.free, PLACE, code="E903")
+        refuse_phase(system, axis.free, LOCATION, code="E903")
         low, high = axis.values[0], axis.values[-1]
         least = NARROWEST * max(abs(low), abs(high))
         if high - low < least:
             expected = with_unit(f"a width of at least {float(least):.2g}", axis.unit)
-            what, got = f"the range of {axis.free.label}", with_unit(f"{float(high - low):.2g}", axis.unit)
-            raise ApcError(Diagnostic("E903", SourceLocation(f"--{letter}"), what, expected, got))
+            message, got = f"the range of {axis.free.label}", with_unit(f"{float(high - low):.2g}", axis.unit)
+            raise ApcError(Diagnostic("E903", SourceLocation(f"--{letter}"), message, expected, got))
         intervals.append(Range(axis.free, axis.unit, axis.values[0], axis.values[-1]))
     first, second = intervals
     if overlap(system, first.free, second.free):
         item, other = first.free.label, second.free.label
-        what = f"{item} is on both axes; a region has two parameters"
+        message = f"{item} is on both axes; a region has two parameters"
         if item != other:
-            what = f"{item} and {other} are not apart: without a group it is that of all groups"
-        raise ApcError(Diagnostic("E902", PLACE, what))
+            message = f"{item} and {other} are not apart: without a group it is that of all groups"
+        raise ApcError(Diagnostic("E902", LOCATION, message))
     return first, replace(second, low=second.low / scale, high=second.high / scale)

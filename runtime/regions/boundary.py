@@ -1,6 +1,6 @@
 """Boundary curves of a stable region in the unit square, to a stated accuracy.
 
-Takes: a `Eigenvalues` and the `Survey` of its cells.
+Takes: an `Eigenvalues` and the `Survey` of its cells.
 Gives: `BoundaryArc`, `trace`, `traced`; `trace_steps`, `straight_arc` for a boundary that has steps;
 `stable_area`, `relative_to`.
 Guarantees: every point lies on the boundary to rounding; between its points a curve is the cubic Hermite
@@ -27,7 +27,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.frame.radius import UNIT
+from apc.frame.interval_arithmetic import UNIT_ROUNDOFF
+from apc.regions.adaptive_grid import Survey, just_inside, survey
 from apc.regions.boundary_points import (
     MOST_STEPS,
     MOST_TRIES,
@@ -35,11 +36,10 @@ from apc.regions.boundary_points import (
     clear,
     cross,
     moved,
-    polish,
+    newton_refine,
 )
-from apc.regions.curves import area_beside, handles_of, off_an_arc, straight_handles, tangents
-from apc.regions.deciding import Eigenvalues, Pairs, join
-from apc.regions.survey import Survey, just_inside, survey
+from apc.regions.curves import area_under, distance_from_arc, handles_of, straight_handles, tangents
+from apc.regions.dominant_pairs import Eigenvalues, Pairs, join
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -61,8 +61,8 @@ COINCIDENT = 1e-11
 # An error of a curve, of the unit square, beyond which it is lost; how often cells are halved to find it.
 LOST, MOST_HALVED = 1e-3, 3
 
-# Points on either side of a chord at which the boundary is looked for, at growing distances, and of
-# how many chords at most.
+# Number of points on either side of a chord at which the boundary is searched, at growing distances, and the
+# largest number of chords.
 FARTHER, FEW = 24, 8
 
 # A middle farther from where it is expected, in lengths of the interval, is not on the same piece.
@@ -75,7 +75,7 @@ EXPLAINED = 0.25
 # twice that, and rounding takes a share.
 FILLED = 0.375
 
-# Where on a cell's edge a step of the boundary is, in shares of the range: finer than any picture shows.
+# The accuracy of a boundary step on a cell's edge, as a share of the range: finer than any picture.
 RESOLUTION = 2.0**-24
 
 # A straight line that is off by less, in shares of the range, is not halved.
@@ -87,13 +87,13 @@ LEAST_COORDINATE = 1e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoundaryArc:
-    """A piece of the boundary along which one mode decides, stable side on the left.
+    """An arc of the boundary with one critical mode, stable side on the left.
 
-    `points` (k, 2) and `handles` (k − 1, 2, 2), see `curves`, are of the unit square.
-    `errors` (k − 1,) are its distances from the boundary. `knots` (m, 2) are the points that were solved for,
-    `values` (m,) the eigenvalues there, `system` is the closed system they belong to, and `rounding` bounds
-    how far rounding moves them. `chain` says which chain of the survey the arc is on. An arc that is not
-    `smooth` has steps, and straight lines between its points.
+    `points` (k, 2) and `handles` (k − 1, 2, 2), see `curves`, are of the unit square. `errors` (k − 1,) are
+    its distances from the boundary. `knots` (m, 2) are the points that were solved for, `values` (m,) the
+    eigenvalues there, `system` is their closed-loop system, and `rounding` bounds their rounding error.
+    `chain` is the index of the arc's chain in the survey. An arc that is not `smooth` has steps, and straight
+    lines between its points.
     """
 
     points: Floats
@@ -119,9 +119,9 @@ class BoundaryArc:
 
 
 class _Knots:
-    """Points on the boundary, each with the eigenvalue that decides there; `key` orders those of a chain.
+    """Points on the boundary with their critical eigenvalues; `key` orders those of a chain.
 
-    `error` is that of the interval from a knot to the next; `last` says that an arc ends with the knot.
+    `error` is that of the interval from a knot to the next; `last` is whether the arc ends with the knot.
     """
 
     def __init__(self, points: Floats, pairs: Pairs, chain: Integers, key: Floats) -> None:
@@ -142,8 +142,8 @@ class _Knots:
 
     @property
     def jumps(self) -> NDArray[np.bool_]:
-        """Say of each knot whether the boundary is there because the spectral radius jumps."""
-        return np.asarray(~(np.abs(self.pairs.growth) <= JUMP))
+        """Return for each knot whether the spectral radius is discontinuous there."""
+        return np.asarray(~(np.abs(self.pairs.log_radius) <= JUMP))
 
     def tangents(self, knots: Integers) -> Floats:
         """Return the unit tangents (k, 2) at some knots, with falling log|λ| on their left."""
@@ -163,18 +163,18 @@ def trace(
     Parameters
     ----------
     deciding
-        What decides over the unit square.
+        The evaluator over the unit square.
     survey
-        Where the boundary crosses the cells' edges, and in what order.
+        The crossings of the boundary with the cells' edges, in order.
     tolerance
         Largest distance between curves and boundary, relative to one of the two coordinates: that in which
         the distance makes the smaller difference.
     offset
-        What to add to unit coordinates to have them count from zero (2,): lower end over width of the range.
+        The offset from unit coordinates to values relative to zero (2,): lower end over width of the range.
     """
     if not survey.chains:
         return ()
-    points, pairs = cross(deciding, survey.stable, survey.unstable, survey.growth)
+    points, pairs = cross(deciding, survey.stable, survey.unstable, survey.log_radius)
     members: list[int] = []
     chain: list[int] = []
     key: list[int] = []
@@ -183,12 +183,12 @@ def trace(
         members += whole
         chain += [number] * len(whole)
         key += range(len(whole))
-    taken = np.array(members)
-    knots = _Knots(points[taken], pairs.at(taken), np.array(chain), np.array(key, np.float64))
+    used = np.array(members)
+    knots = _Knots(points[used], pairs.at(used), np.array(chain), np.array(key, np.float64))
     first = np.flatnonzero(knots.chain[1:] == knots.chain[:-1])
     intervals = np.stack([first, first + 1], axis=1)
     for halving in range(MOST_HALVINGS):
-        intervals = _apart(knots, intervals)
+        intervals = _separate(knots, intervals)
         if not len(intervals):
             break
         intervals = _halve(deciding, knots, intervals, tolerance, offset, guarded=not halving)
@@ -197,13 +197,13 @@ def trace(
     return _arcs(deciding, knots, survey.closed)
 
 
-def _apart(knots: _Knots, intervals: Integers) -> Integers:
+def _separate(knots: _Knots, intervals: Integers) -> Integers:
     """Return the intervals longer than nothing; where two modes meet in one of no length, an arc ends."""
     a, b = intervals.T
-    apart = np.linalg.norm(knots.points[b] - knots.points[a], axis=1) > COINCIDENT
-    meeting = intervals[~apart]
-    knots.last[meeting[~_on_one_branch(knots, meeting), 0]] = True
-    left: Integers = intervals[apart]
+    separation = np.linalg.norm(knots.points[b] - knots.points[a], axis=1) > COINCIDENT
+    meeting = intervals[~separation]
+    knots.last[meeting[~_on_single_branch(knots, meeting), 0]] = True
+    left: Integers = intervals[separation]
     return left
 
 
@@ -220,7 +220,7 @@ def _halve(
 
     `guarded` asks whether another eigenvalue has left the unit circle at the new knots.
     """
-    same = _on_one_branch(knots, intervals)
+    same = _on_single_branch(knots, intervals)
     lost, left = intervals[~same], []
     jumps = knots.jumps[lost].any(axis=1)
     if not jumps.all():
@@ -234,20 +234,22 @@ def _halve(
         # The cubic with these tangents goes through here in its middle.
         handles = handles_of(knots.points[a], knots.points[b], tangent_a, tangent_b)
         expected = (knots.points[a] + knots.points[b] + 3 * handles.sum(axis=1)) / 8
-        unseen = off_an_arc(tangent_a, tangent_b, length)
-        place, pairs = polish(deciding, expected, _halfway(knots, a, b, chord))
-        off = _norm(place - expected)
-        good = off <= ASTRAY * length
+        unseen = distance_from_arc(tangent_a, tangent_b, length)
+        index, pairs = newton_refine(deciding, expected, _halfway(knots, a, b, chord))
+        error_bound = _norm(index - expected)
+        good = error_bound <= ASTRAY * length
         if guarded:
-            good &= clear(deciding, place, pairs)
+            good &= clear(deciding, index, pairs)
         lost = np.concatenate([lost, np.stack([a[~good], b[~good]], axis=1)])
-        a, b, place, pairs = a[good], b[good], place[good], pairs.at(good)
-        off = (off[good] + unseen[good]) / GAIN
-        middle = knots.add(place, pairs, a, (knots.key[a] + knots.key[b]) / 2)
-        knots.error[a] = knots.error[middle] = off
+        a, b, index, pairs = a[good], b[good], index[good], pairs.at(good)
+        error_bound = (error_bound[good] + unseen[good]) / GAIN
+        middle = knots.add(index, pairs, a, (knots.key[a] + knots.key[b]) / 2)
+        knots.error[a] = knots.error[middle] = error_bound
         # No nearer than where rounding has the boundary, which the curve's error counts as well.
         values = _rounding(deciding, pairs)
-        fine = off <= np.maximum(FILLED * tolerance * relative_to(place, pairs.gradient, offset), values)
+        fine = error_bound <= np.maximum(
+            FILLED * tolerance * relative_to(index, pairs.gradient, offset), values
+        )
         left += [np.stack([a, middle], axis=1)[~fine], np.stack([middle, b], axis=1)[~fine]]
     if len(lost):
         left.append(_search(deciding, knots, lost, tolerance, offset))
@@ -260,7 +262,7 @@ def _norm(vectors: Floats) -> Floats:
 
 
 def relative_to(points: Floats, gradient: Floats, offset: Floats) -> Floats:
-    """Return what a distance from the boundary is relative to, at points (k, 2).
+    """Return the scale of a relative distance from the boundary, at points (k, 2).
 
     A distance d is a difference d/|n_x| of one coordinate or d/|n_y| of the other, n the unit normal.
     """
@@ -269,13 +271,13 @@ def relative_to(points: Floats, gradient: Floats, offset: Floats) -> Floats:
     return size
 
 
-def _on_one_branch(knots: _Knots, intervals: Integers) -> NDArray[np.bool_]:
-    """Say of each interval whether the eigenvalues at its ends are one that moved."""
+def _on_single_branch(knots: _Knots, intervals: Integers) -> NDArray[np.bool_]:
+    """Return for each interval whether the eigenvalues at its ends are on one branch."""
     a, b = intervals.T
     chord = knots.points[b] - knots.points[a]
     moves = [(knots.pairs.slope[end] * chord).sum(axis=1) for end in (a, b)]
     moved = knots.pairs.value[b] - knots.pairs.value[a]
-    # A complex pair may meet on the real axis: the slopes say nothing there, but the eigenvalue is near it.
+    # A complex pair may meet on the real axis: slopes are then useless, but the eigenvalue is near the axis.
     size = np.abs(moved) + np.abs(moves[0]) + np.abs(moves[1])
     same: NDArray[np.bool_] = (knots.pairs.system[a] == knots.pairs.system[b]) & ~knots.jumps[intervals].any(
         axis=1
@@ -292,50 +294,50 @@ def _halfway(knots: _Knots, a: Integers, b: Integers, chord: Floats) -> Pairs:
 
 
 def _corners(deciding: Eigenvalues, knots: _Knots, intervals: Integers) -> tuple[Integers, Integers]:
-    """Solve for the corner in each interval; return the intervals beside corners, and those without one."""
+    """Solve for the corner in each interval; return the intervals adjacent to corners, and those without."""
     a, b = intervals.T
     count = len(a)
     chord = knots.points[b] - knots.points[a]
     length = _norm(chord)
-    place = (knots.points[a] + knots.points[b]) / 2
+    location = (knots.points[a] + knots.points[b]) / 2
     pairs = join([knots.pairs.at(a), knots.pairs.at(b)])
     before = np.concatenate([knots.points[a], knots.points[b]])
     for _ in range(MOST_STEPS):
-        both = np.concatenate([place, place])
+        both = np.concatenate([location, location])
         pairs = deciding.follow(both, moved(pairs, both - before))
         before = both
         rows = np.stack([pairs.gradient[:count], pairs.gradient[count:]], axis=1)
-        growth = np.stack([pairs.growth[:count], pairs.growth[count:]], axis=1)
-        regular = np.abs(np.linalg.det(rows)) > UNIT * np.square(rows).sum(axis=(1, 2))
+        growth = np.stack([pairs.log_radius[:count], pairs.log_radius[count:]], axis=1)
+        regular = np.abs(np.linalg.det(rows)) > UNIT_ROUNDOFF * np.square(rows).sum(axis=(1, 2))
         rows = np.where(regular[:, None, None], rows, np.eye(2))
         step = -np.linalg.solve(rows, growth[:, :, None])[:, :, 0]
         # The first step may overshoot; the corner is no farther than the chord is long.
         size = np.linalg.norm(step, axis=1)
         step *= np.minimum(1, length / np.maximum(size, np.finfo(np.float64).tiny))[:, None]
-        place = place + step
+        location = location + step
         if np.all(size <= SHORT):
             break
-    off = np.linalg.norm(place - (knots.points[a] + knots.points[b]) / 2, axis=1)
-    good = regular & (size <= SHORT) & (off <= length)
-    good &= clear(deciding, place, pairs.at(np.arange(count)))
-    a, b, place = a[good], b[good], place[good]
-    own = pairs.at(np.concatenate([good, good]))
+    error_bound = np.linalg.norm(location - (knots.points[a] + knots.points[b]) / 2, axis=1)
+    good = regular & (size <= SHORT) & (error_bound <= length)
+    good &= clear(deciding, location, pairs.at(np.arange(count)))
+    a, b, location = a[good], b[good], location[good]
+    local = pairs.at(np.concatenate([good, good]))
     third = (knots.key[b] - knots.key[a]) / 3
-    ends = knots.add(place, own.at(np.arange(len(a))), a, knots.key[a] + third)
-    starts = knots.add(place, own.at(np.arange(len(a), 2 * len(a))), a, knots.key[b] - third)
+    ends = knots.add(location, local.at(np.arange(len(a))), a, knots.key[a] + third)
+    starts = knots.add(location, local.at(np.arange(len(a), 2 * len(a))), a, knots.key[b] - third)
     knots.last[ends] = True
-    beside = np.concatenate([np.stack([a, ends], axis=1), np.stack([starts, b], axis=1)])
-    return beside, intervals[~good]
+    alongside = np.concatenate([np.stack([a, ends], axis=1), np.stack([starts, b], axis=1)])
+    return alongside, intervals[~good]
 
 
 def _search(
     deciding: Eigenvalues, knots: _Knots, intervals: Integers, tolerance: float, offset: Floats
 ) -> Integers:
-    """Put a knot into intervals nothing is known about, where a line across their middle meets the boundary.
+    """Insert a knot into open intervals, at the intersection of the boundary with the perpendicular bisector.
 
-    It meets it near the chord, or farther off: around a long tongue, say, whose sides are near each other.
-    Returns the halves that are not good enough yet; an interval without such a crossing keeps the chord as
-    its error. Along a jump the boundary is followed by straight lines: they are off by what the knot is.
+    The intersection is near the chord, or farther away, as for a long narrow tongue. Returns the halves that
+    are not good enough yet; an interval without such a crossing keeps the chord as its error. Along a jump
+    the boundary is followed by straight lines: they are off by what the knot is.
     """
     a, b = intervals.T
     chord = knots.points[b] - knots.points[a]
@@ -344,26 +346,26 @@ def _search(
     # From stable to unstable, in units of half a chord: nearby, then out to where the square ends.
     reach = FARTHER if len(a) <= FEW else 1
     out = np.geomspace(1, 2 / np.maximum(_norm(across), COINCIDENT), reach)
-    places = np.concatenate([-out[::-1], out])[:, :, None] * across + middle  # (2 · reach, k, 2)
-    places = np.asarray(just_inside(places.reshape(-1, 2)))
-    growth = deciding.growth(places.reshape(-1, 2)).reshape(2 * reach, -1)
-    turns = (growth[:-1] < 0) & (growth[1:] >= 0)
+    indices = np.concatenate([-out[::-1], out])[:, :, None] * across + middle  # (2 · reach, k, 2)
+    indices = np.asarray(just_inside(indices.reshape(-1, 2)))
+    growth = deciding.growth(indices.reshape(-1, 2)).reshape(2 * reach, -1)
+    rotations = (growth[:-1] < 0) & (growth[1:] >= 0)
     away = np.abs(np.arange(2 * reach - 1) - reach + 1)
-    nearest = np.argmin(np.where(turns, away[:, None], reach), axis=0)
-    result, every = turns.any(axis=0), np.arange(len(a))
-    stable, unstable = (places.reshape(2 * reach, -1, 2)[nearest + number, every] for number in (0, 1))
+    nearest = np.argmin(np.where(rotations, away[:, None], reach), axis=0)
+    result, every = rotations.any(axis=0), np.arange(len(a))
+    stable, unstable = (indices.reshape(2 * reach, -1, 2)[nearest + number, every] for number in (0, 1))
     ends = np.stack([growth[nearest + number, every] for number in (0, 1)], axis=1)
     knots.error[a[~result]] = np.linalg.norm(chord[~result], axis=1)
     a, b = a[result], b[result]
     if not len(a):
         return intervals[:0]
     tries = 1 if knots.jumps[np.stack([a, b])].any(axis=0).all() else MOST_TRIES
-    place, pairs = cross(deciding, stable[result], unstable[result], ends[result], tries=tries)
-    new = knots.add(place, pairs, a, (knots.key[a] + knots.key[b]) / 2)
+    index, pairs = cross(deciding, stable[result], unstable[result], ends[result], tries=tries)
+    new = knots.add(index, pairs, a, (knots.key[a] + knots.key[b]) / 2)
     straight = knots.jumps[np.stack([a, new, b])].all(axis=0)
-    off = _norm(place - middle[result])
-    straight &= off <= FILLED * tolerance * relative_to(place, across[result], offset)
-    knots.error[a[straight]] = knots.error[new[straight]] = off[straight]
+    error_bound = _norm(index - middle[result])
+    straight &= error_bound <= FILLED * tolerance * relative_to(index, across[result], offset)
+    knots.error[a[straight]] = knots.error[new[straight]] = error_bound[straight]
     a, b, new = a[~straight], b[~straight], new[~straight]
     return np.concatenate([np.stack([a, new], axis=1), np.stack([new, b], axis=1)])
 
@@ -392,12 +394,12 @@ def _between_jumps(knots: _Knots, piece: Integers) -> list[Integers]:
 
 
 def _without_copies(points: Floats) -> Integers:
-    """Return which points of a curve to keep so that no two that follow each other are one; both ends are."""
-    apart = _norm(np.diff(points, axis=0)) > COINCIDENT
-    kept = np.flatnonzero(np.concatenate([[True], apart]))
-    if len(kept) > 1:
-        kept[-1] = len(points) - 1
-    return kept
+    """Return the points of a curve to keep so that consecutive ones differ; both ends are kept."""
+    separation = _norm(np.diff(points, axis=0)) > COINCIDENT
+    stored = np.flatnonzero(np.concatenate([[True], separation]))
+    if len(stored) > 1:
+        stored[-1] = len(points) - 1
+    return stored
 
 
 def _arc(deciding: Eigenvalues, knots: _Knots, piece: Integers, chain: int) -> BoundaryArc:
@@ -425,7 +427,7 @@ def _arc(deciding: Eigenvalues, knots: _Knots, piece: Integers, chain: int) -> B
 
 
 def _rounding(deciding: Eigenvalues, pairs: Pairs) -> Floats:
-    """Return how far rounding moves points of the boundary (k,), by its pairs there."""
+    """Return the rounding error of points of the boundary (k,), from their eigenpairs."""
     steepness = np.linalg.norm(pairs.gradient, axis=1)
     moved_by: Floats = deciding.value_errors(pairs) / np.maximum(steepness, np.finfo(np.float64).tiny)
     return moved_by
@@ -433,28 +435,28 @@ def _rounding(deciding: Eigenvalues, pairs: Pairs) -> Floats:
 
 def trace_steps(
     growth: Callable[[Floats], Floats],
-    leading: Callable[[Floats], complex],
+    dominant: Callable[[Floats], complex],
     survey: Survey,
     *,
     halvings: int = 0,
 ) -> tuple[BoundaryArc, ...]:
-    """Follow a boundary that is known by verdicts alone, by straight lines.
+    """Follow a boundary from stability verdicts only, by straight segments.
 
     Over a link a packet is read at ticks only: the radius is a step function of the delay, and the boundary a
-    staircase, which goes straight up wherever a packet comes a tick later. How it runs inside a cell is not
-    said: its error there is the length of the line.
+    staircase with a step wherever a packet arrives one tick later. Within a cell the boundary is not
+    resolved: its error there is the length of the segment.
 
     Parameters
     ----------
     growth
-        Gives the logarithm of the spectral radius (k,), or what stands for it, at points (k, 2).
-    leading
-        Gives the eigenvalue that decides at a point (2,).
+        Returns the logarithm of the spectral radius (k,), or of its substitute, at points (k, 2).
+    dominant
+        Returns the critical eigenvalue at a point (2,).
     survey
-        Where the boundary crosses the cells' edges, and in what order.
+        The crossings of the boundary with the cells' edges, in order.
     halvings
-        How often the middle of a line is put onto the boundary, where that has no steps; the error is then by
-        how far it was off.
+        The number of bisections of a segment, if the boundary has no steps; the error is then the last
+        displacement.
     """
     stable, unstable = _closed_in(growth, survey.stable, survey.unstable)
     arcs = []
@@ -466,7 +468,7 @@ def trace_steps(
             points, errors = _halved(growth, points, errors)
         middle = members[len(members) // 2]  # its unstable side has the motion that grows
         arcs.append(
-            straight_arc(points, errors, unstable[middle], leading(unstable[middle]), number, RESOLUTION)
+            straight_arc(points, errors, unstable[middle], dominant(unstable[middle]), number, RESOLUTION)
         )
     return tuple(arcs)
 
@@ -481,9 +483,9 @@ def _closed_in(growth: Callable[[Floats], Floats], stable: Floats, unstable: Flo
 
 
 def _halved(growth: Callable[[Floats], Floats], points: Floats, errors: Floats) -> tuple[Floats, Floats]:
-    """Put a point of the boundary beside the middle of each line that is off by more than `STRAIGHT`.
+    """Insert a point of the boundary at the middle of each segment with an error above `STRAIGHT`.
 
-    An arc of a circle is off its chord by four times what it is off two chords; half of that is counted on.
+    Halving a chord of a circular arc reduces the error by four; a factor of two is assumed.
     """
     lines = np.flatnonzero(errors > STRAIGHT)
     chord = np.diff(points, axis=0)[lines]
@@ -514,9 +516,9 @@ def straight_arc(
     knot, value
         A point (2,) on the boundary or beyond it, and the eigenvalue that decides there.
     chain
-        Which chain of the survey the arc is on.
+        The index of the arc's chain in the survey.
     rounding
-        How far the points themselves may be off.
+        The error of the points.
     """
     return BoundaryArc(
         points=points,
@@ -556,16 +558,16 @@ def traced(
     """
     result = survey(samples, cells=cells)
     arcs = trace(deciding, result, tolerance=tolerance, offset=offset)
-    area, off = stable_area(arcs, result)
+    area, error_bound = stable_area(arcs, result)
     for halving in range(1, MOST_HALVED + 1):
-        if off >= 1 or max((float(arc.errors.max()) for arc in arcs), default=0.0) <= LOST:
+        if error_bound >= 1 or max((float(arc.errors.max()) for arc in arcs), default=0.0) <= LOST:
             break
         finer = survey(samples, cells=cells * 2**halving)
-        again = trace(deciding, finer, tolerance=tolerance, offset=offset)
-        better = stable_area(again, finer)
-        if better[1] < off:  # not at a cusp, say
-            arcs, result, (area, off) = again, finer, better
-    return arcs, result, area, off
+        repeated = trace(deciding, finer, tolerance=tolerance, offset=offset)
+        better = stable_area(repeated, finer)
+        if better[1] < error_bound:  # for example at a cusp
+            arcs, result, (area, error_bound) = repeated, finer, better
+    return arcs, result, area, error_bound
 
 
 def stable_area(arcs: Sequence[BoundaryArc], survey: Survey) -> tuple[float, float]:
@@ -573,19 +575,19 @@ def stable_area(arcs: Sequence[BoundaryArc], survey: Survey) -> tuple[float, flo
 
     ∮ x dy around the stable side: along the curves, and up the right edge where that is stable.
     """
-    area, off = 0.0, 0.0
+    area, error_bound = 0.0, 0.0
     ends: dict[int, list[Floats]] = {}
     for arc in arcs:
-        area += area_beside(arc.points, arc.handles)
+        area += area_under(arc.points, arc.handles)
         length = np.linalg.norm(np.diff(arc.points, axis=0), axis=1)
-        off += float(length @ arc.errors) + float(length.sum()) * arc.rounding
+        error_bound += float(length @ arc.errors) + float(length.sum()) * arc.rounding
         ends.setdefault(arc.chain, []).append(arc.points)
-    turns = []
+    rotations = []
     for chain, pieces in ends.items():
         if not survey.closed[chain]:
-            turns += [float(end[1]) for end in (pieces[0][0], pieces[-1][-1]) if end[0] == 1.0]
+            rotations += [float(end[1]) for end in (pieces[0][0], pieces[-1][-1]) if end[0] == 1.0]
     stable, below = survey.corners[1], 0.0
-    for turn in [*sorted(turns), 1.0]:
+    for turn in [*sorted(rotations), 1.0]:
         area += (turn - below) if stable else 0.0
         stable, below = not stable, turn
-    return min(max(area, 0.0), 1.0), off
+    return min(max(area, 0.0), 1.0), error_bound

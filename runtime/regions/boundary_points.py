@@ -1,7 +1,7 @@
 """Newton's method onto the boundary, for many points at once.
 
-Takes: a `Eigenvalues`, and guesses of points and eigenvalues.
-Gives: `cross`, `polish`, `moved`, `clear`; `SHORT`.
+Takes: an `Eigenvalues`, and guesses of points and eigenvalues.
+Gives: `cross`, `newton_refine`, `moved`, `clear`; `SHORT`.
 Guarantees: a point is on the curve log|λ| = 0 of its eigenvalue to rounding, or NaN; one of `cross` is where
 the spectral radius is 1.
 Does not: connect points (see `boundary`).
@@ -14,8 +14,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.regions.deciding import Eigenvalues, Pairs
-from apc.regions.survey import just_inside
+from apc.regions.adaptive_grid import just_inside
+from apc.regions.dominant_pairs import Eigenvalues, Pairs
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -23,11 +23,11 @@ Integers = NDArray[np.int64]
 # A step this short, in unit coordinates, leaves an error of its square.
 SHORT = 1e-8
 
-# Newton's method either arrives within so many steps or is not near anything.
+# Newton's method converges within this number of steps or the start is not near a solution.
 MOST_STEPS = 8
 
-# A bracket is closed in on at most so many times, each time by half or more; the first few of them are tried
-# to be ended by Newton's method, which nothing leads to where the spectral radius jumps.
+# The largest number of bracket reductions, each by half or more; Newton's method is tried on the first few.
+# It does not converge at discontinuities of the spectral radius.
 MOST_BRACKETS, MOST_TRIES = 50, 8
 
 # A bracket this short, in unit coordinates, is one point.
@@ -40,18 +40,18 @@ OUTSIDE = 1e-9
 def cross(
     deciding: Eigenvalues, stable: Floats, unstable: Floats, growth: Floats, *, tries: int = MOST_TRIES
 ) -> tuple[Floats, Pairs]:
-    """Return where the boundary lies on stretches from stable to unstable points, and who decides there.
+    """Return the boundary points between stable and unstable points, and the critical eigenvalues.
 
     Parameters
     ----------
     deciding
-        What decides.
+        The evaluator.
     stable, unstable
         The ends of the stretches (k, 2).
     growth
         The log of the spectral radius at both ends (k, 2).
     tries
-        How often Newton's method is tried.
+        The number of trials of Newton's method.
 
     Notes
     -----
@@ -63,33 +63,35 @@ def cross(
     low, high = np.zeros(count), np.ones(count)
     along = unstable - stable
     points = unstable.copy()
-    pairs = deciding.leading(unstable)
+    pairs = deciding.dominant(unstable)
     guess = _quadratic_root(growth, (pairs.gradient * along).sum(axis=1))
     rest = np.arange(count)
     for bracket in range(MOST_BRACKETS):
         middle = (low[rest] + high[rest]) / 2
-        looked_at, arrived = middle, np.zeros(len(rest), dtype=bool)
+        evaluated_at, arrived = middle, np.zeros(len(rest), dtype=bool)
         if bracket < tries:
             start = stable[rest] + guess[rest, None] * along[rest]
-            place, result = polish(deciding, start, moved(pairs.at(rest), start - points[rest]), along[rest])
+            index, result = newton_refine(
+                deciding, start, moved(pairs.at(rest), start - points[rest]), along[rest]
+            )
             length = np.square(along[rest]).sum(axis=1)
-            reached = ((place - stable[rest]) * along[rest]).sum(axis=1) / length
+            reached = ((index - stable[rest]) * along[rest]).sum(axis=1) / length
             arrived = np.isfinite(reached) & (reached >= low[rest]) & (reached <= high[rest])
-            looked_at = np.where(arrived, reached, middle)
-        spots = stable[rest] + looked_at[:, None] * along[rest]
+            evaluated_at = np.where(arrived, reached, middle)
+        spots = stable[rest] + evaluated_at[:, None] * along[rest]
         top = deciding.growth(spots)
         good = arrived.copy()
         if arrived.any():
-            good[arrived] = top[arrived] <= rounded_growth(spots[arrived], result.gradient[arrived])
-            points[rest[good]] = place[good]
+            good[arrived] = top[arrived] <= rounded_log_radius(spots[arrived], result.gradient[arrived])
+            points[rest[good]] = index[good]
             _put(pairs, rest[good], result.at(good))
         out = ~good & (top > 0)
-        low[rest[~good & ~out]] = looked_at[~good & ~out]
-        high[rest[out]] = looked_at[out]
-        again = rest[out]
-        if len(again) and bracket < tries - 1:
-            points[again] = spots[out]
-            _put(pairs, again, deciding.leading(points[again]))
+        low[rest[~good & ~out]] = evaluated_at[~good & ~out]
+        high[rest[out]] = evaluated_at[out]
+        repeated = rest[out]
+        if len(repeated) and bracket < tries - 1:
+            points[repeated] = spots[out]
+            _put(pairs, repeated, deciding.dominant(points[repeated]))
         rest = rest[~good]
         guess[rest] = (low[rest] + high[rest]) / 2
         if (np.hypot(*along[rest].T) * (high - low)[rest] <= CLOSED).all():
@@ -97,12 +99,12 @@ def cross(
     if not len(rest):
         return points, pairs
     points[rest] = stable[rest] + high[rest, None] * along[rest]
-    _put(pairs, rest, deciding.leading(points[rest]))
+    _put(pairs, rest, deciding.dominant(points[rest]))
     return points, pairs
 
 
 def _quadratic_root(growth: Floats, slope: Floats) -> Floats:
-    """Return where in (0, 1) a quadratic vanishes, of given values (k, 2) at 0 and 1 and slope (k,) at 1.
+    """Return the zero in (0, 1) of a quadratic with values (k, 2) at 0 and 1 and slope (k,) at 1.
 
     Where the slope doesn't fit, by another mode at the other end, the secant's root.
     """
@@ -116,24 +118,26 @@ def _quadratic_root(growth: Floats, slope: Floats) -> Floats:
     return guess
 
 
-def _put(pairs: Pairs, places: Integers, new: Pairs) -> None:
+def _put(pairs: Pairs, indices: Integers, new: Pairs) -> None:
     """Write pairs into others, in place."""
     for name in Pairs.__slots__:
-        getattr(pairs, name)[places] = getattr(new, name)
+        getattr(pairs, name)[indices] = getattr(new, name)
 
 
-def rounded_growth(points: Floats, gradient: Floats) -> Floats:
-    """Return up to where log|λ| counts as zero at points of the boundary, looked at a hair inside the rim."""
+def rounded_log_radius(points: Floats, gradient: Floats) -> Floats:
+    """Return the tolerance for zero log|λ| at boundary points, evaluated just inside the rectangle."""
     shift = np.abs(just_inside(points) - points)
     limit: Floats = OUTSIDE + 2 * (shift * np.abs(gradient)).sum(axis=1)
     return limit
 
 
 def clear(deciding: Eigenvalues, points: Floats, pairs: Pairs) -> NDArray[np.bool_]:
-    """Say of each point of the boundary whether no other eigenvalue has left the unit circle there."""
+    """Return for each boundary point whether no other eigenvalue is outside the unit circle."""
     alone: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
     if alone.any():
-        alone[alone] = deciding.growth(points[alone]) <= rounded_growth(points[alone], pairs.gradient[alone])
+        alone[alone] = deciding.growth(points[alone]) <= rounded_log_radius(
+            points[alone], pairs.gradient[alone]
+        )
     return alone
 
 
@@ -142,7 +146,7 @@ def moved(pairs: Pairs, by: Floats) -> Pairs:
     return replace(pairs, value=pairs.value + (pairs.slope * by).sum(axis=1))
 
 
-def polish(
+def newton_refine(
     deciding: Eigenvalues, points: Floats, guess: Pairs, along: Floats | None = None
 ) -> tuple[Floats, Pairs]:
     """Move points onto the curve log|λ| = 0 of the eigenvalues guessed; NaN where that leads nowhere.
@@ -150,9 +154,9 @@ def polish(
     Parameters
     ----------
     deciding
-        What decides.
+        The evaluator.
     points
-        Where to begin (k, 2).
+        The start points (k, 2).
     guess
         The eigenvalues to follow.
     along
@@ -162,9 +166,9 @@ def polish(
     whole = guess
     for _ in range(MOST_STEPS):
         guess = deciding.follow(points, guess)
-        way = guess.gradient if along is None else along
-        rise = (guess.gradient * way).sum(axis=1)
-        step = -(guess.growth / np.where(rise == 0, np.nan, rise))[:, None] * way
+        direction = guess.gradient if along is None else along
+        rise = (guess.gradient * direction).sum(axis=1)
+        step = -(guess.log_radius / np.where(rise == 0, np.nan, rise))[:, None] * direction
         size = np.hypot(*step.T)
         points, guess = points + step, moved(guess, step)
         done = size <= SHORT

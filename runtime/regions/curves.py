@@ -1,7 +1,7 @@
 """Smooth plane curves as chains of cubic Bézier segments.
 
 Takes: points (k, 2) along a curve, and tangents there or handles.
-Gives: `handles_of`, `straight_handles`, `between`, `tangents`, `area_beside`, `off_an_arc`.
+Gives: `handles_of`, `straight_handles`, `between`, `tangents`, `area_under`, `distance_from_arc`.
 Guarantees: `between` is the interpolant that results are given by; a curve scaled is the curve of its points
 and handles scaled.
 Does not: know what the curves bound.
@@ -53,7 +53,7 @@ def tangents(points: Floats, handles: Floats) -> Floats:
     return values
 
 
-def area_beside(points: Floats, handles: Floats) -> float:
+def area_under(points: Floats, handles: Floats) -> float:
     """Return ∫ x dy along a curve: exactly, by three Gauss points a segment."""
     steps = np.diff(np.stack([points[:-1], handles[:, 0], handles[:, 1], points[1:]]), axis=0)[..., 1]
     total = 0.0
@@ -64,12 +64,12 @@ def area_beside(points: Floats, handles: Floats) -> float:
     return total
 
 
-def off_an_arc(tangent_a: Floats, tangent_b: Floats, length: Floats) -> Floats:
-    """Return how far a cubic of `handles_of` is at most from a circular arc, which it meets in the middle.
+def distance_from_arc(tangent_a: Floats, tangent_b: Floats, length: Floats) -> Floats:
+    """Return the largest distance of a cubic of `handles_of` from a circular arc, with contact in the middle.
 
     The chord subtends θ: the distance is (2/27) r sin⁶(θ/4)/cos²(θ/4), r = chord/(2 sin(θ/2)).
     """
     turn = np.clip((tangent_a * tangent_b).sum(axis=1), -1, 1)
     quarter = np.arccos(turn) / 4
-    off: Floats = length / 54 * np.sin(quarter) ** 5 / np.cos(quarter) ** 3
-    return off
+    error_bound: Floats = length / 54 * np.sin(quarter) ** 5 / np.cos(quarter) ** 3
+    return error_bound

@@ -1,4 +1,4 @@
-"""A published condition laid over two parameters of a scene: who plays which symbol, and the curve.
+"""A published condition laid over two parameters of a model: who plays which symbol, and the curve.
 
 Takes: a `Model` and words such as
 `colgate:K=contact.stiffness,B=contact.damping,b=device.damping,T=haptic.period`.
@@ -20,16 +20,16 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import Group, Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
-from apc.frame.names import ParameterRef, Range, find, unit_of, value_now
 from apc.frame.overrides import Override, apply
-from apc.hands.wall_conditions import CONDITIONS, MEANINGS, UNITS, PublishedCondition
+from apc.frame.parameter_names import ParameterRef, Range, find, unit_of, value_now
+from apc.haptics.wall_conditions import CONDITIONS, MEANINGS, UNITS, PublishedCondition
 
 Floats = NDArray[np.float64]
 
-_PLACE = SourceLocation("overlay")
+_LOCATION = SourceLocation("overlay")
 _FORM = "colgate:K=contact.stiffness,B=contact.damping,b=device.damping,T=haptic.period"
 
-# Lines of the plane along each axis on which the boundary is found: a curve of so many points looks smooth.
+# Grid lines along each axis at which the boundary is evaluated: enough points for a smooth curve.
 LINES = 65
 
 
@@ -42,7 +42,7 @@ class Overlay:
 
     @property
     def label(self) -> str:
-        """What a legend says: authors and formula."""
+        """The text of a legend: authors and formula."""
         return f"{self.condition.title}: {self.condition.formula}"
 
 
@@ -57,27 +57,29 @@ def parse_overlay(system: Model, text: str) -> Overlay:
     """
     name, colon, rest = (part.strip() for part in text.partition(":"))
     if not colon or not rest:
-        raise ApcError(Diagnostic("E886", _PLACE, "an overlay", "CONDITION:SYMBOL=NAME,…", text[:80], _FORM))
+        raise ApcError(
+            Diagnostic("E886", _LOCATION, "an overlay", "CONDITION:SYMBOL=NAME,…", text[:80], _FORM)
+        )
     condition = CONDITIONS.get(name)
     if condition is None:
-        what = f"{name[:80]} is no published condition known here ({', '.join(CONDITIONS)})"
-        raise ApcError(Diagnostic("E886", _PLACE, what, hint=nearest(name, CONDITIONS) or _FORM))
+        message = f"{name[:80]} is no published condition known here ({', '.join(CONDITIONS)})"
+        raise ApcError(Diagnostic("E886", _LOCATION, message, hint=nearest(name, CONDITIONS) or _FORM))
     result: dict[str, ParameterRef | float] = {}
     for part in rest.split(","):
         symbol, equals, player = (piece.strip() for piece in part.partition("="))
         if not (equals and symbol and player):
-            raise ApcError(Diagnostic("E886", _PLACE, "a symbol", "SYMBOL=NAME", part[:80], _FORM))
+            raise ApcError(Diagnostic("E886", _LOCATION, "a symbol", "SYMBOL=NAME", part[:80], _FORM))
         if symbol not in condition.symbols:
-            what = f"{condition.formula} has no {symbol[:80]}; it has {', '.join(condition.symbols)}"
-            raise ApcError(Diagnostic("E886", _PLACE, what, hint=nearest(symbol, condition.symbols)))
+            message = f"{condition.formula} has no {symbol[:80]}; it has {', '.join(condition.symbols)}"
+            raise ApcError(Diagnostic("E886", _LOCATION, message, hint=nearest(symbol, condition.symbols)))
         if symbol in result:
-            raise ApcError(Diagnostic("E886", _PLACE, f"{symbol} is given twice"))
+            raise ApcError(Diagnostic("E886", _LOCATION, f"{symbol} is given twice"))
         result[symbol] = _role(system, symbol, player)
     missing = [symbol for symbol in condition.symbols if symbol not in result]
     if missing:
-        wanted = ", ".join(f"{symbol}, the {MEANINGS[symbol]}" for symbol in missing)
+        requested = ", ".join(f"{symbol}, the {MEANINGS[symbol]}" for symbol in missing)
         hint = f"{text.strip()},{missing[0]}=… (a parameter or a quantity in {UNITS[missing[0]]})"
-        raise ApcError(Diagnostic("E886", _PLACE, f"{condition.formula} needs {wanted}", hint=hint))
+        raise ApcError(Diagnostic("E886", _LOCATION, f"{condition.formula} needs {requested}", hint=hint))
     return Overlay(condition, tuple(result[symbol] for symbol in condition.symbols))
 
 
@@ -86,27 +88,27 @@ def _role(system: Model, symbol: str, player: str) -> ParameterRef | float:
     from apc.compiler.language.units import parse_unit, quantity
 
     if player[0] in "+-.0123456789":
-        return float(quantity(player, _PLACE, what=symbol, unit=UNITS[symbol]).value)
-    free = find(system, player, _PLACE)
+        return float(quantity(player, _LOCATION, subject=symbol, unit=UNITS[symbol]).value)
+    free = find(system, player, _LOCATION)
     name, unit = free.name, unit_of(system, free.name)
-    if parse_unit(unit, _PLACE).dimension != parse_unit(UNITS[symbol], _PLACE).dimension:
-        what = f"{symbol}, the {MEANINGS[symbol]},"
-        raise ApcError(Diagnostic("E204", _PLACE, what, UNITS[symbol], f"{name} in {unit}"))
+    if parse_unit(unit, _LOCATION).dimension != parse_unit(UNITS[symbol], _LOCATION).dimension:
+        message = f"{symbol}, the {MEANINGS[symbol]},"
+        raise ApcError(Diagnostic("E204", _LOCATION, message, UNITS[symbol], f"{name} in {unit}"))
     if free.group is None:
-        groups = [group for group in system.groups if name in _own_names(group)]
+        groups = [group for group in system.groups if name in _local_names(group)]
         if groups:
-            what = f"{name} differs between peers, and {symbol} is one number"
-            raise ApcError(Diagnostic("E886", _PLACE, what, hint=f"{symbol}={groups[0].name}.{name}"))
+            message = f"{name} differs between peers, and {symbol} is one number"
+            raise ApcError(Diagnostic("E886", _LOCATION, message, hint=f"{symbol}={groups[0].name}.{name}"))
     return free
 
 
-def _own_names(group: Group) -> set[str]:
-    """Return the parameters of which a group has values of its own."""
+def _local_names(group: Group) -> set[str]:
+    """Return the parameters with separate values in a group."""
     return {value.name for value in group.values} | {column.name for column in group.columns}
 
 
 def symbol_values(system: Model, overlay: Overlay) -> tuple[float, ...]:
-    """Return the value of each symbol with the scene's numbers, in the order of the condition's symbols."""
+    """Return the value of each symbol with the parameter values, in the order of the condition's symbols."""
     return tuple(role if isinstance(role, float) else value_now(system, role) for role in overlay.roles)
 
 
@@ -116,7 +118,7 @@ def overlay_points(system: Model, overlay: Overlay, x: Range, y: Range) -> Float
     Parameters
     ----------
     system
-        The scene; its numbers hold for what is on neither axis, and what depends on an axis follows it.
+        The model; its numbers hold for what is on neither axis, and what depends on an axis follows it.
     overlay
         The condition and its roles.
     x, y
@@ -146,7 +148,7 @@ def overlay_points(system: Model, overlay: Overlay, x: Range, y: Range) -> Float
         return float(overlay.condition.margin(*symbol_values(apply(system, overrides), overlay)))
 
     def crossings(along: Callable[[float], float], low: float, high: float) -> list[float]:
-        """Return where a line of the plane meets the boundary: one value, or none."""
+        """Return the intersection of a grid line with the boundary: one value, or none."""
         first, last = along(low), along(high)
         if first == 0 or last == 0:
             return [low if first == 0 else high]

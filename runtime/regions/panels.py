@@ -1,8 +1,8 @@
-"""Stable regions side by side: several scenes in one panel, several settings in several panels.
+"""Stable regions of several models in one panel, or of several settings in several panels.
 
-Takes: compiled scenes, what each panel sets, and two axes.
+Takes: models, the settings of each panel, and two axes.
 Gives: `Panel`, `Panels`; `compare_regions`, `parse_panel`, `parse_vary`, `gain_factor`.
-Guarantees: what is multiplied for a comparison at equal gain follows from the scene's equations, and is told.
+Guarantees: the factors of a comparison at equal gain follow from the model's equations, and are reported.
 Does not: draw.
 """
 
@@ -17,18 +17,18 @@ import numpy as np
 
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
-from apc.frame.ages import linear_sites
-from apc.frame.exchange import build_exchange
+from apc.frame.communication_graph import build_exchange
+from apc.frame.data_age import linear_subsystems
 from apc.frame.linearize import linearize
-from apc.frame.names import Range, times_of
 from apc.frame.overrides import Override, apply, parse_override
+from apc.frame.parameter_names import Range, times_of
 from apc.frame.parameters import resolve
 from apc.option_value import with_last_unit
-from apc.regions.axes import PLACE, parse_axes
+from apc.parameter_studies.crossing import Progress
+from apc.regions.axes import LOCATION, parse_axes
 from apc.regions.overlay import Overlay, overlay_points, parse_overlay
 from apc.regions.stable_region import CELLS, Floats, Region, region
 from apc.result import PlotStyle, Result
-from apc.vary.crossing import Progress
 
 # By what a parameter is moved to see which weights follow it: no round ratio, so that none of them agree.
 MOVE = Fraction(19, 13)
@@ -36,7 +36,7 @@ MOVE = Fraction(19, 13)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Panel:
-    """One picture: the regions of some scenes with the same settings.
+    """One picture: the regions of some models with the same settings.
 
     `gains` are what each region's y is multiplied by in the comparison: 1, or its number of others.
     `overlays` are published conditions as (label, points (k, 2) in SI).
@@ -50,7 +50,7 @@ class Panel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Panels(Result):
-    """Regions to be seen together; `normalized` says that y is an effective gain, see `gain_factor`."""
+    """Regions of one figure; `normalized` is whether y is an effective gain, see `gain_factor`."""
 
     shown_by = "region_output:panels"
 
@@ -65,13 +65,13 @@ class Panels(Result):
         regions = self.panels[0].regions
         return regions[0] if len(regions) == 1 else None
 
-    def plot(self, **look: Unpack[PlotStyle]) -> Any:
-        """Draw all panels, as `look` says; return the matplotlib Figure."""
-        return self._drawn(look=look)
+    def plot(self, **style: Unpack[PlotStyle]) -> Any:
+        """Plot all panels in the style `look`; return the matplotlib Figure."""
+        return self._plotted(style=style)
 
 
 def parse_panel(text: str) -> tuple[str, ...]:
-    """Read `lan.delay=0 ms, contact.delay=0 ms`: what a panel sets. Raises ApcError E907 if it isn't that."""
+    """Read `lan.delay=0 ms, contact.delay=0 ms`: the settings of a panel."""
     parts = tuple(part.strip() for part in text.split(","))
     if not all(part and "=" in part for part in parts):
         form = '--panel "lan.delay=0 ms, contact.delay=0 ms"'
@@ -99,7 +99,7 @@ def parse_vary(text: str) -> tuple[tuple[str, ...], ...]:
     return tuple((f"{name}={value}",) for value in texts)
 
 
-# A scene with a panel's settings, its axes, and what its y is multiplied by.
+# A model with a panel's settings, its axes, and what its y is multiplied by.
 _Work = tuple[Model, tuple[Range, Range], int]
 
 
@@ -115,21 +115,21 @@ def compare_regions(
     criterion: str | None = None,
     progress: Progress | None = None,
 ) -> Panels:
-    """Find the regions of some scenes with some settings.
+    """Find the regions of some models with some settings.
 
     Parameters
     ----------
     systems
-        The scenes; the first one's `studies: region:` gives the axes that are left out.
+        The models; the first one's `studies: region:` gives the axes that are left out.
     x, y
         The axes, see `axes.parse_axes`.
     panels
-        What each panel sets: `NAME=VALUE` texts.
+        The settings of each panel: `NAME=VALUE` texts.
     overlays
-        Published conditions, see `overlay.parse_overlay`; of the first scene.
+        Published conditions, see `overlay.parse_overlay`; of the first model.
     normalize
-        Whether y is the effective gain: a scene that sums over its others is given y divided by their number,
-        so that its coupling is as strong as that of a scene that takes their mean.
+        Whether y is the effective gain: a model that sums over its others is given y divided by their number,
+        so that its coupling is as strong as that of a model that takes their mean.
     cells, criterion, progress
         See `stable_region.region`.
 
@@ -138,13 +138,13 @@ def compare_regions(
     ApcError
         As `parse_axes`, `parse_override`, `parse_overlay`, `gain_factor` and `region`.
     """
-    # Whatever is wrong is told before anything is computed.
+    # All errors are reported before any computation.
     jobs: list[tuple[str, list[_Work], list[Overlay]]] = []
     for settings in panels:
         work: list[_Work] = []
-        for place, original in enumerate(systems):
+        for index, original in enumerate(systems):
             system = apply(original, [parse_override(original, text) for text in settings])
-            if place and len(systems[0].region) == 2:
+            if index and len(systems[0].region) == 2:
                 system = replace(system, region=systems[0].region)
             axes = parse_axes(system, x, y)
             _refuse_set(axes, system, settings)
@@ -172,34 +172,35 @@ def _refuse_set(axes: Sequence[Range], system: Model, settings: Sequence[str]) -
         for axis in axes:
             all_of_it = free.group in (None, axis.free.group) and axis.free.name == free.name
             if all_of_it or axis.free.name in times_of(system, free.name):
-                what = f"{axis.free.label} is on an axis and set for the panel as well"
-                raise ApcError(Diagnostic("E902", PLACE, what))
+                message = f"{axis.free.label} is on an axis and set for the panel as well"
+                raise ApcError(Diagnostic("E902", LOCATION, message))
 
 
 def gain_factor(system: Model, axis: Range) -> int:
-    """Return how often a parameter counts: its number of others where it weighs a sum, 1 where a mean.
+    """Return the gain factor of a parameter: the number of other peers for a sum, 1 for a mean.
 
-    With the mean of N − 1 others a peer is pulled as by one of them, with their sum as by all of them: the
-    mean is a sum whose gain is divided by N − 1.
+    The mean of N − 1 others is their sum with the gain divided by N − 1.
 
     Raises
     ------
     ApcError
-        E906 a parameter that weighs both, an operator that is neither, or peers that hear unequally many.
+        E906 a parameter of both, an operator that is neither, or peers with unequal numbers of senders.
     """
     first = resolve(system)
     value = axis.low + (axis.high - axis.low) * (MOVE - 1)
     second = resolve(apply(system, [Override(axis.free, value)]))
     exchange = build_exchange(system, first.timings)
     numbers: set[int] = set()
-    sites = linear_sites(system, first.timings)
-    for place, group in enumerate(system.groups):
-        built = sites[group.kind]
+    subsystems = linear_subsystems(system, first.timings)
+    for index, group in enumerate(system.groups):
+        built = subsystems[group.peer_type]
         if not built.parameters_suffice:
-            what = "the scene weighs its others one by one, so that there is no effective gain to compare at"
-            raise ApcError(Diagnostic("E906", PLACE, what))
-        before, after = (linearize(built, numbers.parameters[place][0]) for numbers in (first, second))
-        for partition, tick_a, tick_b in zip(built.kind.clocks, before.ticks, after.ticks, strict=True):
+            message = (
+                "the topology weighs its others one by one, so that there is no effective gain to compare at"
+            )
+            raise ApcError(Diagnostic("E906", LOCATION, message))
+        before, after = (linearize(built, numbers.parameters[index][0]) for numbers in (first, second))
+        for partition, tick_a, tick_b in zip(built.peer_type.clocks, before.ticks, after.ticks, strict=True):
             for column in np.flatnonzero((tick_a.r != tick_b.r).any(axis=0)).tolist():
                 receive = partition.receives[column]
                 if receive.operator == "mean":
@@ -207,9 +208,11 @@ def gain_factor(system: Model, axis: Range) -> int:
                 elif exchange.is_complete(receive.link):
                     numbers.add(system.peers - 1)
                 else:
-                    heard = np.bincount(exchange.arcs(receive.link)[0][:, 1], minlength=system.peers)
-                    numbers |= set(heard.tolist())
+                    received = np.bincount(exchange.arcs(receive.link)[0][:, 1], minlength=system.peers)
+                    numbers |= set(received.tolist())
     if len(numbers) > 1:
-        what = f"{axis.free.label} weighs what is heard of {' and '.join(map(str, sorted(numbers)))} others"
-        raise ApcError(Diagnostic("E906", PLACE, f"{what}, so that there is no one effective gain"))
+        message = (
+            f"{axis.free.label} weighs what is heard of {' and '.join(map(str, sorted(numbers)))} others"
+        )
+        raise ApcError(Diagnostic("E906", LOCATION, f"{message}, so that there is no one effective gain"))
     return max(numbers, default=1)

@@ -2,10 +2,10 @@
 
 Takes: a `MatrixSource` of two free parameters and their ranges.
 Gives: `Rectangle`, `rectangle_of`; `DirectFamily`, `family_over`.
-Guarantees: every point is computed anew; errors are bounds at points inside the rectangle. States that drive
-each other are a system of their own: peers that hear each other one way only share nearly equal eigenvalues,
-which one matrix of all would tell apart by rounding alone.
-Does not: know what happens between points.
+Guarantees: every point is computed anew; errors are bounds at points inside the rectangle. Strongly connected
+states form separate systems: with one-directional coupling, peers have nearly equal eigenvalues, which a
+single matrix would split by rounding only.
+Does not: bound values between points.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.eigenpairs import driving_parts
-from apc.frame.names import Range
-from apc.vary.batch import MatrixSource
-from apc.vary.leading import DrivingPart
+from apc.frame.parameter_names import Range
+from apc.parameter_studies.dominant_eigenvalue import DrivingPart
+from apc.parameter_studies.frame_matrices import MatrixSource
 
 Floats = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ class Rectangle:
 
     @property
     def offset(self) -> Floats:
-        """What to add to points to have them count from a parameter's zero (2,)."""
+        """The offset from points to parameter values relative to zero (2,)."""
         return self.low / self.width
 
 
@@ -115,5 +115,5 @@ def family_over(source: MatrixSource, rectangle: Rectangle, errors: Errors) -> D
     for system, (error, matrix) in enumerate(zip(wrong, source.matrices(corners), strict=True)):
         driving = driving_parts(np.abs(matrix).max(axis=0) + error != 0)
         parts += [DrivingPart(system, states) for states in driving or [np.arange(len(error))]]
-    own = tuple(wrong[part.system][np.ix_(part.states, part.states)] for part in parts)
-    return DirectFamily(source, rectangle, tuple(parts), own)
+    local = tuple(wrong[part.system][np.ix_(part.states, part.states)] for part in parts)
+    return DirectFamily(source, rectangle, tuple(parts), local)

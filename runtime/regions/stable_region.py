@@ -1,11 +1,11 @@
-"""The stable region of two parameters: exact boundary curves, areas, and who is inside.
+"""The stable region of two parameters: exact boundary curves, areas, and tests of points.
 
 Takes: a `Model`, two parameters and their ranges.
 Gives: `Curve`, `Region`, `region`, `side_of_curves`.
-Guarantees: every curve comes with a bound on its distance from the boundary, the mode that makes it and that
-mode's frequency; an empty region and one without boundary are answers. What was looked at how finely is part
-of the answer: a component smaller than a cell, with nothing around it that hints at it, can be missed.
-Does not: draw, or write files (see `present`).
+Guarantees: every curve comes with a bound on its distance from the boundary, the critical mode and its
+frequency. Empty regions and regions without boundary are supported. The resolution of the search is part of
+the result: a component smaller than a cell can be missed if values around it give no indication.
+Does not: plot, or write files (see `output`).
 """
 
 from __future__ import annotations
@@ -19,31 +19,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import near_start, prepare_at_start
-from apc.analysis.sides import Side, sides
+from apc.analysis.one_sided_slopes import Side, sides
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic
 from apc.compiler.timings import part
-from apc.compiler.words import counted
-from apc.eigen.closing import ClosedLoop
+from apc.compiler.wording import counted
+from apc.eigen.interconnection import ClosedLoop
 from apc.eigen.spectrum import mode_near
 from apc.frame.devices import replaced_hands
-from apc.frame.finite_equations import finite_equations
-from apc.frame.instance import Prepared, prepare
-from apc.frame.names import ParameterRef, Range, notes_for_all_groups
+from apc.frame.evaluation_errors import finite_equations
+from apc.frame.numeric_model import Prepared, prepare
 from apc.frame.overrides import apply
-from apc.network.nominal import left_out, refuse_channel_number
-from apc.regions.axes import PLACE
-from apc.regions.boundary import BoundaryArc, relative_to, stable_area, trace_steps, traced
-from apc.regions.curves import between
-from apc.regions.deciding import Eigenvalues, log_magnitudes
-from apc.regions.rectangle import INSIDE, DirectFamily, Rectangle, family_over, rectangle_of
-from apc.regions.strips import BRANCHES, TracedRegion, trace_strips
-from apc.regions.survey import blurred, just_inside, survey
-from apc.result import PlotStyle, Result
-from apc.threads import single_threaded
-from apc.vary.batch import BatchEvaluator
-from apc.vary.crossing import Progress
-from apc.vary.evaluator import (
+from apc.frame.parameter_names import ParameterRef, Range, notes_for_all_groups
+from apc.network.nominal_criterion import limitations, refuse_channel_number
+from apc.parameter_studies.crossing import Progress
+from apc.parameter_studies.dominant_eigenvalue import DrivingPart
+from apc.parameter_studies.evaluator import (
     JoinedEvaluator,
     PiecewiseEvaluator,
     closed_at,
@@ -53,18 +44,27 @@ from apc.vary.evaluator import (
     reaches_count,
     reaches_time,
 )
-from apc.vary.growth import (
-    BY_GROWTH,
+from apc.parameter_studies.frame_matrices import BatchEvaluator
+from apc.parameter_studies.stability_criteria import (
     MEAN_SQUARE,
     NOMINAL,
     PASSIVE,
+    SCALAR_CRITERIA,
     RadiusEvaluator,
     criterion_of,
-    judge_at,
     refuse_time,
+    verdict_with,
 )
-from apc.vary.leading import DrivingPart
-from apc.vary.timing_values import is_scaled, reaches_period
+from apc.parameter_studies.timing_values import is_scaled, reaches_period
+from apc.regions.adaptive_grid import blurred, just_inside, survey
+from apc.regions.axes import LOCATION
+from apc.regions.boundary import BoundaryArc, relative_to, stable_area, trace_steps, traced
+from apc.regions.curves import between
+from apc.regions.delay_strips import BRANCHES, TracedRegion, trace_delay_strips
+from apc.regions.dominant_pairs import Eigenvalues, log_magnitudes
+from apc.regions.rectangle import INSIDE, DirectFamily, Rectangle, family_over, rectangle_of
+from apc.result import PlotStyle, Result
+from apc.threads import single_threaded
 
 if TYPE_CHECKING:
     import pandas
@@ -81,17 +81,17 @@ TOLERANCE = 1e-9
 # The same by a criterion of one number, whose slopes are differences: each of its values takes milliseconds.
 TOLERANCE_OF_DIFFERENCES = 1e-6
 
-# How often the straight lines of a boundary known by verdicts alone are halved, where it has no steps.
+# The number of bisections of the segments of a boundary from verdicts, without steps.
 HALVINGS = 3
 
-# How near to 0 or π, in radians, an eigenvalue's angle may come before its turns are counted again.
+# The distance in radians of an eigenvalue's angle from 0 or π below which its phase is computed anew.
 FOLD = 0.1
 
-# Points looked at together when they are compared with all curves.
+# Points compared with all curves in one batch.
 CHUNK = 1024
 
 
-# What gives the closed systems at a point; none where one number decides.
+# The closed-loop systems at a point; none for a scalar criterion.
 ClosedAt = Callable[[Sequence[float]], tuple[ClosedLoop, ...]]
 
 
@@ -128,29 +128,29 @@ class Curve:
 
     @property
     def frequency_hz(self) -> tuple[float, float]:
-        """The least and the largest frequency, along the curve, of the motion that neither grows nor dies.
+        """The smallest and the largest frequency of the critical mode along the curve.
 
-        Both are NaN where it can't be told.
+        Both are NaN if unknown.
         """
         if self.closed_at is None:
             return np.nan, np.nan
         angles = np.abs(np.angle(self.eigenvalues))
         middle = len(self.knots) // 2
-        places = {middle} if self.smooth else set(range(len(self.knots)))
-        if np.any(angles < FOLD) or np.any(angles > np.pi - FOLD):  # it may fold on the way
-            places |= {0, len(self.knots) - 1}
+        indices = {middle} if self.smooth else set(range(len(self.knots)))
+        if np.any(angles < FOLD) or np.any(angles > np.pi - FOLD):  # the phase may fold between knots
+            indices |= {0, len(self.knots) - 1}
         values: list[float] = []
-        for place in sorted(places):
-            _, turn, frame = _identify(self.closed_at, self.knots[place], complex(self.eigenvalues[place]))
+        for index in sorted(indices):
+            _, turn, frame = _identify(self.closed_at, self.knots[index], complex(self.eigenvalues[index]))
             if np.isnan(turn):
                 return np.nan, np.nan
             # turn = 2πm ± angle, and so is it along the curve.
             candidates = [
-                2 * np.pi * round((turn - sign * float(angles[place])) / (2 * np.pi)) + sign * angles
+                2 * np.pi * round((turn - sign * float(angles[index])) / (2 * np.pi)) + sign * angles
                 for sign in (1, -1)
             ]
-            own = min(candidates, key=lambda candidate: abs(float(candidate[place]) - turn))
-            listed = own if len(places) == 1 else own[[place]]
+            local = min(candidates, key=lambda candidate: abs(float(candidate[index]) - turn))
+            listed = local if len(indices) == 1 else local[[index]]
             values += (np.abs(listed) / (2 * np.pi * frame)).tolist()
         return min(values), max(values)
 
@@ -159,11 +159,11 @@ class Curve:
 class Region(Result):
     """The stable region of a rectangle of two parameters.
 
-    `stable_area` is in the product of the axes' units. `cell` are the sides of the cells the rectangle was
-    looked at in, in SI; where values hinted at more, cells down to `finest` of them. `corner` says whether
-    the corner of both lower ends is stable, `stepped` that the boundary is right to a cell only, as times
-    vary, `tolerance` how near smooth curves were to come (see `coarse`), `linearized` that the scene is not
-    linear; `criterion` what stable means; `left_out` says what of the scene the answer does not look at.
+    `stable_area` is in the product of the axes' units. `cell` are the sides of the coarse cells in SI,
+    `finest` the relative size of the finest. `corner` is whether the corner of both lower ends is stable,
+    `stepped` whether the boundary is accurate to a cell only (time parameters), `tolerance` that of smooth
+    curves (see `coarse`), `linearized` whether the model is nonlinear; `criterion` is the stability
+    criterion; `limitations` lists the limitations of the analysis.
     """
 
     shown_by = "region_output:region"
@@ -181,12 +181,12 @@ class Region(Result):
     tolerance: float
     linearized: bool
     criterion: str
-    left_out: tuple[str, ...]
+    limitations: tuple[str, ...]
     system: Model
 
     @property
     def coarse(self) -> tuple[Curve, ...]:
-        """The smooth curves that could not be followed to the tolerance, as their errors say."""
+        """The smooth curves with an error above the tolerance."""
         return tuple(curve for curve in self.curves if curve.smooth and not curve.error <= self.tolerance)
 
     @property
@@ -199,12 +199,12 @@ class Region(Result):
         table: pandas.DataFrame = self._shown("table")
         return table
 
-    def plot(self, ax: Any = None, **look: Unpack[PlotStyle]) -> Any:
-        """Draw the region into a matplotlib Axes, or a figure of its own, as `look` says; return the Axes."""
-        return self._drawn(ax, look=look)
+    def plot(self, ax: Any = None, **style: Unpack[PlotStyle]) -> Any:
+        """Plot the region into a matplotlib Axes, or a new figure, in the style `look`; return the Axes."""
+        return self._plotted(ax, style=style)
 
     def contains(self, x: Any, y: Any) -> Any:
-        """Say whether points are stable: by the curves or, nearer to them than their error, by eigenvalues.
+        """Return whether points are stable: by the curves or, nearer than their error, by eigenvalues.
 
         Parameters
         ----------
@@ -228,7 +228,7 @@ class Region(Result):
                 f"{axis.free.label} in {float(axis.low):g} to {float(axis.high):g} {axis.unit}"
                 for axis in (self.x, self.y)
             )
-            raise ApcError(Diagnostic("E904", PLACE, "a point", ranges, "one outside"))
+            raise ApcError(Diagnostic("E904", LOCATION, "a point", ranges, "one outside"))
         inside, near = side_of_curves(self, points)
         if near.any():
             inside[near] = _decide(self, values[near])
@@ -246,64 +246,63 @@ def region(
     prepared: Prepared | None = None,
     progress: Progress | None = None,
 ) -> Region:
-    """Find the boundary of the stable region of two parameters.
+    """Compute the boundary of the stable region of two parameters.
 
     Parameters
     ----------
     system
-        The compiled scene; all other parameters keep its numbers.
+        The model; all other parameters keep its values.
     axes
         The two parameters, from `parse_axes`.
     cells
-        Into how many cells each side of the rectangle is divided to begin with.
+        The initial number of cells along each side of the rectangle.
     tolerance
         Largest distance between curves and boundary, relative to a coordinate; curves that could not be
         followed so closely are `Region.coarse`. None: `TOLERANCE`, in mean square `TOLERANCE_OF_DIFFERENCES`.
     criterion
         "mean-square" or "nominal", see `critical_values.critical`.
     prepared
-        From `instance.prepare`, of this system with any numbers.
+        From `numeric_model.prepare`, of this model with any parameter values.
     progress
-        Is told, in words, how far the work is.
+        Called with a text on the progress.
 
     Raises
     ------
     ApcError
-        E896 a number of an unreliable link; E905 the scene can't be analysed everywhere in the rectangle, or
-        rounding leaves open where in it the boundary runs; and
-        those of `analysis.lifted_groups`.
+        E896 a parameter of an unreliable link; E905 the model cannot be analyzed everywhere in the rectangle,
+        or rounding prevents locating the boundary; and those of `analysis.lifted_groups`.
 
     Notes
     -----
-    Where one axis is a delay, the rectangle is cut where events coincide (see `strips`). Along a period it is
-    cut halfway between the periods that are analysed (see `periods`), unless all times scale with it. Where
-    both axes are times each point is analysed by itself, and the boundary is a line from cell edge to cell
-    edge, its error the size of a cell. A scene that is linearized at its start, and starts elsewhere along an
-    axis, is analysed point by point where other motions are free. With passive hands there are no steps: its
-    points are on the boundary, straight lines between, and its error is an estimate by their middles.
+    Where one axis is a delay, the rectangle is cut where events coincide (see `delay_strips`). Along a period
+    it is cut halfway between the analyzed periods (see `clock_periods`), unless all times scale with it.
+    If both axes are times, each point is analyzed separately, and the boundary is a line from cell edge to
+    cell edge with the error of a cell. A model whose start, and so its linearization, depends on an axis is
+    analyzed point by point if its neutral modes change. With passive hands there are no steps: points are on
+    the boundary, with straight segments between, and the error is estimated at their middles.
     """
     free = tuple(axis.free for axis in axes)
-    meant = criterion_of(system, criterion, PLACE, free)
-    tolerance = tolerance or (TOLERANCE_OF_DIFFERENCES if meant in BY_GROWTH else TOLERANCE)
+    meant = criterion_of(system, criterion, LOCATION, free)
+    tolerance = tolerance or (TOLERANCE_OF_DIFFERENCES if meant in SCALAR_CRITERIA else TOLERANCE)
     for item in free:
         if meant == NOMINAL:
-            refuse_channel_number(system, item, PLACE, instead=f"--in {MEAN_SQUARE}")
+            refuse_channel_number(system, item, LOCATION, instead=f"--criterion {MEAN_SQUARE}")
         else:
-            refuse_time(system, item, PLACE, meant)
+            refuse_time(system, item, LOCATION, meant)
     rectangle = rectangle_of(*axes)
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         prepared = prepared or prepare(system)
-        affine = all(prepared.jacobians[group.kind].affine for group in system.groups)
-        times = [place for place, item in enumerate(free) if reaches_time(system, item)]
-        counts = [place for place, item in enumerate(free) if reaches_count(system, item)]
+        affine = all(prepared.jacobians[group.peer_type].affine for group in system.groups)
+        times = [index for index, item in enumerate(free) if reaches_time(system, item)]
+        counts = [index for index, item in enumerate(free) if reaches_count(system, item)]
         if counts:
             _check_count(axes[counts[0]], len(counts) == 2, bool(times), meant, affine=affine)
-        times = [] if meant in BY_GROWTH else times + counts
+        times = [] if meant in SCALAR_CRITERIA else times + counts
         # Where every time scales with a period the frame is the same at all values, but for its length.
         scales = len(times) == 1 and not counts and _scales(system, free[times[0]])
         times = [] if scales else times
-        _refuse_two_times(system, [free[place] for place in times])
-        starts = () if meant in BY_GROWTH else _starts(system, prepared, free, rectangle)
+        _refuse_two_times(system, [free[index] for index in times])
+        starts = () if meant in SCALAR_CRITERIA else _starts(system, prepared, free, rectangle)
         start = starts[0].prepared if len(starts) == 1 else None
         striped: TracedRegion | None = None
         if not starts or times or scales:
@@ -311,14 +310,16 @@ def region(
             if meant == NOMINAL and not times:
                 tolerance = max(tolerance, TOLERANCE_OF_DIFFERENCES)
             if start is not None and len(times) == 1:
-                striped = trace_strips(
+                striped = trace_delay_strips(
                     system, axes, times[0], start, cells=cells, tolerance=tolerance, progress=progress
                 )
         else:
             source = JoinedEvaluator(
                 system,
                 free,
-                tuple(evaluator_of_many(side.system, free, PLACE, prepared=side.prepared) for side in starts),
+                tuple(
+                    evaluator_of_many(side.system, free, LOCATION, prepared=side.prepared) for side in starts
+                ),
             )
             plane = _Plane(family_over(source, rectangle, source.errors), source.closed_at, stepped=False)
             try:
@@ -341,7 +342,7 @@ def region(
         y=axes[1],
         curves=curves,
         stable_area=striped.area * whole,
-        stable_area_error=striped.off * whole,
+        stable_area_error=striped.error_bound * whole,
         cell=(striped.cell[0] * float(rectangle.width[0]), striped.cell[1] * float(rectangle.width[1])),
         finest=striped.finest,
         corner=striped.corner,
@@ -349,9 +350,9 @@ def region(
         tolerance=tolerance,
         linearized=not affine,
         criterion=meant,
-        left_out=(
+        limitations=(
             *near_start(system, prepared),
-            *left_out(system, network=meant != MEAN_SQUARE, varied=free),
+            *limitations(system, network=meant != MEAN_SQUARE, varied=free),
             *(replaced_hands(system) if meant == PASSIVE else ()),
             *notes_for_all_groups(system, free),
         ),
@@ -390,22 +391,22 @@ def _refuse_two_times(system: Model, times: Sequence[ParameterRef]) -> None:
         return
     for free in times:
         if reaches_period(system, free) and not is_scaled(system, free):
-            what = f"{free.label} is a period, and the other axis a time: their frames are too long"
-            raise ApcError(Diagnostic("E903", PLACE, what, hint=f"apc critical {free.label}"))
+            message = f"{free.label} is a period, and the other axis a time: their frames are too long"
+            raise ApcError(Diagnostic("E903", LOCATION, message, hint=f"apc critical {free.label}"))
 
 
 def _check_count(axis: Range, both: bool, timed: bool, meant: str, *, affine: bool) -> None:
-    """Refuse a number of peers beside what no steps are drawn for: ApcError E903."""
+    """Refuse a number of peers on an axis of a region without steps: ApcError E903."""
     reasons = {
         "two numbers of peers": both,
         "a time beside it": timed,
-        f"what is stable {BY_GROWTH.get(meant, '')}": meant in BY_GROWTH,
-        "a scene that is not linear": not affine,
+        f"what is stable {SCALAR_CRITERIA.get(meant, '')}": meant in SCALAR_CRITERIA,
+        "a topology that is not linear": not affine,
     }
     why = next((text for text, applies in reasons.items() if applies), "")
     if why:
-        what = f"{axis.free.label} is a number of peers: no steps are drawn for {why}"
-        raise ApcError(Diagnostic("E903", PLACE, what, hint=f"apc critical {axis.free.label}"))
+        message = f"{axis.free.label} is a number of peers: no steps are drawn for {why}"
+        raise ApcError(Diagnostic("E903", LOCATION, message, hint=f"apc critical {axis.free.label}"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -427,13 +428,13 @@ def _points_plane(
     *,
     stepped: bool,
 ) -> _Plane:
-    """Return what gives the one number of a criterion; `stepped`: a time or a number of peers varies."""
-    source = RadiusEvaluator(system, free, prepared, PLACE, meant)
+    """Return the evaluator of a scalar criterion; `stepped`: a time or a number of peers varies."""
+    source = RadiusEvaluator(system, free, prepared, LOCATION, meant)
     # One point's bounds are enough, and dear.
     (errors,) = source.errors(rectangle.values(np.array([[0.5, 0.5]])))
     family = DirectFamily(source, rectangle, (DrivingPart(0, np.arange(1)),), (errors[0],))
     closed = partial(closed_at, system, free, prepared) if meant == NOMINAL else None
-    # What hands can draw is known as the damping needed, which jumps.
+    # The energy from hands is measured by the required damping, which is discontinuous.
     halvings = HALVINGS if meant == PASSIVE else 0
     return _Plane(family, closed, stepped or meant == PASSIVE, halvings)
 
@@ -445,7 +446,7 @@ def _pieces_plane(
     prepared: Prepared,
     start: Prepared,
 ) -> _Plane:
-    """Return what gives the matrices of a scene in which other motions are free in parts of the rectangle."""
+    """Return the frame matrices of a model whose neutral modes change within the rectangle."""
     size = sum(len(closed.matrix) for closed in source.closed)
     pieces = PiecewiseEvaluator(system, source.free, start, size)
     (errors,) = pieces.errors(rectangle.values(np.array([[0.5, 0.5]])))
@@ -456,36 +457,38 @@ def _pieces_plane(
 def _surveyed(plane: _Plane, cells: int, tolerance: float, progress: Progress | None) -> TracedRegion:
     """Survey the whole rectangle and follow the boundary through it, or go by steps from cell to cell."""
     deciding = Eigenvalues(plane.family)
-    looked = 0
+    evaluations = 0
 
     def samples(points: Floats) -> Floats:
-        nonlocal looked
-        looked += len(points)
+        nonlocal evaluations
+        evaluations += len(points)
         if progress:
-            progress(f"looking at {counted(looked, 'point')}")
+            progress(f"looking at {counted(evaluations, 'point')}")
         return _samples(plane, points)
 
     if plane.stepped:
         result = survey(samples, cells=cells)
         arcs = trace_steps(
             lambda points: samples(points)[:, 0],
-            lambda point: _leading(plane, point),
+            lambda point: _dominant(plane, point),
             result,
             halvings=plane.halvings,
         )
-        area, off = stable_area(arcs, result)
+        area, error_bound = stable_area(arcs, result)
     else:
         offset = plane.family.rectangle.offset
-        arcs, result, area, off = traced(deciding, samples, cells=cells, tolerance=tolerance, offset=offset)
-    if off >= 1:  # of the unit square: the boundary may be anywhere in it
+        arcs, result, area, error_bound = traced(
+            deciding, samples, cells=cells, tolerance=tolerance, offset=offset
+        )
+    if error_bound >= 1:  # of the unit square: the boundary may be anywhere in it
         raise blurred()
     return TracedRegion(
-        arcs, area, off, result.corners[0], (result.cell, result.cell), result.finest / result.cell
+        arcs, area, error_bound, result.corners[0], (result.cell, result.cell), result.finest / result.cell
     )
 
 
 def _samples(plane: _Plane, points: Floats) -> Floats:
-    """Return the logarithms of the largest magnitudes, or raise what is wrong with a point."""
+    """Return the logarithms of the largest magnitudes, or raise the error of a point."""
     source, rectangle = plane.family.evaluator, plane.family.rectangle
     matrices = plane.family.matrices(points)
     for matrix in matrices:
@@ -493,26 +496,28 @@ def _samples(plane: _Plane, points: Floats) -> Floats:
         if len(wrong):
             value = rectangle.values(points[wrong[:1]])[0].tolist()
             overrides = overrides_at(source.system, source.free, value)
-            apply(source.system, overrides)  # says so itself if the value can't be
+            apply(source.system, overrides)  # reports an unavailable value itself
             if plane.closed_at is not None:
                 plane.closed_at(value)
-            what = "the scene's frame leaves the range of floating point numbers in part of the rectangle"
-            raise ApcError(Diagnostic("E905", PLACE, what, hint="a smaller range"))
+            message = (
+                "the topology's frame leaves the range of floating point numbers in part of the rectangle"
+            )
+            raise ApcError(Diagnostic("E905", LOCATION, message, hint="a smaller range"))
     return log_magnitudes(matrices, BRANCHES)
 
 
-def _leading(plane: _Plane, point: Floats) -> complex:
+def _dominant(plane: _Plane, point: Floats) -> complex:
     """Return the eigenvalue that decides at a point (2,) where one number is known."""
     source, rectangle = plane.family.evaluator, plane.family.rectangle
     assert isinstance(source, RadiusEvaluator), "one number is known"
-    return source.leading(rectangle.values(point).tolist())
+    return source.dominant(rectangle.values(point).tolist())
 
 
 def _curve(plane: _Plane, arc: BoundaryArc, criterion: str) -> Curve:
     """Return an arc in SI."""
     rectangle, values = plane.family.rectangle, arc.values
     if arc.smooth and criterion == NOMINAL and isinstance(plane.family.evaluator, RadiusEvaluator):
-        values = np.array([_leading(plane, point) for point in just_inside(arc.knots)])
+        values = np.array([_dominant(plane, point) for point in just_inside(arc.knots)])
     return Curve(
         points=rectangle.values(arc.points),
         handles=rectangle.values(arc.handles),
@@ -538,11 +543,11 @@ def _identify(closed_at: ClosedAt, value: Floats, eigenvalue: complex) -> tuple[
     """Return the name of an eigenvalue's closed system, its turn in a frame, and the frame in s."""
     closed = closed_at(value.tolist())
     mode, frame_s = mode_near(closed, eigenvalue), closed[0].frame_s
-    return mode.shape, 2 * np.pi * mode.frequency_hz * frame_s, frame_s
+    return mode.family, 2 * np.pi * mode.frequency_hz * frame_s, frame_s
 
 
 def side_of_curves(region: Region, points: Floats) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Say of points (k, 2) of the unit square whether they are stable, and which are too near a curve to say.
+    """Return whether points (k, 2) of the unit square are stable, and which are too close to a curve.
 
     From the point straight down, then along the lower edge to its left corner: each crossing of a curve
     changes sides. Curves are replaced by their chords, which is right farther from them than their sagitta.
@@ -570,17 +575,17 @@ def side_of_curves(region: Region, points: Floats) -> tuple[NDArray[np.bool_], N
             stable[some] ^= crossings % 2 == 1
             size = np.maximum(np.square(chord).sum(axis=1), np.finfo(np.float64).tiny)
             along = np.clip(((x - a[:, 0]) * chord[:, 0] + (y - a[:, 1]) * chord[:, 1]) / size, 0, 1)
-            apart = np.hypot(x - a[:, 0] - along * chord[:, 0], y - a[:, 1] - along * chord[:, 1])
-            near[some] |= (apart <= reach).any(axis=1)
+            separation = np.hypot(x - a[:, 0] - along * chord[:, 0], y - a[:, 1] - along * chord[:, 1])
+            near[some] |= (separation <= reach).any(axis=1)
     return stable, near
 
 
 def _decide(region: Region, values: Floats) -> NDArray[np.bool_]:
-    """Say of parameter values (k, 2) whether they are stable, each by an analysis of its own."""
+    """Return whether parameter values (k, 2) are stable, by one analysis each."""
     prepared = prepare(region.system)
     decided = []
     for value in values.tolist():
         overrides = overrides_at(region.system, (region.x.free, region.y.free), value)
-        verdict = judge_at(region.system, prepared, overrides, PLACE, criterion=region.criterion)
+        verdict = verdict_with(region.system, prepared, overrides, LOCATION, criterion=region.criterion)
         decided.append(bool(verdict.stable))
     return np.array(decided, dtype=bool)

@@ -1,1 +1,1 @@
-"""Everything that is known of scenes, gathered for a page that is kept and computed again."""
+"""Everything that is known of topologies, gathered for a page that is kept and computed again."""

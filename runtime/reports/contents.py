@@ -1,10 +1,10 @@
-"""What a report of scenes holds: the results of the other commands, each with the command that prints it.
+"""What a report of topologies holds: the results of the other commands, each with the command that prints it.
 
 Takes: topologies and settings.
-Gives: `Section`, `SceneReport`, `Report`; `report`; `differences`.
-Guarantees: every number is that of the command beside it; a section that a scene can't fill says why. A
-report keeps the scene's own texts, so that it can be computed anew from itself alone.
-Does not: draw, or write files (see `present.report_output`).
+Gives: `Section`, `TopologyReport`, `Report`; `report`; `differences`.
+Guarantees: every number is that of the command beside it; a section that a topology can't fill says why. A
+report keeps the topology's own texts, so that it can be computed anew from itself alone.
+Does not: draw, or write files (see `output.report_output`).
 """
 
 from __future__ import annotations
@@ -15,35 +15,35 @@ from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any
 
-from apc.analysis.needs import needs
-from apc.answer import AnalysisReport, answer
+from apc.analysis.model_size import model_size
+from apc.analysis_report import AnalysisReport, answer
 from apc.comparison.choice import DELAY, LOSS, STIFFNESS, choose
 from apc.comparison.comparison import SchemeComparison, compare
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.compiler.timings import part
-from apc.compiler.words import counted
+from apc.compiler.wording import counted
 from apc.distribution import versions
-from apc.frame.names import parameter_of, unit_of
-from apc.hands.asked import read_frequencies
-from apc.hands.frequency_response import feel
-from apc.inputs import open_scene
-from apc.moments.network_verdict import judge_network
+from apc.frame.parameter_names import parameter_of, unit_of
+from apc.haptics.device_port import read_frequencies
+from apc.haptics.frequency_response import transparency
+from apc.inputs import open_topology
+from apc.mean_square.mean_square_stability import mean_square_stability
+from apc.parameter_studies.critical_values import critical
+from apc.parameter_studies.margins import STIFFNESSES, coupler_parameters
+from apc.parameter_studies.stability_criteria import MEAN_SQUARE, NOMINAL
 from apc.regions.axes import parse_axes
 from apc.regions.stable_region import region
 from apc.result import Result
-from apc.simulation.strike import WATCHED, impulse_text, strike
+from apc.simulation.initial_velocity import WATCHED, impulse_text, initial_velocity
+from apc.simulation.motion_classes import MotionVerdict
 from apc.simulation.trajectory import simulate
-from apc.simulation.verdicts import MotionVerdict
-from apc.vary.critical_values import critical
-from apc.vary.growth import MEAN_SQUARE, NOMINAL
-from apc.vary.margins import STIFFNESSES, coupler_parameters
 
 LIBRARIES = ("casadi", "numpy", "scipy", "sympy", "python-flint", "matplotlib")
-MOST_PLAYED = 60  # peers
+MOST_SIMULATED = 60  # peers
 JITTER = "jitter"
-FURTHER = 3  # times the present value a region reaches where the scene says no range
-FEEL = ("0.1 Hz", 200)  # the lowest frequency, and how many
+FURTHER = 3  # times the present value a region reaches where the topology says no range
+TRANSPARENCY = ("0.1 Hz", 200)  # the lowest frequency, and how many
 # Numbers computed anew, on another processor or by other libraries, are the same up to this, relatively, and
 # by as much as their own errors; of what is next to nothing beside the others of a list nothing is known.
 SAME, NOTHING = 1e-6, 1e-9
@@ -51,25 +51,25 @@ SAME, NOTHING = 1e-6, 1e-9
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A part of a report: sentences, `results` that are shown as text, and `drawn`, those with a picture.
+    """A part of a report: `remarks`, `results` shown as text, and `figures`, results with a picture.
 
-    `refused` says why there is nothing else.
+    `refused` is the reason if there is nothing else.
     """
 
     key: str
     command: str
     remarks: tuple[str, ...] = ()
     results: tuple[Result, ...] = ()
-    drawn: tuple[Any, ...] = ()
+    figures: tuple[Any, ...] = ()
     refused: str = ""
 
 
 @dataclass(frozen=True, slots=True)
-class SceneReport:
-    """All of one scene: `texts` are its own files by name, `origin` the digests of all it is made of."""
+class TopologyReport:
+    """All of one topology: `texts` are its own files by name, `origin` the digests of all it is made of."""
 
     name: str
-    about: str
+    description: str
     path: Path
     settings: tuple[str, ...]
     texts: tuple[tuple[str, str], ...]
@@ -79,11 +79,11 @@ class SceneReport:
 
 @dataclass(frozen=True, slots=True)
 class Report(Result):
-    """Scenes side by side; `comparison` is there where they are several."""
+    """Topologies side by side; `comparison` is there where they are several."""
 
     shown_by = "report_output:report"
 
-    scenes: tuple[SceneReport, ...]
+    topologies: tuple[TopologyReport, ...]
     comparison: SchemeComparison | None
     refused: str
     versions: tuple[tuple[str, str], ...]
@@ -91,7 +91,7 @@ class Report(Result):
 
 @part("report")
 def report(paths: Sequence[Path], settings: Sequence[str] = ()) -> Report:
-    """Gather what is known of scenes.
+    """Gather what is known of topologies.
 
     Parameters
     ----------
@@ -105,15 +105,15 @@ def report(paths: Sequence[Path], settings: Sequence[str] = ()) -> Report:
     ApcError
         A file or a setting is at fault.
     """
-    systems = [open_scene(str(path), settings) for path in paths]
-    scenes = tuple(_scene(path, system, settings) for path, system in zip(paths, systems, strict=True))
-    beside, refused = None, ""
+    systems = [open_topology(str(path), settings) for path in paths]
+    topologies = tuple(_topology(path, system, settings) for path, system in zip(paths, systems, strict=True))
+    alongside, refused = None, ""
     if len(systems) > 1:
         try:
-            beside = compare(systems)
+            alongside = compare(systems)
         except ApcError as error:
             refused = _why(error)
-    return Report(scenes, beside, refused, _versions())
+    return Report(topologies, alongside, refused, _versions())
 
 
 def _versions() -> tuple[tuple[str, str], ...]:
@@ -127,7 +127,7 @@ def _versions() -> tuple[tuple[str, str], ...]:
     return tuple(result)
 
 
-def _scene(path: Path, system: Model, settings: Sequence[str]) -> SceneReport:
+def _topology(path: Path, system: Model, settings: Sequence[str]) -> TopologyReport:
     words = " ".join(f"--set {shlex.quote(text)}" for text in settings)
     call = f"{shlex.quote(path.name)} {words}".strip()
     made: tuple[tuple[str, Callable[[Model, str], Section]], ...] = (
@@ -137,7 +137,7 @@ def _scene(path: Path, system: Model, settings: Sequence[str]) -> SceneReport:
         ("region", _region),
         ("response", _response),
         ("network", _network),
-        ("feel", _feel),
+        ("transparency", _transparency),
     )
     sections = []
     for key, make in made:
@@ -146,19 +146,19 @@ def _scene(path: Path, system: Model, settings: Sequence[str]) -> SceneReport:
         except ApcError as error:
             sections.append(Section(key, "", refused=_why(error)))
     texts = tuple(_texts(system))
-    about = (system.name, system.about, path)
-    return SceneReport(*about, tuple(settings), texts, system.origin.digests, tuple(sections))
+    description = (system.name, system.description, path)
+    return TopologyReport(*description, tuple(settings), texts, system.origin.digests, tuple(sections))
 
 
 def _why(error: ApcError) -> str:
     """Return the first mistake in words."""
     mistake = error.mistakes[0]
-    wanted = f" wants {mistake.expected}, got {mistake.got}" if mistake.expected else ""
-    return f"{mistake.what}{wanted}"
+    requested = f" wants {mistake.expected}, got {mistake.got}" if mistake.expected else ""
+    return f"{mistake.message}{requested}"
 
 
 def _texts(system: Model) -> Iterable[tuple[str, str]]:
-    """Yield the texts of a scene's own: the topology, its tables, its components."""
+    """Yield the texts of a topology's own: the topology, its tables, its components."""
     for name, text in system.origin.texts:
         if PurePath(name).suffix and not name.endswith("/"):
             yield name, text.decode()
@@ -170,7 +170,9 @@ def _texts(system: Model) -> Iterable[tuple[str, str]]:
 def _compiled(system: Model, call: str) -> Section:
     remarks = [f"Warning: {warning}" for warning in system.warnings]
     remarks += [f"left out: {name}, as {reason}" for name, reason in system.dropped]
-    return Section("compiled", f"apc compile {call.split(' --set')[0]}", tuple(remarks), (needs(system),))
+    return Section(
+        "compiled", f"apc compile {call.split(' --set')[0]}", tuple(remarks), (model_size(system),)
+    )
 
 
 def _answered(system: Model) -> tuple[AnalysisReport, str]:
@@ -188,29 +190,31 @@ def _verdict(system: Model, call: str) -> Section:
 
 
 def _limits(system: Model, call: str) -> Section:
-    asked = [(axis, choice.name, choice.why) for axis, choice in choose(system, ()).items()]
-    return _criticals(system, call, "limits", [item for item in asked if item[0] in (STIFFNESS, DELAY)])
+    requested = [(axis, choice.name, choice.why) for axis, choice in choose(system, ()).items()]
+    return _criticals(system, call, "limits", [item for item in requested if item[0] in (STIFFNESS, DELAY)])
 
 
 def _network(system: Model, call: str) -> Section:
     loss = choose(system, ())[LOSS]
     channels = [link.channel for link in system.links if link.channel is not None]
     jitters = [(JITTER, channel.jitter, "") for channel in channels if channel.jitter is not None]
-    return _criticals(system, call, "network", [(LOSS, loss.name, loss.why), *jitters], judge_network(system))
+    return _criticals(
+        system, call, "network", [(LOSS, loss.name, loss.why), *jitters], mean_square_stability(system)
+    )
 
 
 def _criticals(
     system: Model,
     call: str,
     key: str,
-    asked: Sequence[tuple[str, str, str]],
+    requested: Sequence[tuple[str, str, str]],
     verdict: Result | None = None,
 ) -> Section:
     """Return where the verdict changes along what `apc compare` looks at, behind a verdict that is known."""
-    remarks, drawn = [], []
+    remarks, plotted = [], []
     results: list[Result] = [] if verdict is None else [verdict]
     commands = [] if verdict is None else [f"apc analyze {call}"]
-    for axis, name, why in asked:
+    for axis, name, why in requested:
         try:
             result = critical(system, name) if name else None
         except ApcError as error:
@@ -221,58 +225,64 @@ def _criticals(
         stiff = axis == STIFFNESS
         commands.append(f"apc critical {name} {call}{f' --plot {axis}.svg' if stiff else ''}")
         results.append(result)
-        drawn += [result] if stiff else []
+        plotted += [result] if stiff else []
     if not results:
         return Section(key, "", refused=" ".join(remarks))
-    return Section(key, " && ".join(commands), tuple(remarks), tuple(results), tuple(drawn))
+    return Section(key, " && ".join(commands), tuple(remarks), tuple(results), tuple(plotted))
 
 
 def _region(system: Model, call: str) -> Section:
-    asked: list[str | None] = [None, None]
+    requested: list[str | None] = [None, None]
     if len(system.region) < 2:
         stiff = [free for free in coupler_parameters(system) if unit_of(system, free.name) in STIFFNESSES]
         if len(stiff) < 2:
-            why = "all peers share fewer than two stiffnesses, and the scene says no studies: region:"
+            why = "all peers share fewer than two stiffnesses, and the topology says no studies: region:"
             return Section("region", "", refused=why)
-        asked = [
+        requested = [
             f"{free.label}=0 N/m:{FURTHER * parameter_of(system, free).value or 1000:g} N/m"
             for free in stiff[:2]
         ]
     unreliable = any(link.channel is not None for link in system.links)
     criterion = NOMINAL if unreliable else None
-    result = region(system, parse_axes(system, *asked), criterion=criterion)
-    words = [f" --{axis} {shlex.quote(text)}" for axis, text in zip("xy", asked, strict=True) if text]
-    words += [f" --in {NOMINAL}"] if criterion else []
+    result = region(system, parse_axes(system, *requested), criterion=criterion)
+    words = [f" --{axis} {shlex.quote(text)}" for axis, text in zip("xy", requested, strict=True) if text]
+    words += [f" --criterion {NOMINAL}"] if criterion else []
     command = f"apc region {call}{''.join(words)} --out region.svg"
-    lossy = command.replace(f"--in {NOMINAL}", f"--in {MEAN_SQUARE}")
+    lossy = command.replace(f"--criterion {NOMINAL}", f"--criterion {MEAN_SQUARE}")
     text = f"Stable here means with every packet on time. As they are lost and late: {lossy}"
     return Section("region", command, (text,) if unreliable else (), (result,), (result,))
 
 
 def _response(system: Model, call: str) -> Section:
-    if system.peers > MOST_PLAYED:
-        why = f"{counted(system.peers, 'peer', ',')} are more than the {MOST_PLAYED} that a report plays"
+    if system.peers > MOST_SIMULATED:
+        why = f"{counted(system.peers, 'peer', ',')} are more than the {MOST_SIMULATED} that a report plays"
         return Section("response", "", refused=f"{why}; apc simulate does")
     duration, remarks = system.experiment.duration, []
     length = "" if duration else f" --duration {shlex.quote(f'{float(WATCHED):g} s')}"
     trajectory = simulate(system, duration=duration or WATCHED)
     if trajectory.summary.verdict is MotionVerdict.AT_REST:
         try:
-            struck, what = strike(system)
+            struck, subject = initial_velocity(system)
         except ApcError as error:
             remarks.append(_why(error))
         else:
-            remarks.append(f"The start is at rest. Here {impulse_text(what)}")
-            length += f" --strike {shlex.quote(what.partition('.')[0])}"
+            remarks.append(f"The start is at rest. Here {impulse_text(subject)}")
+            length += f" --impulse {shlex.quote(subject.partition('.')[0])}"
             trajectory = simulate(struck, duration=duration or WATCHED)
     command = f"apc simulate {call}{length} --plot run.svg"
     return Section("response", command, tuple(remarks), (trajectory,), (trajectory,))
 
 
-def _feel(system: Model, call: str) -> Section:
-    low, count = FEEL
-    result = feel(system, read_frequencies(system, None, low, None, count))
-    return Section("feel", f"apc feel {call} --points {count} --out feel.svg", (), (result,), (result,))
+def _transparency(system: Model, call: str) -> Section:
+    low, count = TRANSPARENCY
+    result = transparency(system, read_frequencies(system, None, low, None, count))
+    return Section(
+        "transparency",
+        f"apc transparency {call} --points {count} --out transparency.svg",
+        (),
+        (result,),
+        (result,),
+    )
 
 
 # ---- computed anew ----
@@ -283,10 +293,10 @@ def differences(before: Any, now: Any) -> Iterator[str]:
 
     Words differ if they are others; numbers by more than roundings and the errors that stand beside them.
     """
-    kept, made = dict(_leaves(before)), dict(_leaves(now))
-    for name in {**kept, **made}:
+    stored, made = dict(_leaves(before)), dict(_leaves(now))
+    for name in {**stored, **made}:
         cell, least = made.get(name, (None, 0.0))
-        old, below = kept.get(name, (None, 0.0))
+        old, below = stored.get(name, (None, 0.0))
         numbers = isinstance(cell, int | float) and isinstance(old, int | float)
         if cell != old and not (numbers and abs(cell - old) <= max(SAME * abs(cell), least + below)):
             yield f"{name} is {_shown(cell)}, not {_shown(old)}"
@@ -304,8 +314,8 @@ def _leaves(data: Any, name: str = "", value: float = 0.0) -> Iterator[tuple[str
                 yield from _leaves(item, f"{name}.{key}" if name else key, value)
     elif isinstance(data, list):
         sizes = [abs(item) for item in data if isinstance(item, int | float)]
-        for place, item in enumerate(data):
-            yield from _leaves(item, f"{name}[{place + 1}]", max(value, NOTHING * max(sizes, default=0.0)))
+        for index, item in enumerate(data):
+            yield from _leaves(item, f"{name}[{index + 1}]", max(value, NOTHING * max(sizes, default=0.0)))
     else:
         yield name, (data, value)
 

@@ -57,10 +57,10 @@ def line_differences(shown: str, expected: str, *, exact: bool) -> Iterator[Line
     pairs = list(zip(left, right, strict=False))
     if len(left) != len(right):
         # Lines are missing or inserted: what precedes and follows them is paired from both ends.
-        start = next((k for k, pair in enumerate(pairs) if not _alike(*pair, exact)), len(pairs))
+        start = next((k for k, pair in enumerate(pairs) if not _equal_lines(*pair, exact)), len(pairs))
         behind = zip(reversed(left[start:]), reversed(right[start:]), strict=False)
         rest = min(len(left), len(right)) - start
-        end = next((k for k, pair in enumerate(behind) if not _alike(*pair, exact)), rest)
+        end = next((k for k, pair in enumerate(behind) if not _equal_lines(*pair, exact)), rest)
         some, others = left[start : len(left) - end], right[start : len(right) - end]
         last = _Line(left[min(start, len(left) - 1)].number if left else 1, "", False)
         count = max(len(some), len(others))
@@ -68,10 +68,10 @@ def line_differences(shown: str, expected: str, *, exact: bool) -> Iterator[Line
             (some[k] if k < len(some) else last, others[k] if k < len(others) else last) for k in range(count)
         ]
     last_number = 0
-    for one, other in pairs:
-        if one.number != last_number and not _alike(one, other, exact):
-            last_number = one.number
-            yield LineDifference(one.number, *_excerpts(one.text, other.text))
+    for item, other in pairs:
+        if item.number != last_number and not _equal_lines(item, other, exact):
+            last_number = item.number
+            yield LineDifference(item.number, *_excerpts(item.text, other.text))
 
 
 def _lines(page: str, exact: bool) -> list[_Line]:
@@ -81,41 +81,43 @@ def _lines(page: str, exact: bool) -> list[_Line]:
         figures: list[str] = []
         lines.append(_Line(number, _FIGURE.sub(partial(_decoded, figures), text), False))
         for figure in figures:
-            drawn = figure if exact else _renumbered(figure)
-            lines += [_Line(number, row, True) for row in drawn.splitlines()]
+            plotted = figure if exact else _renumbered(figure)
+            lines += [_Line(number, row, True) for row in plotted.splitlines()]
     return lines
 
 
-def _decoded(figures: list[str], found: re.Match[str]) -> str:
+def _decoded(figures: list[str], result: re.Match[str]) -> str:
     """Append the text of a figure to `figures`; return its replacement in the line."""
     try:
-        figures.append(base64.b64decode(found[1], validate=True).decode("utf-8"))
+        figures.append(base64.b64decode(result[1], validate=True).decode("utf-8"))
     except (binascii.Error, ValueError):
-        return found[0]
+        return result[0]
     return "figure"
 
 
 def _renumbered(figure: str) -> str:
     """Return a figure whose hashed identifiers are numbered in their order."""
     numbers: dict[str, int] = {}
-    return _HASHED.sub(lambda found: f"id{numbers.setdefault(found[0], len(numbers))}", figure)
+    return _HASHED.sub(lambda result: f"id{numbers.setdefault(result[0], len(numbers))}", figure)
 
 
-def _alike(one: _Line, other: _Line, exact: bool) -> bool:
+def _equal_lines(item: _Line, other: _Line, exact: bool) -> bool:
     """Return whether two lines show the same."""
-    if one.text == other.text or exact:
-        return one.text == other.text and one.figure == other.figure
-    words, expected = ([" ".join(word.split()) for word in _NUMBER.split(each.text)] for each in (one, other))
-    numbers = zip(_NUMBER.findall(one.text), _NUMBER.findall(other.text), strict=False)
+    if item.text == other.text or exact:
+        return item.text == other.text and item.figure == other.figure
+    words, expected = (
+        [" ".join(word.split()) for word in _NUMBER.split(each.text)] for each in (item, other)
+    )
+    numbers = zip(_NUMBER.findall(item.text), _NUMBER.findall(other.text), strict=False)
     return words == expected and all(
-        _near(*pair, figure=one.figure, error=before.endswith("±"))
+        _near(*pair, figure=item.figure, error=before.endswith("±"))
         for before, pair in zip(words, numbers, strict=False)
     )
 
 
-def _near(one: str, other: str, *, figure: bool, error: bool) -> bool:
+def _near(item: str, other: str, *, figure: bool, error: bool) -> bool:
     """Return whether two numbers are the same but for roundings."""
-    a, b = (float(text.replace(",", "")) for text in (one, other))
+    a, b = (float(text.replace(",", "")) for text in (item, other))
     largest = max(a, b)
     if error:
         return largest <= ERROR_FACTOR * min(a, b)
@@ -134,8 +136,8 @@ def _last_digit(text: str) -> float:
 def _excerpts(shown: str, expected: str) -> tuple[str, str]:
     """Return two lines from shortly before the place where they differ."""
     least = min(len(shown), len(expected))
-    place = next((k for k in range(least) if shown[k] != expected[k]), least)
-    begin = max(0, place - WIDEST // 3)
+    index = next((k for k in range(least) if shown[k] != expected[k]), least)
+    begin = max(0, index - WIDEST // 3)
     return _excerpt(shown, begin), _excerpt(expected, begin)
 
 

@@ -1,1 +1,1 @@
-"""A scene played in time."""
+"""A model played in time."""

@@ -1,10 +1,10 @@
-"""How far a simulation is from the scene's true motion: the same played again, more closely.
+"""Error estimate of a simulation by comparison with a more accurate second run.
 
 Takes: a `Simulation`.
 Gives: `AccuracyEstimator`, `SignalError`, `ErrorEstimate`, `compare_with`.
-Guarantees: the two runs hear the same packets; the memory used does not grow with the duration.
-Does not: prove a bound: where a motion is unstable, or contacts are lost and made, both runs go ways of their
-own, and the estimate says so by its size.
+Guarantees: the two runs receive the same packets; the memory used does not grow with the duration.
+Does not: prove a bound: if the motion is unstable, or contacts open and close, the two runs diverge, and the
+estimate becomes large.
 
 By CVODES the second run has tolerances 100 times tighter. With a fixed step it has half the step, and the
 error is the difference times 1/(1 − 1/2ⁿ) for a method of order n. An exact transition has no error but
@@ -19,14 +19,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from apc.simulation.rows_in_time import OutputBlock, blocks
+from apc.simulation.output_blocks import OutputBlock, blocks
 from apc.simulation.settings import finer
 from apc.simulation.signals import Signal
 from apc.simulation.simulation import Simulation, prepare
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,13 +51,13 @@ class ErrorEstimate:
     signals: tuple[SignalError, ...]
 
     @property
-    def worst(self) -> SignalError | None:
+    def largest(self) -> SignalError | None:
         """The signal with the largest error relative to its range."""
         return max(self.signals, key=lambda signal: signal.relative, default=None)
 
 
 class AccuracyEstimator:
-    """Takes the blocks of a run as they come and plays the closer one beside it."""
+    """Processes the blocks of a run and simulates the more accurate run in parallel."""
 
     def __init__(self, closer: Simulation, kind: str, compared: str, factor: float) -> None:
         self.kind, self.compared, self.factor = kind, compared, factor
@@ -77,17 +74,17 @@ class AccuracyEstimator:
         if not other or not rows:
             return
         values = block.values[:rows]
-        apart = self.factor * np.abs(values - other.values[:rows])
-        larger = apart.max(axis=0) > self.error
-        self.at[larger] = block.time[apart.argmax(axis=0)[larger]]
-        self.error = np.maximum(self.error, apart.max(axis=0))
+        separation = self.factor * np.abs(values - other.values[:rows])
+        larger = separation.max(axis=0) > self.error
+        self.at[larger] = block.time[separation.argmax(axis=0)[larger]]
+        self.error = np.maximum(self.error, separation.max(axis=0))
         self.low, self.high = (
             np.minimum(self.low, values.min(axis=0)),
             np.maximum(self.high, values.max(axis=0)),
         )
 
     def estimate(self) -> ErrorEstimate:
-        """Return what has been seen."""
+        """Return the error estimate up to now."""
         span = np.where(self.high >= self.low, self.high - self.low, 0.0)
         columns: Sequence[Any] = (self.error.tolist(), self.at.tolist(), span.tolist())
         estimates = (
@@ -103,7 +100,7 @@ def compare_with(simulation: Simulation, *, signals: Sequence[str] = ()) -> Accu
     Parameters
     ----------
     simulation
-        What is to be judged.
+        The simulation.
     signals
         The patterns that it was prepared with.
     """

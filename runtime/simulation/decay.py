@@ -43,7 +43,7 @@ OPEN = 0.5
 LARGE = 0.1  # share of the largest amplitude from which a pole that is not known leaves the rate open
 FADED = 1e-10  # share of the largest second difference from which a sample counts
 STEADY = 0.5  # share of the range of the last quarter that the step to it must be, for a drift
-KEPT = 0.8  # share of a step that the next but one must keep, for a drift
+STORED = 0.8  # share of a step that the next but one must keep, for a drift
 LATE = 0.9  # share of the samples: a motion that ends before has ended
 UNIT = float(np.finfo(np.float64).eps)
 PARTS = ((0.0, 0.7), (0.3, 1.0))  # of the window, which are fitted again
@@ -51,9 +51,9 @@ PARTS = ((0.0, 0.7), (0.3, 1.0))  # of the window, which are fitted again
 
 @dataclass(frozen=True, slots=True)
 class Oscillation:
-    """A frequency in Hz with its error, of the position at `place`, from crest to trough by `size` in SI."""
+    """A frequency in Hz with its error, of the position at `index`, from crest to trough by `size` in SI."""
 
-    place: int
+    index: int
     size: float
     frequency: float
     error: float
@@ -147,7 +147,7 @@ def fit_motion(step: float, values: Floats, scale: Floats) -> Fit | None:
         return None
     last = min(int(moving[-1]) + 1, len(scaled) - 1)
     ended = last < LATE * len(scaled)
-    # What grows fast is rounding compared with its end until a short time before.
+    # A fast-growing motion is at rounding level, relative to its end, until shortly before it.
     curve = np.abs(np.diff(scaled[: last + 1], 2, axis=0)).max(axis=1, initial=0.0)
     begun = int(np.argmax(curve > FADED * curve.max(initial=0.0)))
     first = max(min(max(last // 2, begun), last + 1 - FEWEST), 0)
@@ -156,23 +156,23 @@ def fit_motion(step: float, values: Floats, scale: Floats) -> Fit | None:
     ranges = np.ptp(window, axis=0)
     chosen = np.argsort(-ranges, kind="stable")[:CHANNELS]
     chosen = chosen[ranges[chosen] > VISIBLE * ranges[chosen[0]]]
-    window, places = window[:, chosen], channels[chosen]
+    window, indices = window[:, chosen], channels[chosen]
     stride = _stride(window)
     thin = window[(len(window) - 1) % stride :: stride][-MOST:]
-    found = _by_poles(step * stride, thin)
-    if found is None or found.error * span > OPEN:
+    result = _by_poles(step * stride, thin)
+    if result is None or result.error * span > OPEN:
         other = _by_ranges(step, window)
-        if found is None or (other is not None and other.error < found.error):
-            found = other
-    if found is None:
-        found = _Rate(0.0, math.inf, None, _drifts(window))
+        if result is None or (other is not None and other.error < result.error):
+            result = other
+    if result is None:
+        result = _Rate(0.0, math.inf, None, _drifts(window))
     crests = None
-    if found.line is not None:
-        place, frequency, off = found.line
-        end = window[-(len(window) // 4) :, place]
-        size = float(np.ptp(_straightened(end) if found.ramp else end) * scale[places[place]])
-        crests = Oscillation(int(places[place]), size, frequency, off)
-    return Fit(found.rate, found.error, span, ended, crests, found.ramp)
+    if result.line is not None:
+        index, frequency, off = result.line
+        end = window[-(len(window) // 4) :, index]
+        size = float(np.ptp(_straightened(end) if result.ramp else end) * scale[indices[index]])
+        crests = Oscillation(int(indices[index]), size, frequency, off)
+    return Fit(result.rate, result.error, span, ended, crests, result.ramp)
 
 
 def _stride(window: Floats) -> int:
@@ -206,7 +206,7 @@ def _by_poles(step: float, window: Floats) -> _Rate | None:
     slowest = known[np.argmax(every.s.real[known])]
     # A large one that is not known to decay faster leaves the rate open.
     large = np.flatnonzero(size > LARGE * size.max())
-    doubt = max(float((every.s.real[large] - every.s.real[slowest]).max()), 0.0)
+    uncertainty = max(float((every.s.real[large] - every.s.real[slowest]).max()), 0.0)
     turning = [i for i in known if abs(every.s[i].imag) > max(float(off[i]), 1 / (step * count))]
     line = None
     if turning:
@@ -214,7 +214,7 @@ def _by_poles(step: float, window: Floats) -> _Rate | None:
         frequency, error = (float(v / (2 * np.pi)) for v in (abs(every.s[largest].imag), off[largest]))
         line = int(np.argmax(every.amplitudes[largest])), frequency, error
     ramp = bool((every.ramps > RAMP * np.ptp(window, axis=0)).any()) and _drifts(window)
-    return _Rate(float(every.s.real[slowest]), float(off[slowest]) + doubt, line, ramp)
+    return _Rate(float(every.s.real[slowest]), float(off[slowest]) + uncertainty, line, ramp)
 
 
 def _poles(step: float, window: Floats) -> _Poles | None:
@@ -283,6 +283,6 @@ def _drifts(window: Floats) -> bool:
     quarters = np.array_split(window, 4)
     steps = np.diff([part.mean(axis=0) for part in quarters], axis=0)
     onwards = (np.sign(steps) == np.sign(steps[0])).all(axis=0)
-    kept = np.abs(steps[2]) > KEPT * np.abs(steps[0])
+    stored = np.abs(steps[2]) > STORED * np.abs(steps[0])
     large = np.abs(steps[2]) > np.maximum(RAMP * np.ptp(window, axis=0), STEADY * np.ptp(quarters[3], axis=0))
-    return bool((onwards & kept & large).any())
+    return bool((onwards & stored & large).any())

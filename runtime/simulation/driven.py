@@ -21,7 +21,7 @@ from apc.simulation.simulation import Simulation
 Floats = NDArray[np.float64]
 
 GRID = 1024  # instants at which equations are evaluated
-MOST_SITES = 16  # different sites of a group that are evaluated
+MOST_SUBSYSTEMS = 16  # different subsystems of a group that are evaluated
 STATES = (0.005, 0.01)  # between which the states are drawn, in SI
 CHANGED = 1e-12  # share of a value from which it has changed
 
@@ -32,24 +32,26 @@ def driven_until(simulation: Simulation) -> float:
     until = 0.0
     functions: dict[PeerType, list[Any]] = {}
     for member, forces in zip(simulation.population.members, simulation.forces, strict=True):
-        kind = simulation.topology.kinds[simulation.topology.groups[member.group].kind]
-        if kind not in functions:
-            functions[kind] = [function for function in _functions(kind) if _depends_on_time(function)]
+        peer_type = simulation.topology.peer_types[simulation.topology.groups[member.group].peer_type]
+        if peer_type not in functions:
+            functions[peer_type] = [
+                function for function in _functions(peer_type) if _depends_on_time(function)
+            ]
         breaks = [force.breaks[(force.breaks > 0) & (force.breaks < end)] for force in forces]
         instants = np.unique(np.concatenate([np.linspace(0, end, GRID + 1), *breaks]))
-        for function in functions[kind]:
-            for parameters in member.parameters[:MOST_SITES]:
+        for function in functions[peer_type]:
+            for parameters in member.parameters[:MOST_SUBSYSTEMS]:
                 until = max(until, _last_change(function, parameters, instants))
     return until
 
 
-def _functions(kind: PeerType) -> Iterator[Any]:
-    """Yield the functions of a kind over (…, p, t)."""
-    yield kind.derivative
-    for clock in kind.clocks:
+def _functions(peer_type: PeerType) -> Iterator[Any]:
+    """Yield the functions of a peer type over (…, p, t)."""
+    yield peer_type.derivative
+    for clock in peer_type.clocks:
         yield clock.tick
         yield from (receive.edge for receive in clock.receives if receive.edge is not None)
-    yield from (send.send for send in kind.sends)
+    yield from (send.send for send in peer_type.sends)
 
 
 def _depends_on_time(function: Any) -> bool:

@@ -1,8 +1,8 @@
-/* Plays frames of all peers: what `hearing` lists, between the kernels of the members' segments.
+/* Advances all peers by frames: the exchanges of `exchange_program`, between the kernels of the members' segments.
 
-The kernels stand before this text (see `machine`), which also says what every field is. All fields have 8
-bytes; addresses are those of NumPy's arrays, which outlive a call. A row of a packet, a carry or what is
-heard is contiguous: a number a peer; what is in effect is a number a way.
+The kernels precede this text (see `compiled_engine`, which also documents every field). All fields have 8
+bytes; addresses are those of NumPy's arrays, which outlive a call. A row of a packet, a carry or a
+received value is contiguous: one number per peer. The packets in effect are one number per arc.
 */
 
 enum { COMPLETE, WEIGHED, DELIVER, LOOK, MOVE, WORK };

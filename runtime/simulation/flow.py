@@ -1,11 +1,11 @@
-"""The continuous states of a kind that are moved by a numerical method, and the function that moves them.
+"""The states of a peer type that a numerical method integrates, and the function of a step.
 
-Takes: a `PeerType`, a `Method`; for scales, the scene's numbers.
+Takes: a `PeerType`, a `Method`; for scales, the parameter values.
 Gives: `Flow`, `Tolerance`, `flow_of`, `rows_to_move`; `stepped`, methods of a fixed step; `state_scales`,
 `integrals`.
 Guarantees: only the states that no chain of equations ties to what is not linear keep their exact transition,
 unless the method is for all. Whole steps, then one shorter one to the end, which cost no more code however
-many they are. Scales are positive numbers in SI, the same for all peers of a kind.
+many they are. Scales are positive numbers in SI, the same for all peers of a peer type.
 Does not: move anything by exact transitions (see `propagate`), or know how large its error is (see
 `accuracy`).
 
@@ -16,9 +16,9 @@ Does not: move anything by exact transitions (see `propagate`), or know how larg
 (Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, table II.1.2; Hairer, Lubich and
 Wanner, Geometric Numerical Integration, section I.1.2.)
 
-A state's scale, which its tolerance is a part of, is the largest magnitude of the scene's numbers in its unit
-(start values, widths, places). A state that is another's rate of change is moreover at least √(2 a L), the
-speed reached over that one's scale L at its first rate of change a, and at least L a second.
+A state's scale, which its tolerance is a part of, is the largest magnitude of the parameter values in its
+unit (start values, widths, places). A state that is another's rate of change is moreover at least √(2 a L),
+the speed reached over that one's scale L at its first rate of change a, and at least L a second.
 """
 
 from __future__ import annotations
@@ -43,14 +43,15 @@ from apc.simulation.settings import EXACT, RK4, WHERE_NEEDED, Method
 Floats = NDArray[np.float64]
 Rate = Callable[[Any, Any], Any]  # (x, t) -> dx/dt
 
-# Where the scene has no number in a state's unit: a thousandth of it, as the millimetres of a hand's work.
+# The default scale of a state without a parameter in its unit: a thousandth of it, as the millimeters of hand
+# work.
 UNKNOWN = 1e-3
 MOST_UNROLLED = 64  # steps between two events that are written out, and so can be machine code
 
 
 @dataclass(frozen=True, slots=True)
 class Tolerance:
-    """What CVODES keeps the error of a step of a state below: relative · |x| + absolute, in its unit."""
+    """Bounds of the error of a CVODES step, per state: relative · |x| + absolute, in its unit."""
 
     state: str
     unit: str
@@ -60,7 +61,7 @@ class Tolerance:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Flow:
-    """States moved by `method`: `rows` of the kind's; `rate` (x, u, p, t) -> dx/dt is of these states alone.
+    """States integrated by `method`: `rows` of the peer type's; `rate` (x, u, p, t) -> their dx/dt.
 
     `scale` (rows,) is how large each is, in SI.
     """
@@ -79,45 +80,45 @@ class Flow:
         assert self.method.tolerance is not None
         return Integrated(self.rate, self.scale, self.method.tolerance, duration)
 
-    def tolerances(self, kind: PeerType) -> tuple[Tolerance, ...]:
+    def tolerances(self, peer_type: PeerType) -> tuple[Tolerance, ...]:
         """Return the tolerances of its states, none if the step is fixed."""
         if self.method.tolerance is None:
             return ()
         return tuple(
             Tolerance(state.name, state.unit, self.method.tolerance, self.method.tolerance * float(size))
-            for state, size in zip((kind.states[row] for row in self.rows), self.scale, strict=True)
+            for state, size in zip((peer_type.states[row] for row in self.rows), self.scale, strict=True)
         )
 
 
-def rows_to_move(kind: PeerType, method: Method) -> tuple[int, ...]:
-    """Return the states of a kind that a method moves itself."""
+def rows_to_move(peer_type: PeerType, method: Method) -> tuple[int, ...]:
+    """Return the states of a peer type that a method moves itself."""
     if method.name == EXACT:
         return ()
-    return nonlinear_rows(kind) if method.name == WHERE_NEEDED else tuple(range(len(kind.states)))
+    return nonlinear_rows(peer_type) if method.name == WHERE_NEEDED else tuple(range(len(peer_type.states)))
 
 
-def flow_of(kind: PeerType, method: Method, rows: Sequence[int], scale: Floats) -> Flow | None:
-    """Return what a method moves of a kind, None if that is nothing.
+def flow_of(peer_type: PeerType, method: Method, rows: Sequence[int], scale: Floats) -> Flow | None:
+    """Return the equations of a peer type that a method integrates, None if none.
 
     Parameters
     ----------
-    kind
-        The kind.
+    peer_type
+        The peer type.
     method
         The method.
     rows
         The states it moves.
     scale
-        How large every state of the kind is (n_x,), in SI.
+        The scale of every state of the type (n_x,), in SI.
     """
     if not rows:
         return None
-    type_: Any = casadi.SX if kind.derivative.is_a("SXFunction") else casadi.MX
-    x, u = type_.sym("x", len(rows)), type_.sym("u", len(kind.holds))
-    p, t = type_.sym("p", len(kind.parameters)), type_.sym("t")
-    place = {row: i for i, row in enumerate(rows)}
-    whole = casadi.vertcat(*(x[place[row]] if row in place else 0 for row in range(len(kind.states))))
-    speed = casadi.densify(kind.derivative(whole, u, p, t)[list(rows)])
+    type_: Any = casadi.SX if peer_type.derivative.is_a("SXFunction") else casadi.MX
+    x, u = type_.sym("x", len(rows)), type_.sym("u", len(peer_type.holds))
+    p, t = type_.sym("p", len(peer_type.parameters)), type_.sym("t")
+    index = {row: i for i, row in enumerate(rows)}
+    whole = casadi.vertcat(*(x[index[row]] if row in index else 0 for row in range(len(peer_type.states))))
+    speed = casadi.densify(peer_type.derivative(whole, u, p, t)[list(rows)])
     rate = casadi.Function("rate", [x, u, p, t], [speed])
     return Flow(method, tuple(rows), rate, np.asarray(scale)[list(rows)])
 
@@ -134,7 +135,7 @@ def stepped(function: Any, method: Method, duration: Fraction, pairs: Sequence[t
     duration
         In seconds.
     pairs
-        Which states are integrals of which, as `integrals` gives them: of these the new value is used.
+        The states that are integrals of others, as `integrals` gives them: of these the new value is used.
     """
     assert method.step is not None
     whole = int(duration / method.step)  # rounds down
@@ -155,7 +156,7 @@ def stepped(function: Any, method: Method, duration: Fraction, pairs: Sequence[t
 
 
 def _step(function: Any, advance: Callable[..., Any], h: float) -> Any:
-    """Return one whole step; what stays the same travels with what changes, so that steps can be repeated."""
+    """Return one complete step; constant data are passed through, so that steps can be repeated."""
     type_: Any = casadi.SX if function.is_a("SXFunction") else casadi.MX
     sizes = [function.numel_in(i) for i in range(3)]
     carry = type_.sym("carry", sum(sizes) + 2)
@@ -209,17 +210,17 @@ def integrals(rate: Any) -> tuple[tuple[int, int], ...]:
 
 
 def state_scales(
-    system: Model, kind: PeerType, site: SubsystemJacobians, vectors: Sequence[Floats]
+    system: Model, peer_type: PeerType, subsystem: SubsystemJacobians, vectors: Sequence[Floats]
 ) -> Floats:
     """Return the scale of every state (n_x,), in SI.
 
     Parameters
     ----------
     system
-        The compiled scene.
-    kind
-        One of its kinds.
-    site
+        The model.
+    peer_type
+        One of its peer types.
+    subsystem
         Its Jacobians, which know where it starts.
     vectors
         The parameters of its different peers (n_p,).
@@ -227,17 +228,17 @@ def state_scales(
     units = {parameter.name: parameter.unit for parameter in system.parameters}
     units |= {value.name: value.unit for group in system.groups for value in group.values}
     largest: dict[str, float] = {}
-    for place, name in enumerate(kind.parameters):
-        size = max((abs(float(vector[place])) for vector in vectors), default=0.0)
+    for index, name in enumerate(peer_type.parameters):
+        size = max((abs(float(vector[index])) for vector in vectors), default=0.0)
         unit = units.get(name, "1")
         largest[unit] = max(largest.get(unit, 0.0), size)
-    scale = np.array([largest.get(state.unit, 0.0) for state in kind.states])
+    scale = np.array([largest.get(state.unit, 0.0) for state in peer_type.states])
     first = np.zeros(len(scale))
     for vector in vectors:
-        x, u, _ = start_values(site, [float(item) for item in vector])
-        speed = np.abs(np.asarray(kind.derivative(x, u, vector, 0.0), dtype=np.float64).ravel())
+        x, u, _ = start_values(subsystem, [float(item) for item in vector])
+        speed = np.abs(np.asarray(peer_type.derivative(x, u, vector, 0.0), dtype=np.float64).ravel())
         first = np.maximum(first, np.nan_to_num(speed, posinf=0.0))
-    rates = integrals(kind.derivative)
+    rates = integrals(peer_type.derivative)
     derived = {j for _, j in rates}
     scale = np.where((scale == 0) & ~np.isin(np.arange(len(scale)), list(derived)), UNKNOWN, scale)
     for i, j in reversed(rates):  # from positions to velocities

@@ -1,7 +1,7 @@
-"""What forces that change with time alone add to a site's motion, next to exact.
+"""The effect of time-varying forces on a subsystem's motion, in addition to the exact transition.
 
-Takes: the `Rates` of a kind, a parameter vector, when intervals begin and how long they last.
-Gives: `SubsystemForcing`, `site_forcing`, `impulses`.
+Takes: the `Rates` of a peer type, a parameter vector, when intervals begin and how long they last.
+Gives: `SubsystemForcing`, `subsystem_forcing`, `impulses`.
 Guarantees: an interval is split where a comparison of `time` switches (a step, a corner of a ramp, a row of
 a table), so that what is integrated is smooth; an impulse is right to `AGREE` of the largest of those
 integrated at once, and where a force jumps at an instant that is not known beforehand, to `LOST`.
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.frame.discretize import exponential
-from apc.frame.exact import ROWS, evaluate_exact
+from apc.frame.exact_arithmetic import ROWS, evaluate_exact
 from apc.frame.jacobians import guards_of, lookups_of
 from apc.simulation.propagate import Rates
 from apc.threads import load_pool
@@ -43,7 +43,7 @@ MOST_NUMBERS = 2**21  # of the exponentials that are held at once
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SubsystemForcing:
-    """The forces on one site, of which x' = A x + g(t).
+    """The forces on one subsystem, of which x' = A x + g(t).
 
     `matrix` is A (n_x, n_x); `force` gives the rows `pushed` of g at a time, the others are zero; at
     `breaks`, instants in order, it is not smooth. `durations` are the lengths of intervals, in seconds.
@@ -56,15 +56,15 @@ class SubsystemForcing:
     durations: tuple[float, ...]
 
 
-def site_forcing(rates: Rates, parameters: Floats, durations: Sequence[Fraction]) -> SubsystemForcing:
-    """Return the forces on a site.
+def subsystem_forcing(rates: Rates, parameters: Floats, durations: Sequence[Fraction]) -> SubsystemForcing:
+    """Return the forces on a subsystem.
 
     Parameters
     ----------
     rates
-        The equations of its kind.
+        The equations of its peer type.
     parameters
-        The site's (n_p,).
+        The subsystem's (n_p,).
     durations
         The lengths of intervals, in seconds.
     """
@@ -72,12 +72,10 @@ def site_forcing(rates: Rates, parameters: Floats, durations: Sequence[Fraction]
     t = type_.sym("t")
     g = rates.rate(parameters, t)
     pushed, breaks = tuple(range(g.numel())), []
-    if (
-        type_ is casadi.SX
-    ):  # where the solution of a loop is not smooth, and what is not linear in time: halving
+    if type_ is casadi.SX:  # where a loop's solution is nonsmooth, or time-dependence nonlinear: halving
         pushed = tuple(row for row in pushed if not g[row].is_zero())
-        places = [(at, casadi.DM(table.times)) for table, at in lookups_of(g)]
-        for at, zeros in [*places, *((guard, casadi.DM(0)) for guard in guards_of(g, t))]:
+        indices = [(at, casadi.DM(table.times)) for table, at in lookups_of(g)]
+        for at, zeros in [*indices, *((guard, casadi.DM(0)) for guard in guards_of(g, t))]:
             pace = casadi.jacobian(at, t)
             if not casadi.depends_on(pace, t):
                 breaks.append((zeros - casadi.substitute(at, t, 0)) / pace)
@@ -92,54 +90,54 @@ def site_forcing(rates: Rates, parameters: Floats, durations: Sequence[Fraction]
     )
 
 
-def impulses(site: SubsystemForcing, starts: Floats, which: Integers) -> Floats:
+def impulses(subsystem: SubsystemForcing, starts: Floats, which: Integers) -> Floats:
     """Return c of every interval (intervals, n_x).
 
     Parameters
     ----------
-    site
+    subsystem
         The forces.
     starts
-        When each interval begins, in seconds (intervals,).
+        The start of each interval, in seconds (intervals,).
     which
-        The place of each interval's length in the site's `durations` (intervals,).
+        The place of each interval's length in the subsystem's `durations` (intervals,).
 
     Raises
     ------
     ApcError
         E871 a force changes too fast to be followed.
     """
-    result = np.zeros((len(starts), len(site.matrix)))
-    for place, duration in enumerate(site.durations):
-        rows = np.flatnonzero(which == place)
-        result[rows] = _impulses_of_length(site, duration, starts[rows])
+    result = np.zeros((len(starts), len(subsystem.matrix)))
+    for index, duration in enumerate(subsystem.durations):
+        rows = np.flatnonzero(which == index)
+        result[rows] = _impulses_of_length(subsystem, duration, starts[rows])
     return result
 
 
-def _impulses_of_length(site: SubsystemForcing, duration: float, starts: Floats) -> Floats:
+def _impulses_of_length(subsystem: SubsystemForcing, duration: float, starts: Floats) -> Floats:
     """Return c of intervals of one length (intervals, n_x)."""
-    total = np.zeros((len(starts), len(site.matrix)))
-    whose, low, high = _parts(site, duration, starts)
-    most = max(1, MOST_NUMBERS // site.matrix.size)  # parts that are integrated at once
+    total = np.zeros((len(starts), len(subsystem.matrix)))
+    whose, low, high = _parts(subsystem, duration, starts)
+    most = max(1, MOST_NUMBERS // subsystem.matrix.size)  # parts that are integrated at once
     for first in range(0, len(whose), most):
         some = slice(first, first + most)
-        value = _integrated(site, starts[whose[some]] + duration, low[some], high[some])
+        value = _integrated(subsystem, starts[whose[some]] + duration, low[some], high[some])
         np.add.at(total, whose[some], value)
     return total
 
 
-def _parts(site: SubsystemForcing, duration: float, starts: Floats) -> tuple[Integers, Floats, Floats]:
+def _parts(subsystem: SubsystemForcing, duration: float, starts: Floats) -> tuple[Integers, Floats, Floats]:
     """Return the parts into which breaks, and what fades, cut intervals: whose each is, from where to where.
 
     Times are in seconds before the interval's end, which stay exact where something dies out at once.
     """
-    first = np.searchsorted(site.breaks, starts, side="right")
-    many = np.maximum(np.searchsorted(site.breaks, starts + duration) - first, 0)
-    every, size = np.arange(len(starts)), float(np.abs(site.matrix).sum(axis=1).max(initial=0.0))
+    first = np.searchsorted(subsystem.breaks, starts, side="right")
+    many = np.maximum(np.searchsorted(subsystem.breaks, starts + duration) - first, 0)
+    every, size = np.arange(len(starts)), float(np.abs(subsystem.matrix).sum(axis=1).max(initial=0.0))
     cut = np.repeat(every, many)
-    place = np.arange(len(cut)) - np.repeat(np.cumsum(many) - many, many) + first[cut]
-    left = duration - (site.breaks[place] - starts[cut])
-    fading = np.arange(0.0, np.log2(max(size * duration, 1.0)), FADING)  # what dies out fast does so within
+    index = np.arange(len(cut)) - np.repeat(np.cumsum(many) - many, many) + first[cut]
+    left = duration - (subsystem.breaks[index] - starts[cut])
+    fading = np.arange(0.0, np.log2(max(size * duration, 1.0)), FADING)  # fast modes decay within it
     fixed = np.array([0.0, duration, *2.0**fading / max(size, 1 / duration)])
     whose = np.concatenate([np.repeat(every, len(fixed)), cut])
     ends = np.concatenate([np.tile(fixed, len(starts)), left])
@@ -149,17 +147,17 @@ def _parts(site: SubsystemForcing, duration: float, starts: Floats) -> tuple[Int
     return whose[:-1][inside], ends[:-1][inside], ends[1:][inside]
 
 
-def _integrated(site: SubsystemForcing, until: Floats, low: Floats, high: Floats) -> Floats:
+def _integrated(subsystem: SubsystemForcing, until: Floats, low: Floats, high: Floats) -> Floats:
     """Integrate parts of intervals that end at `until`, from `high` to `low` seconds before, all (k,)."""
     equal, which = np.unique(np.stack([low, high]), axis=1, return_inverse=True)
     which = which.reshape(-1)
-    nothing = site.matrix[None, :, :0]
+    nothing = subsystem.matrix[None, :, :0]
 
     def integrand(share: float) -> Floats:
         left = equal[0] + (equal[1] - equal[0]) * share
-        steps = exponential(site.matrix, nothing, left[:, None, None])
-        g = _at(site.force, np.maximum(until - left[which], 0.0))
-        moved = np.einsum("kxq,qk->kx", steps[..., list(site.pushed)][which], g)
+        steps = exponential(subsystem.matrix, nothing, left[:, None, None])
+        g = _at(subsystem.force, np.maximum(until - left[which], 0.0))
+        moved = np.einsum("kxq,qk->kx", steps[..., list(subsystem.pushed)][which], g)
         return np.asarray((high - low)[:, None] * moved)
 
     value, error = load_pool("scipy.integrate").quad_vec(
@@ -186,10 +184,12 @@ def _at(function: Any, instants: Floats) -> Floats:
 
 
 def _too_fast(begin: Floats, end: Floats) -> ApcError:
-    what = (
+    message = (
         f"a force changes too fast: from {float(begin.min()):.6g} s to {float(end.max()):.6g} s it would be "
         f"looked at in more than {MOST_PIECES:,} places"
     )
     return ApcError(
-        Diagnostic("E871", SourceLocation("simulation"), what, hint="a lower frequency, or a constant force")
+        Diagnostic(
+            "E871", SourceLocation("simulation"), message, hint="a lower frequency, or a constant force"
+        )
     )

@@ -1,4 +1,4 @@
-"""What is not linear between two events, by CVODES, restarted where an equation is not smooth.
+"""Integration of nonlinear equations between two events, by CVODES, restarted at nonsmooth points.
 
 Takes: the rate of change of a state, tolerances, a duration. Gives: `Integrated`.
 Guarantees: each step's error is below the tolerance; where something that decides (a comparison, a max, an
@@ -25,7 +25,7 @@ from apc.frame.jacobians import guards_of
 
 Floats = NDArray[np.float64]
 
-LOOKS = 8  # at what decides, between two events: CVODES' own interpolation gives the states there
+MOST_EVALUATIONS = 8  # at what decides, between two events: CVODES' own interpolation gives the states there
 HALVINGS = 34  # of the distance of two looks: 6e-11 of it is left
 MOST_CROSSINGS = 4  # between two events that are located; those after are left to the control of the step
 MOST_STEPS = 20_000  # of CVODES from look to look: what takes more jumps to and fro without end
@@ -45,7 +45,7 @@ class Integrated(casadi.Callback):
         function
             The rate of change (x, u, p, t) -> dx/dt, a CasADi function.
         scale
-            How large each state is (n_x,): the error of a step is below `tolerance` times |x| + scale.
+            The scale of each state (n_x,): the error of a step is below `tolerance` times |x| + scale.
         tolerance
             Relative to |x| + scale.
         duration
@@ -68,7 +68,7 @@ class Integrated(casadi.Callback):
             "disable_internal_warnings": True,
             "show_eval_warnings": False,
         }
-        looks = [k / LOOKS for k in range(1, LOOKS + 1)]
+        looks = [k / MOST_EVALUATIONS for k in range(1, MOST_EVALUATIONS + 1)]
         self.once = casadi.integrator("once", "cvodes", problem, 0.0, [1.0], options)
         guards = guards_of(rate, casadi.vertcat(y, begin, t, s)) if type_ is casadi.SX else []
         self.looks: Any = None
@@ -78,41 +78,43 @@ class Integrated(casadi.Callback):
             self.signs = casadi.Function("signs", [y, fixed], [casadi.densify(decides)])
             start, held = casadi.MX.sym("y", self.sizes[0]), casadi.MX.sym("fixed", fixed.numel() - 2)
             first, last = casadi.MX.sym("first"), casadi.MX.sym("last")
-            looked = casadi.integrator("looks", "cvodes", problem, 0.0, looks, options)
-            ends = looked(x0=start, p=casadi.vertcat(held, first, last - first))["xf"]
+            evaluations = casadi.integrator("looks", "cvodes", problem, 0.0, looks, options)
+            ends = evaluations(x0=start, p=casadi.vertcat(held, first, last - first))["xf"]
             every = casadi.horzcat(start, ends)
             at = first + (last - first) * casadi.DM([0.0, *looks]).T
-            places = casadi.vertcat(casadi.repmat(held, 1, LOOKS + 1), at, casadi.MX.zeros(1, LOOKS + 1))
-            signs = self.signs.map(LOOKS + 1)(every, places)
+            indices = casadi.vertcat(
+                casadi.repmat(held, 1, MOST_EVALUATIONS + 1), at, casadi.MX.zeros(1, MOST_EVALUATIONS + 1)
+            )
+            signs = self.signs.map(MOST_EVALUATIONS + 1)(every, indices)
             crossed = casadi.norm_inf(casadi.vec(signs[:, 1:] - signs[:, :-1]))
             result = [every[:, -1] * scale, crossed, every, at, signs]
             self.looks = casadi.Function("looks", [start, held, first, last], result)
         self.construct("move", {})
 
     def get_n_in(self) -> int:
-        """Return how many arguments there are, for CasADi."""
+        """Return the number of arguments, for CasADi."""
         return 4
 
     def get_n_out(self) -> int:
-        """Return how many results there are, for CasADi."""
+        """Return the number of results, for CasADi."""
         return 1
 
-    def get_sparsity_in(self, place: int) -> Any:
+    def get_sparsity_in(self, index: int) -> Any:
         """Return an argument's shape, for CasADi."""
-        return casadi.Sparsity.dense(self.sizes[place], 1)
+        return casadi.Sparsity.dense(self.sizes[index], 1)
 
     def get_sparsity_out(self, _: int) -> Any:
         """Return the result's shape, for CasADi."""
         return casadi.Sparsity.dense(self.sizes[0], 1)
 
     def eval(self, arguments: Sequence[Any]) -> list[Any]:
-        """Return x at the end, locating what decides on the way, for CasADi."""
+        """Return x at the end, with location of the switching events, for CasADi."""
         y, held, begin = arguments[0] / casadi.DM(self.scale), casadi.vertcat(*arguments[1:]), 0.0
         for _ in range(MOST_CROSSINGS if self.looks is not None else 0):
-            end, crossed, *looked = self.looks(y, held, begin, self.duration)
+            end, crossed, *evaluations = self.looks(y, held, begin, self.duration)
             if not float(crossed):
                 return [end]
-            every, at, signs = map(np.asarray, looked)
+            every, at, signs = map(np.asarray, evaluations)
             changed = (signs[:, 1:] != signs[:, :-1]).any(axis=0)
             first = int(changed.argmax())
             ends = every[:, [first]], every[:, [first + 1]]

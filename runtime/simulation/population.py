@@ -1,12 +1,12 @@
-"""All peers of a scene over one frame: each one's program, and what they hear of each other.
+"""All peers of a model over one frame: their programs and their exchange of packets.
 
-Takes: a `Model`, who hears whom, and the members, with their programs.
+Takes: a `Model`, the communication graph, and the members with their programs.
 Gives: `Population`, `build_population`; `FrameRows`, `FrameEngine`; `PopulationState`, `DeliverySource`;
 `exchanges_within`, `instants_within`, `refuse_unheard_of`.
-Guarantees: what many peers have in common is kept once.
-Does not: play it (see `stepwise`, `machine`).
+Guarantees: data common to several peers is stored once.
+Does not: execute it (see `interpreted_engine`, `compiled_engine`).
 
-A member is a group of the scene, or those of its peers that are recorded, or those that are not.
+A member is a group of the model, or its recorded peers, or its other peers.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
-from apc.frame.exchange import CommunicationGraph
+from apc.frame.communication_graph import CommunicationGraph
 from apc.frame.schedule import Propagate, Schedule, Tick
-from apc.network.timetable import START, DeliveredPackets, Route
-from apc.simulation.hearing import ExchangeProgram, hearing_of
+from apc.network.packet_schedule import START, DeliveredPackets, Route
+from apc.simulation.exchange_program import ExchangeProgram, exchange_program_of
 from apc.simulation.program import GroupProgram, timed_events
 
 Floats = NDArray[np.float64]
@@ -32,17 +32,17 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Population:
-    """All peers. A frame is so many quanta long and has so many rows, at `marks`, of `width` numbers.
+    """All peers. A frame has a length in quanta, and rows at `sample_count`, each of `width` numbers.
 
-    A row holds, member by member from `columns` on, each signal of all its peers. `parts` are those whose
-    work is added up.
+    A row holds, member by member from `columns` on, each signal of all its peers. `parts` are the parts whose
+    work is summed.
     """
 
     members: tuple[GroupProgram, ...]
-    hearing: ExchangeProgram
+    exchange_program: ExchangeProgram
     quantum: Fraction
     frame: int
-    marks: int
+    sample_count: int
     width: int
     columns: tuple[int, ...]
     parts: tuple[str, ...]
@@ -61,10 +61,10 @@ class FrameRows:
 
 
 class DeliverySource(Protocol):
-    """What says which packets the ticks of each route see, as a `Timetable` does; time only goes forward."""
+    """A source of the packets in effect at each route's ticks, such as `Timetable`; time only advances."""
 
     def take(self, until: int) -> tuple[DeliveredPackets, ...]:
-        """Return what each route's ticks see, from where the last call ended to before `until`, in quanta."""
+        """Return the packets in effect at each route's ticks, from the last call until `until` in quanta."""
 
 
 class FrameEngine(Protocol):
@@ -73,18 +73,18 @@ class FrameEngine(Protocol):
     def begin(self, run: int) -> None:
         """Go back to time 0 of the run of a number."""
 
-    def play(self, first: int, count: int, pushes: Sequence[Floats | None]) -> FrameRows:
+    def advance(self, first: int, count: int, pushes: Sequence[Floats | None]) -> FrameRows:
         """Play the frames from number `first` on; of the members with impulses `pushes` are these.
 
-        They are (frames, rows, sites). What is returned may be written over by the next call.
+        They are (frames, rows, subsystems). What is returned may be written over by the next call.
         """
 
     def in_range(self) -> bool:
-        """Say whether all that moves, recorded or not, is still a number; its work may not be."""
+        """Return whether all states, recorded or not, are finite; the work may not be."""
 
 
 class PopulationState:
-    """What all peers remember from frame to frame, in arrays that stay where they are.
+    """The stored values of all peers from frame to frame, in arrays with fixed addresses.
 
     `packets` (ring, keys, peers) are those of the last frames; `carries` are of each member (rows, peers);
     `held` and `effective` are of each route, as of `ExchangeProgram`, and the number of the packet in effect.
@@ -92,44 +92,44 @@ class PopulationState:
 
     def __init__(self, population: Population, timetable: Callable[[int], DeliverySource] | None) -> None:
         """Make it, at time 0 of the first run; `timetable` gives the packets of a run, None without any."""
-        hearing, self.population, self.timetable = population.hearing, population, timetable
-        self.packets = np.empty((hearing.ring, *hearing.start.shape))
+        exchange_program, self.population, self.timetable = population.exchange_program, population, timetable
+        self.packets = np.empty((exchange_program.ring, *exchange_program.start.shape))
         self.carries = [np.empty((member.carry.shape[1], member.count)) for member in population.members]
-        self.held = [np.empty(start.shape) for start in hearing.held]
-        self.effective = [np.empty(len(route.pairs), np.int64) for route in hearing.routes]
+        self.held = [np.empty(start.shape) for start in exchange_program.held]
+        self.effective = [np.empty(len(route.pairs), np.int64) for route in exchange_program.routes]
         self.begin(0)
 
     def begin(self, run: int) -> None:
         """Go back to time 0 (see `FrameEngine`)."""
-        hearing, members = self.population.hearing, self.population.members
+        exchange_program, members = self.population.exchange_program, self.population.members
         self.table = None if self.timetable is None else self.timetable(run)
-        self.packets[:] = hearing.start
-        for array, start in zip(self.held, hearing.held, strict=True):
+        self.packets[:] = exchange_program.start
+        for array, start in zip(self.held, exchange_program.held, strict=True):
             array[:] = start
         for numbers in self.effective:
             numbers[:] = START
         for carry, member in zip(self.carries, members, strict=True):
             carry[:] = member.each(member.carry).T
 
-    def seen_until(self, until: int) -> tuple[DeliveredPackets, ...]:
-        """Return what the ticks see in the frames before number `until`, from the last that was asked for."""
+    def delivered_until(self, until: int) -> tuple[DeliveredPackets, ...]:
+        """Return the packets in effect at the ticks before frame `until`, from the last request on."""
         return self.table.take(until * self.population.frame) if self.table else ()
 
     def in_range(self) -> bool:
-        """Say whether all that moves is still a number (see `FrameEngine`)."""
+        """Return whether all states are finite (see `FrameEngine`)."""
         members = zip(self.carries, self.population.members, strict=True)
         moving = (carry[: member.program.layout.work.start] for carry, member in members)
         return all(bool(np.isfinite(array).all()) for array in (self.packets, *moving))
 
 
 def exchanges_within(schedules: Sequence[Schedule]) -> tuple[int, ...]:
-    """Return the instants, in quanta, at which peers meet within the frame.
+    """Return the instants, in quanta, of exchanges within the frame.
 
-    Something is sent that is heard in the same frame, or a tick looks at each sender by itself.
+    At these a packet is sent and received within the frame, or a tick has a pairwise reduction.
     """
-    slots = {heard.sent for schedule in schedules for heard in schedule.heard if heard.lag == 0}
-    # Over an unreliable link anything may be heard as soon as it is sent.
-    any_time = {selected.way.link for schedule in schedules for selected in schedule.selected}
+    slots = {received.sent for schedule in schedules for received in schedule.received if received.lag == 0}
+    # Over an unreliable link a packet may be received as soon as it is sent.
+    any_time = {selected.coupling_term.link for schedule in schedules for selected in schedule.selected}
     numbers = {
         at
         for schedule in schedules
@@ -138,8 +138,8 @@ def exchanges_within(schedules: Sequence[Schedule]) -> tuple[int, ...]:
     }
     for schedule in schedules:
         for now, event in timed_events(schedule):
-            heard = (row for rows in event.heard for row in rows) if isinstance(event, Tick) else ()
-            if any(schedule.received[row].way.edge for row in heard):
+            received = (row for rows in event.input_rows for row in rows) if isinstance(event, Tick) else ()
+            if any(schedule.all_received[row].coupling_term.edge for row in received):
                 numbers.add(now)
     return tuple(sorted(numbers))
 
@@ -156,23 +156,29 @@ def instants_within(schedules: Sequence[Schedule]) -> tuple[int, ...]:
 
 
 def refuse_unheard_of(system: Model) -> None:
-    """Refuse a peer that has nothing of its own to stand in for what an unreliable link loses."""
+    """Refuse a peer without an own value as the substitute for a lost packet."""
     zero = {link.name for link in system.links if link.channel and link.channel.on_loss == "zero"}
-    for kind in system.kinds:
-        for partition in kind.clocks:
+    for peer_type in system.peer_types:
+        for partition in peer_type.clocks:
             for receive in partition.receives:
-                if receive.link in zero and not any(send.link == receive.link for send in kind.sends):
-                    what = (
+                if receive.link in zero and not any(send.link == receive.link for send in peer_type.sends):
+                    message = (
                         f"{receive.name} hears {receive.link}, over which its peer sends nothing: it has no "
                         "value of its own to stand in for a missing one"
                     )
                     raise ApcError(
-                        Diagnostic("E893", SourceLocation(system.origin.topology), what, hint="on_loss: hold")
+                        Diagnostic(
+                            "E893", SourceLocation(system.origin.topology), message, hint="on_loss: hold"
+                        )
                     )
                 if receive.link in zero and receive.before:
-                    what = f"{receive.name}: what stood in for a missing value at the tick before is not kept"
+                    message = (
+                        f"{receive.name}: what stood in for a missing value at the tick before is not kept"
+                    )
                     raise ApcError(
-                        Diagnostic("E893", SourceLocation(system.origin.topology), what, hint="on_loss: hold")
+                        Diagnostic(
+                            "E893", SourceLocation(system.origin.topology), message, hint="on_loss: hold"
+                        )
                     )
 
 
@@ -184,26 +190,26 @@ def build_population(
     Parameters
     ----------
     exchange
-        Who hears whom.
+        The communication graph.
     members
-        What each group brings, in the scene's order.
+        The members of each group, in the model's order.
     routes
         The unreliable links.
 
     Raises
     ------
     ApcError
-        E801 a mean over nobody, E802 a mean whose weights add up to 0.
+        E801 a mean over no peers, E802 a mean whose weights add up to 0.
     """
     schedule = members[0].program.schedule
     columns = np.cumsum([0, *(len(member.program.recorded) * member.count for member in members)]).tolist()
     parts = (part for member in members for part in member.program.layout.parts)
     return Population(
         members=tuple(members),
-        hearing=hearing_of(exchange, members, routes),
+        exchange_program=exchange_program_of(exchange, members, routes),
         quantum=schedule.quantum,
         frame=schedule.frame,
-        marks=len(schedule.marks) - 1,
+        sample_count=len(schedule.sample_times) - 1,
         width=columns[-1],
         columns=tuple(columns[:-1]),
         parts=tuple(dict.fromkeys(parts)),

@@ -1,14 +1,13 @@
-"""One frame of one site as compiled steps, and the peers that take them.
+"""One frame of one site as compiled steps, and the peers that execute them.
 
-Takes: sites' parameters, what each interval does to them, their start values; which of a
-group's different sites each peer is.
+Takes: sites' parameters, the maps of each interval, start values; the site of each peer of a group.
 Gives: `Program`, `Segment`, `Layout`; `GroupProgram`, `build_member`; `timed_events`, `seconds_at`.
-Guarantees: the carry at time 0 is what was never computed, as zero, and the states where they start; what
-many peers have in common is kept once.
-Does not: write the steps (see `writing`), or know the other members (see `frame_packets`, `population`).
+Guarantees: the carry at time 0 has start states, and zeros for values not yet computed. Data common to
+several peers is stored once.
+Does not: write the steps (see `program_builder`), or handle other members (see `exchange_program`,
+`population`).
 
-A segment is what happens between two moments at which packets are exchanged within the frame, or peers look
-at each other pair by pair:
+A segment lies between two instants of packet exchange or pairwise reduction within the frame:
 
     (carry, heard, constants, impulses, frame) -> (carry⁺, sent, rows)
 """
@@ -28,7 +27,7 @@ from apc.compiler.compiled import PeerType
 from apc.frame.jacobians import SubsystemJacobians
 from apc.frame.linearize import start_values
 from apc.frame.schedule import ClockedValue, Event, Propagate, Schedule
-from apc.simulation.pairs import Pairwise
+from apc.simulation.pairwise import Pairwise
 from apc.simulation.propagate import Rates
 from apc.simulation.signals import LocalSignal
 
@@ -39,21 +38,21 @@ Floats = NDArray[np.float64]
 class Layout:
     """The rows of the carry: x, newest outputs, what holds put out, values to act later, work.
 
-    `outputs` are the (clock partition, output) pairs that are remembered or recorded; `later` are values of
-    earlier frames, or of earlier segments, that a hold puts out after; `parts` are those whose work is added
-    up.
+    `outputs` are the (clock partition, output) pairs that are remembered or recorded; `later_values` are
+    values of earlier frames, or of earlier segments, that a hold puts out after; `parts` are those whose work
+    is added up.
     """
 
     states: int
     outputs: tuple[tuple[int, int], ...]
     holds: int
-    later: tuple[ClockedValue, ...]
+    later_values: tuple[ClockedValue, ...]
     parts: tuple[str, ...]
 
     @property
     def ends(self) -> tuple[int, ...]:
-        """Where each of these begins, and the last ends."""
-        sizes = (self.states, len(self.outputs), self.holds, len(self.later), len(self.parts))
+        """The first index of each part, and the end of the last."""
+        sizes = (self.states, len(self.outputs), self.holds, len(self.later_values), len(self.parts))
         return tuple(accumulate(sizes, initial=0))
 
     @property
@@ -63,20 +62,20 @@ class Layout:
 
     @property
     def work(self) -> slice:
-        """The rows that hold the work done so far, in J."""
+        """The rows of the accumulated work, in J."""
         return slice(*self.ends[4:])
 
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """A stretch of the frame: `kernel` is the function above; `heard`, `sent` are rows of the schedule.
+    """A stretch of the frame: `kernel` is the function above; `received`, `sent` are rows of the schedule.
 
-    After those rows the kernel hears what comes of each of `pairs`. Of a frame's rows and impulses its first
-    are `first_mark` and `first_impulse`.
+    After those rows the kernel hears what comes of each of `pairwise`. Of a frame's rows and impulses its
+    first are `first_mark` and `first_impulse`.
     """
 
     kernel: Any  # casadi.Function
-    heard: tuple[int, ...]
+    received: tuple[int, ...]
     pairs: tuple[Pairwise, ...]
     sent: tuple[int, ...]
     first_mark: int
@@ -85,14 +84,14 @@ class Segment:
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """A site's frame. `recorded` are the signals of each row; `timed` says that the frame's number matters.
+    """A subsystem's frame. `recorded` are the signals of each row; `timed`: it depends on the frame number.
 
-    `durations` are the intervals' lengths in quanta, in the order of a site's constants; `intervals` are
+    `durations` are the intervals' lengths in quanta, in the order of a subsystem's constants; `intervals` are
     (start, place in `durations`) of each interval, for the impulses of forces that change with time; `moves`
-    are what segments integrate by, which has to outlive them.
+    are the integrators of the segments, kept alive with them.
     """
 
-    kind: PeerType
+    peer_type: PeerType
     schedule: Schedule
     rates: Rates
     layout: Layout
@@ -109,11 +108,11 @@ class Program:
 
     @property
     def impulse_rows(self) -> int:
-        """How many numbers the impulses of one frame are."""
-        return len(self.rates.pushed) * len(self.intervals) if self.rates.timed else 0
+        """The number of impulse values of one frame."""
+        return len(self.rates.forced) * len(self.intervals) if self.rates.timed else 0
 
     def constants(self, parameters: Floats, transitions: Sequence[Floats]) -> Floats:
-        """Return sites' constants (sites, rows): parameters, then each duration's [E F c], columns first."""
+        """Return constants (subsystems, rows): parameters, then [E F c] of each duration, columns first."""
         columns = self.rates.pattern.T
         return np.concatenate(
             [parameters, *(transition.swapaxes(1, 2)[:, columns] for transition in transitions)], axis=1
@@ -121,7 +120,7 @@ class Program:
 
 
 def timed_events(schedule: Schedule) -> list[tuple[int, Event]]:
-    """Return what happens in a frame, each with its instant in quanta."""
+    """Return the events of a frame, each with its instant in quanta."""
     lengths = [event.duration if isinstance(event, Propagate) else 0 for event in schedule.events]
     return list(zip(accumulate(lengths, initial=0), schedule.events, strict=False))
 
@@ -134,11 +133,11 @@ def seconds_at(schedule: Schedule, frame: Any, now: int) -> Any:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroupProgram:
-    """Peers of one group of the scene in a population.
+    """Peers of one group of the model in a population.
 
-    `peers` (count,) are their numbers in the scene. `rows` (count,) says which of the different sites each
-    is; `parameters` (sites, n_p) are those sites' vectors, `constants` (sites, rows) what their programs
-    take; `sends` is what they send at the start (sites, channels), by link.
+    `peers` (count,) are their numbers in the model. `rows` (count,) is the subsystem index of each;
+    `parameters` (subsystems, n_p) are those subsystems' vectors, `constants` (subsystems, rows) their program
+    constants; `sends` are the values sent at the start (subsystems, channels), by link.
     """
 
     group: int
@@ -148,7 +147,7 @@ class GroupProgram:
     parameters: Floats
     constants: Floats
     sends: Mapping[str, Floats]
-    carry: Floats  # (sites, rows of the carry)
+    carry: Floats  # (subsystems, rows of the carry)
 
     @property
     def count(self) -> int:
@@ -156,14 +155,14 @@ class GroupProgram:
         return len(self.rows)
 
     def each(self, values: Floats) -> Floats:
-        """Return one row a peer of what is one row a site."""
+        """Return one row per peer from one row per subsystem."""
         return np.ascontiguousarray(values[self.rows])
 
 
 def build_member(
     group: int,
     peers: NDArray[np.int64],
-    site: SubsystemJacobians,
+    subsystem: SubsystemJacobians,
     rows: NDArray[np.int64],
     vectors: Floats,
     program: Program,
@@ -174,24 +173,24 @@ def build_member(
     Parameters
     ----------
     group
-        The group's place in the scene.
+        The group's place in the model.
     peers
-        The peers' numbers in the scene (count,).
-    site
-        The group's kind.
+        The peers' numbers in the model (count,).
+    subsystem
+        The group's peer type.
     rows, vectors, transitions
-        Which of the group's different sites each peer is (count,), their parameters (sites, n_p), and what
-        they do over the program's intervals.
+        Which of the group's different subsystems each peer is (count,), their parameters (subsystems, n_p),
+        and what they do over the program's intervals.
     program
-        What each peer does in a frame.
+        The frame program of each peer.
     """
-    used, own = np.unique(rows, return_inverse=True)
-    vector, kind, layout = vectors[used], site.kind, program.layout
-    x, _, remembered = start_values(site, list(vector.T))
+    used, local = np.unique(rows, return_inverse=True)
+    vector, peer_type, layout = vectors[used], subsystem.peer_type, program.layout
+    x, _, stored = start_values(subsystem, list(vector.T))
     carry = np.zeros((len(vector), layout.ends[-1]))
     for row, value in enumerate(x):
         carry[:, row] = value
-    for p, (partition, values) in enumerate(zip(kind.clocks, remembered, strict=True)):
+    for p, (partition, values) in enumerate(zip(peer_type.clocks, stored, strict=True)):
         for output, value in zip(partition.memories, values, strict=True):
             if (p, output) in layout.outputs:  # else its clock never ticks
                 carry[:, layout.states + layout.outputs.index((p, output))] = value
@@ -200,12 +199,12 @@ def build_member(
         group=group,
         peers=peers,
         program=program,
-        rows=own,
+        rows=local,
         parameters=vector,
         constants=program.constants(vector, [transition[used] for transition in transitions]),
         sends={
             send.link: np.asarray(send.send.map(len(vector))(states, still, vector.T, 0.0), np.float64).T
-            for send in kind.sends
+            for send in peer_type.sends
         },
         carry=carry,
     )

@@ -1,4 +1,4 @@
-"""What a site's continuous states do from event to event: the exact transition of a linear partition.
+"""The motion of a subsystem's continuous states between events: exact transitions of linear partitions.
 
 Takes: a `PeerType` and parameter vectors.
 Gives: `Rates`, `rates`, `transition_rows`, `perturbed`; `exact_rates`; `nonlinear_rows`.
@@ -23,10 +23,10 @@ from apc.compiler.compiled import PeerType
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.interpolation import jacobian
 from apc.frame.discretize import discretize
-from apc.frame.exact import evaluate_exact
+from apc.frame.exact_arithmetic import evaluate_exact
+from apc.frame.interval_arithmetic import value_of
 from apc.frame.jacobians import guards_of, structural_pattern
 from apc.frame.parameters import exact_numbers
-from apc.frame.radius import value_of
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -35,61 +35,61 @@ Pattern = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rates:
-    """The continuous equations of a kind, linear in x and u.
+    """The continuous equations of a peer type, linear in x and u.
 
-    `matrices(p)` is [A B g] (n_x, n_x + n_u + 1), column-major, with the part of g that does not change;
-    `timed` says that g changes with time: then g is zero there, and `rate(p, t)` gives it. `pattern` is where
-    a transition [E F c] can differ from zero, whatever the numbers. States that are moved otherwise have no
+    `matrices(p)` is [A B g] (n_x, n_x + n_u + 1), column-major, with the constant part of g. `timed` is
+    whether g is time-varying: then g is zero there and given by `rate(p, t)`. `pattern` is the sparsity
+    pattern of a transition [E F c] for all parameter values. States integrated by another method have no
     entries.
     """
 
-    kind: PeerType
+    peer_type: PeerType
     matrices: Any  # casadi.Function
     rate: Any  # casadi.Function
     timed: bool
     pattern: Pattern  # (n_x, n_x + n_u + 1)
 
     @property
-    def pushed(self) -> Integers:
+    def forced(self) -> Integers:
         """The states that g can move."""
         return np.flatnonzero(self.pattern[:, -1])
 
 
-def nonlinear_rows(kind: PeerType) -> tuple[int, ...]:
+def nonlinear_rows(peer_type: PeerType) -> tuple[int, ...]:
     """Return the states whose equations are not linear, and all that equations tie to them."""
-    moving, _, t, speed = _symbols(kind)
+    moving, _, t, speed = _symbols(peer_type)
     curved = _curved(speed, moving, t)
     if not curved:
         return ()
-    tied = structural_pattern(kind.derivative.jac_sparsity(0, 0))
+    tied = structural_pattern(peer_type.derivative.jac_sparsity(0, 0))
     together = _closure(tied | tied.T)
     return tuple(np.flatnonzero(together[:, curved].any(axis=1)).tolist())
 
 
-def rates(kind: PeerType, moved: Sequence[int] = ()) -> Rates:
-    """Take the linear continuous equations of a kind apart.
+def rates(peer_type: PeerType, moved: Sequence[int] = ()) -> Rates:
+    """Extract the linear continuous equations of a peer type.
 
     Parameters
     ----------
-    kind
-        The kind.
+    peer_type
+        The peer type.
     moved
-        States that are moved otherwise, with all that equations tie to them.
+        States integrated by another method, with all states coupled to them.
 
     Raises
     ------
     ApcError
         E870 the others' equations are not linear.
     """
-    moving, p, t, speed = _symbols(kind)
-    n_x, type_ = len(kind.states), type(moving)
-    own: Pattern = ~np.isin(np.arange(n_x), list(moved))
-    curved = [row for row in _curved(speed, moving, t) if own[row]]
+    moving, p, t, speed = _symbols(peer_type)
+    n_x, type_ = len(peer_type.states), type(moving)
+    local: Pattern = ~np.isin(np.arange(n_x), list(moved))
+    curved = [row for row in _curved(speed, moving, t) if local[row]]
     if curved:
-        raise _nonlinear(kind, curved, speed, moving, p)
-    dm = casadi.sparsify(casadi.diag(casadi.DM(own.astype(float))))
+        raise _nonlinear(peer_type, curved, speed, moving, p)
+    dm = casadi.sparsify(casadi.diag(casadi.DM(local.astype(float))))
     slopes = dm @ jacobian(speed, moving)
-    still = dm @ kind.derivative(type_.zeros(n_x), type_.zeros(len(kind.holds)), p, t)
+    still = dm @ peer_type.derivative(type_.zeros(n_x), type_.zeros(len(peer_type.holds)), p, t)
     if type_ is casadi.MX:  # the same wherever they are taken, but a loop's solution is of somewhere
         at = casadi.Function("slopes", [moving, p, t], [slopes])
         slopes = at(type_.zeros(moving.numel()), p, 0)
@@ -100,16 +100,16 @@ def rates(kind: PeerType, moved: Sequence[int] = ()) -> Rates:
     if type_ is casadi.SX:
         pushed = structural_pattern(casadi.sparsify(still))[:, 0]
     flat = casadi.vec(casadi.horzcat(casadi.densify(slopes), constant))
-    if type_ is casadi.MX:  # which names the symbols of the other rows, even where no value hangs on them
+    if type_ is casadi.MX:  # which includes the symbols of the other rows, even if unused
         flat = casadi.substitute([flat], [moving, t], [type_.zeros(*moving.shape), type_(0)])[0]
     reach = _closure(structure[:, :n_x])
     inputs = np.hstack([structure[:, n_x:], pushed[:, None]])
     return Rates(
-        kind=kind,
+        peer_type=peer_type,
         matrices=casadi.Function("matrices", [p], [flat]),
         rate=casadi.Function("rate", [p, t], [casadi.densify(still)]),
         timed=timed,
-        pattern=np.hstack([reach, (reach.astype(int) @ inputs.astype(int)) > 0]) & own[:, None],
+        pattern=np.hstack([reach, (reach.astype(int) @ inputs.astype(int)) > 0]) & local[:, None],
     )
 
 
@@ -124,20 +124,20 @@ def perturbed(exact: Sequence[Floats], seed: int) -> tuple[Floats, ...]:
         Of the chance.
     """
     chance = np.random.default_rng(seed)
-    ways = (np.where(chance.random(matrix.shape) < 0.5, -np.inf, np.inf) for matrix in exact)
+    directions = (np.where(chance.random(matrix.shape) < 0.5, -np.inf, np.inf) for matrix in exact)
     return tuple(
         np.where(matrix == 0, 0.0, np.nextafter(matrix, towards))
-        for matrix, towards in zip(exact, ways, strict=True)
+        for matrix, towards in zip(exact, directions, strict=True)
     )
 
 
 def exact_rates(rates_of: Rates, parameters: Floats) -> NDArray[Any]:
-    """Return [A B g] (n_x, n_x + n_u + 1) of a site, exact."""
-    kind = rates_of.kind
-    n_x, n_u = len(kind.states), len(kind.holds)
+    """Return [A B g] (n_x, n_x + n_u + 1) of a subsystem, exact."""
+    peer_type = rates_of.peer_type
+    n_x, n_u = len(peer_type.states), len(peer_type.holds)
     if rates_of.matrices.is_a("SXFunction"):
         exact = evaluate_exact(
-            rates_of.matrices, [exact_numbers(kind, np.asarray(parameters, dtype=np.float64))]
+            rates_of.matrices, [exact_numbers(peer_type, np.asarray(parameters, dtype=np.float64))]
         )[0]
     else:
         exact = [Fraction(float(values)) for values in np.asarray(rates_of.matrices(parameters)).ravel()]
@@ -145,17 +145,17 @@ def exact_rates(rates_of: Rates, parameters: Floats) -> NDArray[Any]:
 
 
 def transition_rows(rates_of: Rates, vectors: Floats, durations: Sequence[Fraction]) -> tuple[Floats, ...]:
-    """Return what many sites do in every duration, [E F c] (sites, n_x, n_x + n_u + 1) each.
+    """Return the transitions [E F c] of subsystems, (subsystems, n_x, n_x + n_u + 1) for every duration.
 
-    Sites that differ in nothing the continuous equations read share a transition: each takes half a
+    Subsystems that differ in nothing the continuous equations read share a transition: each takes half a
     millisecond.
 
     Parameters
     ----------
     rates_of
-        The kind's equations.
+        The peer type's equations.
     vectors
-        The sites' parameters (sites, n_p).
+        The subsystems' parameters (subsystems, n_p).
     durations
         In seconds.
 
@@ -166,23 +166,23 @@ def transition_rows(rates_of: Rates, vectors: Floats, durations: Sequence[Fracti
     """
     n_x, width = rates_of.pattern.shape
     flat = np.asarray(rates_of.matrices.map(len(vectors))(vectors.T), np.float64).T
-    one_column_at_least = np.hstack([flat, np.zeros((len(flat), 1))])
-    _, first, which = np.unique(one_column_at_least, axis=0, return_index=True, return_inverse=True)
+    at_least_single_column = np.hstack([flat, np.zeros((len(flat), 1))])
+    _, first, which = np.unique(at_least_single_column, axis=0, return_index=True, return_inverse=True)
     result = [np.empty((len(first), n_x, width)) for _ in durations]
-    for place, row in enumerate(first.tolist()):
+    for index, row in enumerate(first.tolist()):
         whole = exact_rates(rates_of, vectors[row])
         for matrix, step in zip(result, discretize(whole[:, :n_x], whole[:, n_x:], durations), strict=True):
-            matrix[place] = value_of(step)
+            matrix[index] = value_of(step)
     return tuple(matrix[which.reshape(-1)] for matrix in result)
 
 
-def _symbols(kind: PeerType) -> tuple[Any, Any, Any, Any]:
+def _symbols(peer_type: PeerType) -> tuple[Any, Any, Any, Any]:
     """Return (x, u), p and t as symbols, and the rates of change."""
-    type_: Any = casadi.SX if kind.derivative.is_a("SXFunction") else casadi.MX
-    n_x, n_u = len(kind.states), len(kind.holds)
-    moving, p, t = type_.sym("moving", n_x + n_u), type_.sym("p", len(kind.parameters)), type_.sym("t")
+    type_: Any = casadi.SX if peer_type.derivative.is_a("SXFunction") else casadi.MX
+    n_x, n_u = len(peer_type.states), len(peer_type.holds)
+    moving, p, t = type_.sym("moving", n_x + n_u), type_.sym("p", len(peer_type.parameters)), type_.sym("t")
     x, u = casadi.vertsplit(moving, [0, n_x, n_x + n_u])
-    return moving, p, t, kind.derivative(x, u, p, t)
+    return moving, p, t, peer_type.derivative(x, u, p, t)
 
 
 def _curved(speed: Any, moving: Any, t: Any) -> list[int]:
@@ -198,14 +198,14 @@ def _curved(speed: Any, moving: Any, t: Any) -> list[int]:
 
 
 def _closure(a: Pattern) -> Pattern:
-    """Return where exp(A T) can differ from zero: what reaches what, however indirectly."""
+    """Return the sparsity pattern of exp(A T): the transitive closure of that of A."""
     reach = a | np.eye(len(a), dtype=bool)
     for _ in range(max(len(a) - 1, 0).bit_length()):
         reach = (reach.astype(int) @ reach.astype(int)) > 0
     return reach
 
 
-def _nonlinear(kind: PeerType, rows: Sequence[int], speed: Any, moving: Any, p: Any) -> ApcError:
+def _nonlinear(peer_type: PeerType, rows: Sequence[int], speed: Any, moving: Any, p: Any) -> ApcError:
     """Return the mistake that names the states and the parts whose equations are not linear."""
     involved = []
     for row in rows:
@@ -213,16 +213,18 @@ def _nonlinear(kind: PeerType, rows: Sequence[int], speed: Any, moving: Any, p: 
         bends = casadi.jacobian(casadi.jacobian(speed[row], moving).T, moving)
         varies = casadi.vertcat(casadi.vec(bends), *guards)
         reads = casadi.which_depends(varies, p, 1, False) if p.numel() else ()
-        parts = {name.rpartition(".")[0] for name, read in zip(kind.parameters, reads, strict=True) if read}
+        parts = {
+            name.rpartition(".")[0] for name, read in zip(peer_type.parameters, reads, strict=True) if read
+        }
         involved.append(parts - {""})
     shared = set.intersection(*involved) or set.union(*involved)
-    # What moves is named already; the force that moves it is of another part, if of any.
-    shared = shared - {state.name.rpartition(".")[0] for state in kind.states} or shared
+    # The moving variable is already named; its force belongs to another part, if any.
+    shared = shared - {state.name.rpartition(".")[0] for state in peer_type.states} or shared
     through = f" through {' and '.join(sorted(shared))}" if shared else ""
-    names = ", ".join(kind.states[row].name for row in rows)
-    what = (
+    names = ", ".join(peer_type.states[row].name for row in rows)
+    message = (
         f"the motion of {names} is not linear between the ticks{through}: only what is linear "
         "there can be simulated exactly"
     )
     hint = "no --method (what is linear stays exact), or a part that computes its force at ticks of a clock"
-    return ApcError(Diagnostic("E870", SourceLocation(kind.name), what, hint=hint))
+    return ApcError(Diagnostic("E870", SourceLocation(peer_type.name), message, hint=hint))

@@ -1,10 +1,9 @@
-"""How a scene is played: for how long, with what luck, and by which method between events.
+"""Simulation settings: duration, seed, and integration method between events.
 
-Takes: what a command line or a call says, such as `rk4:0.1ms`.
+Takes: the text of an option or argument, such as `rk4:0.1ms`.
 Gives: `Settings`; `Method`, `DEFAULT`, `parse_method`, `finer`, `check_step`.
-Guarantees: two runs of one scene with equal settings are the same run; a step is an exact rational of a
-second.
-Does not: compute any motion (see `propagate`, `flow`, `integrate`), or say what is recorded (see `signals`).
+Guarantees: two runs of one model with equal settings are identical; a step is an exact rational of a second.
+Does not: integrate (see `propagate`, `flow`, `integrate`), or select signals (see `signals`).
 
     exact              the exact transition; refused where an equation is not linear
     rk4:STEP           the classical method of Runge and Kutta, of order 4
@@ -12,8 +11,8 @@ Does not: compute any motion (see `propagate`, `flow`, `integrate`), or say what
                        engines do
     cvodes:RTOL        CVODES of SUNDIALS, variable order and step, to a relative tolerance
 
-Steps end at every event, the last one before it shorter if need be. Without any of these words what is linear
-moves exactly, and what is not by CVODES.
+Steps end at every event, the last one before it shorter if necessary. By default linear equations use the
+exact transition, and nonlinear ones CVODES.
 """
 
 from __future__ import annotations
@@ -22,9 +21,9 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from apc.compiler.compiled import Model
-from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
-from apc.compiler.words import no_more
+from apc.compiler.number_parsing import plain_float
+from apc.compiler.wording import no_more
 
 EXACT, RK4, SEMI_IMPLICIT, CVODES = "exact", "rk4", "semi-implicit", "cvodes"
 WHERE_NEEDED = "exact where linear"
@@ -53,7 +52,7 @@ class Method:
     perturbed: bool = False
 
     def __str__(self) -> str:
-        """Return it as it is written on a command line."""
+        """Return the method in command-line notation."""
         if self.step is not None:
             return f"{self.name}:{1000 * float(self.step):g} ms"
         if self.name == CVODES:
@@ -66,11 +65,11 @@ DEFAULT = Method(WHERE_NEEDED, tolerance=TOLERANCE)
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """How a scene is played.
+    """The settings of a simulation.
 
-    `duration` is in seconds, the last row that of the last tick until then; `method` says how the continuous
-    states move between events; `seed` is of what is random, None for the experiment's own; `jit` says whether
-    to compile to machine code where there is a C compiler.
+    `duration` is in seconds, the last row that of the last tick until then; `method` is the integration
+    method between events; `seed` that of random losses, None for the experiment's; `jit` is whether to
+    compile to machine code if a C compiler exists.
     """
 
     duration: Fraction
@@ -93,54 +92,54 @@ def parse_method(text: str) -> Method:
         E910 no such method, E911 a step that is none, E912 a tolerance that is none.
     """
     name, colon, size = (part.strip() for part in text.partition(":"))
-    place = SourceLocation("--method")
+    location = SourceLocation("--method")
     if name not in EXAMPLES:
         meant = nearest(name, EXAMPLES) or EXACT
         expected = f"one of {', '.join(EXAMPLES)}"
         got = text[:80] or "nothing"
-        raise ApcError(Diagnostic("E910", place, "the method", expected, got, EXAMPLES[meant]))
+        raise ApcError(Diagnostic("E910", location, "the method", expected, got, EXAMPLES[meant]))
     if name == EXACT:
         if colon:
             expected = "exact alone, which has no step"
-            raise ApcError(Diagnostic("E910", place, "the method", expected, text[:80], EXACT))
+            raise ApcError(Diagnostic("E910", location, "the method", expected, text[:80], EXACT))
         return Method(EXACT)
     if name == CVODES:
-        return Method(CVODES, tolerance=_tolerance(size, place))
+        return Method(CVODES, tolerance=_tolerance(size, location))
     # Imported here: the language of quantities, which most runs do not need.
     from apc.compiler.language.units import quantity
 
     if not size:
         expected = "a step"
-        raise ApcError(Diagnostic("E911", place, name, expected, "none", EXAMPLES[name]))
+        raise ApcError(Diagnostic("E911", location, name, expected, "none", EXAMPLES[name]))
     try:
-        step = Fraction(quantity(size, place, what=f"the step of {name}", unit="s").value)
+        step = Fraction(quantity(size, location, subject=f"the step of {name}", unit="s").value)
     except ApcError as error:
         raise ApcError([replace(mistake, hint=EXAMPLES[name]) for mistake in error.mistakes]) from None
     if step <= 0:
         expected, got = "more than 0 s", size[:80]
-        raise ApcError(Diagnostic("E911", place, f"the step of {name}", expected, got, EXAMPLES[name]))
+        raise ApcError(Diagnostic("E911", location, f"the step of {name}", expected, got, EXAMPLES[name]))
     return Method(name, step=step)
 
 
-def _tolerance(text: str, place: SourceLocation) -> float:
+def _tolerance(text: str, location: SourceLocation) -> float:
     try:
         value = plain_float(text)
     except ValueError:
         value = 0.0
     if not TIGHTEST <= value <= LOOSEST:
         expected = f"a number from {TIGHTEST:g} to {LOOSEST:g}"
-        what, got = "the relative tolerance of cvodes", text[:80] or "none"
-        raise ApcError(Diagnostic("E912", place, what, expected, got, EXAMPLES[CVODES]))
+        message, got = "the relative tolerance of cvodes", text[:80] or "none"
+        raise ApcError(Diagnostic("E912", location, message, expected, got, EXAMPLES[CVODES]))
     return value
 
 
 def check_step(system: Model, method: Method, fastest: Fraction, longest: Fraction) -> None:
-    """Refuse a step that the scene has no room for.
+    """Refuse a step that the model has no room for.
 
     Parameters
     ----------
     system
-        The compiled scene.
+        The model.
     method
         The method.
     fastest
@@ -155,14 +154,14 @@ def check_step(system: Model, method: Method, fastest: Fraction, longest: Fracti
     """
     if method.step is None:
         return
-    place, what = SourceLocation(system.origin.topology), f"the step of {method.name}"
+    location, message = SourceLocation(system.origin.topology), f"the step of {method.name}"
     if method.step > fastest:
         expected = f"at most the period of the fastest clock, {_ms(fastest)}"
         hint = f"--method {method.name}:{no_more(1000 * fastest)}ms"
-        raise ApcError(Diagnostic("E913", place, what, expected, _ms(method.step), hint))
+        raise ApcError(Diagnostic("E913", location, message, expected, _ms(method.step), hint))
     if longest / method.step > MOST_STEPS:
         expected = f"at least {_ms(longest / MOST_STEPS)}, a millionth of the time between two events"
-        raise ApcError(Diagnostic("E913", place, what, expected, _ms(method.step)))
+        raise ApcError(Diagnostic("E913", location, message, expected, _ms(method.step)))
 
 
 def _ms(seconds: Fraction) -> str:
@@ -170,7 +169,7 @@ def _ms(seconds: Fraction) -> str:
 
 
 def finer(method: Method, *, all_linear: bool) -> tuple[Method, float]:
-    """Return the method to compare with, and what the error is of the difference from it.
+    """Return the method for comparison, and the ratio of the error to the difference from it.
 
     Halving the step of a method of order n leaves 1/2ⁿ of the error, so that the error is 1/(1 − 1/2ⁿ) of the
     difference (Richardson). A hundredth of the tolerance leaves next to none of it.
@@ -180,7 +179,7 @@ def finer(method: Method, *, all_linear: bool) -> tuple[Method, float]:
     method
         The method whose error is wanted.
     all_linear
-        Whether all equations of the scene are linear between the ticks.
+        Whether all equations of the model are linear between the ticks.
     """
     if method.step is not None:
         return replace(method, step=method.step / 2), 1 / (1 - 0.5 ** ORDERS[method.name])

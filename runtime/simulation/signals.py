@@ -1,12 +1,12 @@
-"""What is recorded of a simulation: what a site has to record, names such as `left[2].cube.x`, the choice.
+"""The signals of a simulation: recordable signals of a subsystem, names such as `left[2].cube.x`, selection.
 
 Takes: a `PeerType` and its `Schedule`; patterns of names.
 Gives: `LocalSignal`, `local_signals`; `Signal`, `SignalSelection`, `choose`, `signals_of`; `sent_states`,
 `ticking_partitions`.
-Guarantees: a value that acts later than it is computed is two signals, any other is one; signals stand by
-group, peer and site, in the scene's order, whatever the order of the patterns; a pattern that fits nothing is
-refused with the nearest name.
-Does not: hold values.
+Guarantees: a value that acts later than it is computed is two signals, any other is one; signals are ordered
+by group, peer and subsystem as in the model, independent of the order of the patterns. A pattern without a
+match is refused with the nearest name.
+Does not: store values.
 """
 
 from __future__ import annotations
@@ -28,61 +28,61 @@ EXAMPLE = "'cube.x', 'left[2].*' or '*.v'"
 
 @dataclass(frozen=True, slots=True)
 class LocalSignal:
-    """Something of a site that can be recorded.
+    """Something of a subsystem that can be recorded.
 
     `role` is "state", "output" (as newly computed), "hold" (acting) or "limited" (of what has a limit and is
-    none of these); `place` is the state, the (clock partition, output), the hold, or the limit.
+    none of these); `index` is the state, the (clock partition, output), the hold, or the limit.
     """
 
     name: str
     unit: str
     role: str
-    place: tuple[int, ...]
+    index: tuple[int, ...]
 
 
-def local_signals(kind: PeerType, schedule: Schedule) -> tuple[LocalSignal, ...]:
-    """Return what can be recorded of a site.
+def local_signals(peer_type: PeerType, schedule: Schedule) -> tuple[LocalSignal, ...]:
+    """Return the recordable signals of a subsystem.
 
-    A value that a hold puts out as soon as it is computed is one signal; one that acts later is two:
-    `contact.f` as newly computed, and `contact.f acting`.
+    A value that takes effect when computed is one signal; one that takes effect later is two: `contact.f` as
+    computed, and `contact.f active_at_start`.
     """
     signals = [
-        LocalSignal(state.name, state.unit, "state", (place,)) for place, state in enumerate(kind.states)
+        LocalSignal(state.name, state.unit, "state", (index,)) for index, state in enumerate(peer_type.states)
     ]
     ticking = ticking_partitions(schedule)
     for p in ticking:
-        partition = kind.clocks[p]
+        partition = peer_type.clocks[p]
         signals += [
             LocalSignal(name, unit, "output", (p, o))
             for o, (name, unit) in enumerate(zip(partition.outputs, partition.units, strict=True))
         ]
-    numbers = {partition.clock: p for p, partition in enumerate(kind.clocks)}
+    numbers = {partition.clock: p for p, partition in enumerate(peer_type.clocks)}
     late = _late_holds(schedule)
-    for h, hold in enumerate(kind.holds):
+    for h, hold in enumerate(peer_type.holds):
         p = numbers[hold.clock]
         if h in late:
-            unit = kind.clocks[p].units[hold.output]
+            unit = peer_type.clocks[p].units[hold.output]
             signals.append(LocalSignal(f"{hold.name} acting", unit, "hold", (h,)))
     signals += [
-        LocalSignal(limit.name, limit.unit, "limited", (place,))
-        for place, limit in enumerate(kind.limits)
+        LocalSignal(limit.name, limit.unit, "limited", (index,))
+        for index, limit in enumerate(peer_type.limits)
         if limit.value is not None
     ]
     return tuple(signals)
 
 
-def sent_states(kind: PeerType) -> tuple[int, ...]:
-    """Return the states, by their places, that a site sends to others as they are."""
+def sent_states(peer_type: PeerType) -> tuple[int, ...]:
+    """Return the states, by their places, that a subsystem sends to others as they are."""
     numbers = []
-    for sending in kind.sends:
+    for sending in peer_type.sends:
         if sending.send.is_a("SXFunction"):
             inputs = sending.send.sx_in()
             channels = sending.send(*inputs)
             numbers += [
-                place
+                index
                 for row in range(channels.numel())
-                for place in range(len(kind.states))
-                if casadi.is_equal(channels[row], inputs[0][place])
+                for index in range(len(peer_type.states))
+                if casadi.is_equal(channels[row], inputs[0][index])
             ]
     return tuple(dict.fromkeys(numbers))
 
@@ -129,10 +129,10 @@ class Signal:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SignalSelection:
-    """What is recorded of a group: `locals`, of every peer; `wanted` (peers, locals) says which are kept."""
+    """The recorded signals of a group: `locals` of every peer, selected by `selected` (peers, locals)."""
 
     locals: tuple[LocalSignal, ...]
-    wanted: NDArray[np.bool_]
+    selected: NDArray[np.bool_]
 
 
 def choose(
@@ -143,9 +143,9 @@ def choose(
     Parameters
     ----------
     system
-        The compiled scene.
+        The model.
     available
-        What can be recorded of a peer of each group.
+        The recordable signals of a peer of each group.
     patterns
         Names with `*` for any text and `?` for any character; without a group they mean every peer's, and
         with a group's name alone every one's of it.
@@ -159,18 +159,18 @@ def choose(
     used: set[str] = set()
     choices = []
     for group, local_signals in zip(system.groups, available, strict=True):
-        wanted = np.full((group.count, len(local_signals)), not patterns)
+        requested = np.full((group.count, len(local_signals)), not patterns)
         for pattern, test in tests:
-            for place, local in enumerate(local_signals):
+            for index, local in enumerate(local_signals):
                 fits = [any(test.fullmatch(text) for text in (local.name, f"{group.name}.{local.name}"))]
                 if not fits[0] and ("[" in pattern or pattern.startswith(("*", group.name))):
                     names = (f"{group.name}[{i + 1}].{local.name}" for i in range(group.count))
                     fits = [bool(test.fullmatch(name)) for name in names]
-                wanted[:, place] |= fits
+                requested[:, index] |= fits
                 used |= {pattern} if any(fits) else set()
-        recorded = np.flatnonzero(wanted.any(axis=0))
-        locals_ = tuple(local_signals[place] for place in recorded.tolist())
-        choices.append(SignalSelection(locals_, np.ascontiguousarray(wanted[:, recorded])))
+        recorded = np.flatnonzero(requested.any(axis=0))
+        locals_ = tuple(local_signals[index] for index in recorded.tolist())
+        choices.append(SignalSelection(locals_, np.ascontiguousarray(requested[:, recorded])))
     for pattern in patterns:
         if pattern not in used:
             _refuse(system, available, pattern)
@@ -183,13 +183,13 @@ def signals_of(system: Model, choices: Sequence[SignalSelection]) -> tuple[Signa
         Signal(group.name, peer + 1, local.name, local.unit, local.role)
         for group, choice in zip(system.groups, choices, strict=True)
         for peer in range(group.count)
-        for place, local in enumerate(choice.locals)
-        if choice.wanted[peer, place]
+        for index, local in enumerate(choice.locals)
+        if choice.selected[peer, index]
     )
 
 
 def _test(pattern: str) -> re.Pattern[str]:
-    """Return what matches a pattern; brackets are part of names."""
+    """Return the matches of a pattern; brackets are part of names."""
     return re.compile(re.escape(pattern.strip()).replace(r"\*", ".*").replace(r"\?", "."))
 
 
@@ -200,6 +200,6 @@ def _refuse(system: Model, available: Sequence[Sequence[LocalSignal]], pattern: 
         for group, local_signals in zip(system.groups, available, strict=True)
         for local in local_signals
     )
-    what = f"no signal fits {pattern[:80]!r}; the signals of a peer are {', '.join(list(names)[:12])}"
+    message = f"no signal fits {pattern[:80]!r}; the signals of a peer are {', '.join(list(names)[:12])}"
     hint = f"--signals {nearest(pattern, names)}" if nearest(pattern, names) else f"names such as {EXAMPLE}"
-    raise ApcError(Diagnostic("E873", SourceLocation(system.origin.topology), what, hint=hint))
+    raise ApcError(Diagnostic("E873", SourceLocation(system.origin.topology), message, hint=hint))

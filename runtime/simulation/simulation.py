@@ -1,9 +1,10 @@
-"""A scene made ready to be played in time: all peers, what they hear, what is recorded, who plays them.
+"""Preparation of a simulation: all peers, their exchange, recorded signals, and the engine.
 
 Takes: a `Model`, its `Settings`, the signals wanted.
-Gives: `Simulation`, `prepare`; `check_length`, `size_note`, what it will come to.
-Guarantees: time is counted in whole quanta; what would not fit the memory is refused before it is built.
-Does not: play it (see `blocks`).
+Gives: `SimulationPlan`, `plan_of`; `Simulation`, `prepare`; `check_length`, `size_note`, its expected size.
+Guarantees: time is an integer number of quanta. A simulation that would exceed the memory is refused before
+it is built.
+Does not: run it (see `output_blocks`).
 """
 
 from __future__ import annotations
@@ -20,21 +21,22 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.timings import part
-from apc.compiler.words import no_more
-from apc.frame.ages import stamped
-from apc.frame.exchange import CommunicationGraph, build_exchange
-from apc.frame.finite_equations import finite_equations
+from apc.compiler.wording import no_more
+from apc.frame.communication_graph import CommunicationGraph, build_exchange
+from apc.frame.data_age import stamped
+from apc.frame.evaluation_errors import finite_equations
 from apc.frame.jacobians import SubsystemJacobians, jacobians
 from apc.frame.parameters import ResolvedNumbers, resolve
 from apc.frame.schedule import Propagate, Schedule
 from apc.frame.scheduling import build_schedules
 from apc.memory import refuse_beyond
-from apc.network.nominal import refuse_range
-from apc.network.timetable import ArrivalProcess, Route, Timetable, luck_of, routes_of
+from apc.network.nominal_criterion import refuse_range
+from apc.network.packet_schedule import ArrivalProcess, Route, Timetable, arrival_process_of, routes_of
+from apc.simulation.compiled_engine import CompiledEngine, LoadedLibrary, library_of
 from apc.simulation.flow import Flow, Tolerance, flow_of, rows_to_move, state_scales
-from apc.simulation.forcing import SubsystemForcing, site_forcing
-from apc.simulation.machine import CompiledEngine, LoadedLibrary, library_of
-from apc.simulation.pairs import count_pairs
+from apc.simulation.forcing import SubsystemForcing, subsystem_forcing
+from apc.simulation.interpreted_engine import InterpretedEngine
+from apc.simulation.pairwise import count_pairs
 from apc.simulation.population import (
     FrameEngine,
     Population,
@@ -44,6 +46,7 @@ from apc.simulation.population import (
     refuse_unheard_of,
 )
 from apc.simulation.program import GroupProgram, Program, build_member
+from apc.simulation.program_builder import build_program
 from apc.simulation.propagate import perturbed, rates, transition_rows
 from apc.simulation.settings import CVODES, EXACT, WHERE_NEEDED, Method, Settings, check_step
 from apc.simulation.signals import (
@@ -54,8 +57,6 @@ from apc.simulation.signals import (
     sent_states,
     signals_of,
 )
-from apc.simulation.stepwise import InterpretedEngine
-from apc.simulation.writing import build_program
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -63,7 +64,7 @@ Integers = NDArray[np.int64]
 # Numbers that one call of a player takes and gives out, at most, if a frame has fewer: 4 MiB stay in the
 # machine's caches.
 CHUNK = 2**19
-ROW = Fraction(1, 1000)  # seconds from row to row of a scene in which nothing ticks
+ROW = Fraction(1, 1000)  # seconds from row to row of a model in which nothing ticks
 MOST_FRAMES = 2000  # of one chunk: what has left the range of floats is noticed at its end
 NUMBERS_A_PAIR = 16  # what one peer looks at of itself and of another, mostly
 NUMBER = 64  # bytes of a number of all peers' frame, with what CasADi copies
@@ -72,7 +73,7 @@ NUMBER = 64  # bytes of a number of all peers' frame, with what CasADi copies
 # hours. At 1 kHz it is eleven days of simulated time.
 MOST_ROWS = 10**9
 
-# A file larger than this is told of beforehand: 1 GB.
+# File size from which a note is printed beforehand: 1 GB.
 LARGE = 10**9
 
 # Bytes of a number: as a float, and in decimal with the comma, mostly.
@@ -81,16 +82,16 @@ BINARY, DECIMAL = 8, 20
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Simulation:
-    """A scene ready to be played.
+    """A topology ready to be played.
 
     `signals` are the columns of what comes out, the `order` (signals,) of which in a row of the population is
-    another; `marks` the instants of a frame's rows, in quanta, the first of which makes a row at time 0 only
-    unless `ticks_at_zero`; `forces` are those that change with time, of each member's different sites.
-    `lucks` are what chance does on the unreliable links, `seed` is what it begins from: that of the settings,
-    or of the experiment. `library` is the machine code, None if there is none. `length` frames are played at
-    a time.
-    `topology` is the system as it was given, without stamps on its packets (see `ages.stamped`).
-    `tolerances` are of the states that CVODES moves, `sent` the names of those that peers send as they are.
+    another; `sample_times` the instants of a frame's rows, in quanta, the first of which makes a row at time
+    0 only unless `ticks_at_zero`; `forces` are those that change with time, of each member's different
+    subsystems. `arrival_processes` are what chance does on the unreliable links, `seed` is what it begins
+    from: that of the settings, or of the experiment. `library` is the machine code, None if there is none.
+    `length` frames are played at a time. `topology` is the system as it was given, without stamps on its
+    packets (see `data_age.stamped`). `tolerances` are of the states that CVODES moves, `sent` the names of
+    those that peers send as they are.
     """
 
     system: Model
@@ -100,20 +101,20 @@ class Simulation:
     signals: tuple[Signal, ...]
     order: Integers
     forces: tuple[tuple[SubsystemForcing, ...], ...]
-    lucks: tuple[ArrivalProcess, ...]
+    arrival_processes: tuple[ArrivalProcess, ...]
     seed: int
     tolerances: tuple[Tolerance, ...]
     sent: tuple[str, ...]
     quantum: Fraction
     frame: int
-    marks: tuple[int, ...]
+    sample_times: tuple[int, ...]
     ticks_at_zero: bool
     library: LoadedLibrary | None
     length: int
 
     @property
     def how(self) -> str:
-        """The method in words of a command line; what is exact throughout is called so."""
+        """The method in command-line notation; "exact" if exact throughout."""
         method = self.settings.method
         if method.name != WHERE_NEEDED:
             return str(method)
@@ -121,13 +122,13 @@ class Simulation:
 
     @property
     def rows(self) -> int:
-        """How many rows there are at most: those of whole frames."""
-        return (int(self.settings.duration / self.quantum) // self.frame + 1) * len(self.marks)
+        """The largest number of rows: that of complete frames."""
+        return (int(self.settings.duration / self.quantum) // self.frame + 1) * len(self.sample_times)
 
     def player(self) -> FrameEngine:
-        """Return what plays it, with memory of its own."""
-        routes = self.population.hearing.routes
-        timetable = partial(Timetable, routes, self.lucks, seed=self.seed)
+        """Return the engine, with separate memory."""
+        routes = self.population.exchange_program.routes
+        timetable = partial(Timetable, routes, self.arrival_processes, seed=self.seed)
         packets = (lambda run: timetable(run=run)) if routes else None
         if self.library is not None:
             return CompiledEngine(self.library, self.population, packets)
@@ -142,24 +143,24 @@ def prepare(
     signals: Sequence[str] = (),
     live: bool = False,
 ) -> Simulation:
-    """Do what comes before the first instant.
+    """Prepare a simulation up to the first instant.
 
     Parameters
     ----------
     system
-        The compiled scene.
+        The model.
     settings
-        How it is played.
+        The simulation settings.
     signals
         Patterns of the signals to record, all if there is none; see `signals.choose`.
     live
-        Whether it will be played instant by instant, as what is heard at one is known no sooner.
+        Whether it is executed instant by instant, with packets that become available only then.
 
     Raises
     ------
     ApcError
-        E870 a continuous equation is not linear and the method is exact, E873 a pattern fits nothing, E874
-        the peers are too many, E893 a peer has nothing of its own to stand in for a missing packet, E899 a
+        E870 a continuous equation is not linear and the method is exact, E873 a pattern without a match, E874
+        the peers are too many, E893 a peer has no own value as the substitute for a missing packet, E899 a
         delay is a range, E913 a step that does not fit; and those of `build_schedules`, `build_population`
         and `routes_of`.
     """
@@ -173,7 +174,7 @@ def prepare(
         members = _members(plan, choices, settings.method, live=live)
         population = build_population(plan.exchange, members, plan.routes)
     schedule, listed = plan.schedules[0], signals_of(system, choices)
-    marks = schedule.marks[:-1]
+    sample_times = schedule.sample_times[:-1]
     timings, quantum = plan.numbers.timings, schedule.quantum
     return Simulation(
         system=system,
@@ -183,13 +184,19 @@ def prepare(
         signals=listed,
         order=_order(system, population, listed),
         forces=tuple(_forces(member) for member in members),
-        lucks=tuple(luck_of(system, timings, plan.exchange, route, quantum) for route in plan.routes),
+        arrival_processes=tuple(
+            arrival_process_of(system, timings, plan.exchange, route, quantum) for route in plan.routes
+        ),
         seed=system.experiment.seed if settings.seed is None else settings.seed,
         tolerances=_tolerances(system, plan.flows),
-        sent=tuple(dict.fromkeys(kind.states[i].name for kind in system.kinds for i in sent_states(kind))),
+        sent=tuple(
+            dict.fromkeys(
+                peer_type.states[i].name for peer_type in system.peer_types for i in sent_states(peer_type)
+            )
+        ),
         quantum=quantum,
         frame=schedule.frame,
-        marks=marks,
+        sample_times=sample_times,
         ticks_at_zero=_ticks_at_zero(system, plan.numbers),
         library=library_of(population) if settings.jit else None,
         length=_chunk_length(population, settings.duration),
@@ -202,11 +209,11 @@ def check_length(system: Model, duration: Fraction, *, runs: int = 1) -> None:
     Parameters
     ----------
     system
-        The compiled scene.
+        The model.
     duration
-        How long, in seconds.
+        The duration in seconds.
     runs
-        How often.
+        The number of runs.
 
     Raises
     ------
@@ -227,16 +234,19 @@ def check_length(system: Model, duration: Fraction, *, runs: int = 1) -> None:
 
 
 def size_note(simulation: Simulation, *, decimal: bool) -> str:
-    """Return what to tell of a file of all rows, "" if it is small enough not to mention it.
+    """Return a note on the size of a file of all rows, "" if it is small.
 
     Parameters
     ----------
     simulation
-        The scene, ready.
+        The prepared simulation.
     decimal
-        Whether the file is a text.
+        Whether the file is text.
     """
-    rows, columns = simulation.rows - len(simulation.marks), len(simulation.signals) + 1  # of whole frames
+    rows, columns = (
+        simulation.rows - len(simulation.sample_times),
+        len(simulation.signals) + 1,
+    )  # of whole frames
     size = rows * columns * (DECIMAL if decimal else BINARY)
     if size < LARGE:
         return ""
@@ -245,49 +255,51 @@ def size_note(simulation: Simulation, *, decimal: bool) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulationPlan:
-    """What the peers of a scene do in a frame, before a function of it is built.
+    """The events of a frame of all peers, before functions are built.
 
-    `sites` are the Jacobians of each kind, `flows` what the method moves of it, `schedules` what happens in a
-    frame of each group; `routes` are what is heard over unreliable links.
+    `subsystems` are the Jacobians of each peer type, `flows` its equations for the method, `schedules` the
+    events of each group's frame; `routes` are the receptions over unreliable links.
     """
 
     system: Model
     numbers: ResolvedNumbers
     exchange: CommunicationGraph
-    sites: tuple[SubsystemJacobians, ...]
+    subsystems: tuple[SubsystemJacobians, ...]
     flows: tuple[Flow | None, ...]
     routes: tuple[Route, ...]
     schedules: tuple[Schedule, ...]
 
 
 def plan_of(system: Model, method: Method) -> SimulationPlan:
-    """Find out what happens in a frame, and refuse what can't be played.
+    """Determine the events of a frame, and refuse models that cannot be simulated.
 
-    The plan's system is `stamped`: where ages are asked for, packets say when they were sent.
+    The plan's system is `stamped`: if ages are recorded, packets contain their time of sending.
     """
     system = stamped(system)
     numbers = resolve(system)
-    sites = tuple(jacobians(kind) for kind in system.kinds)
-    flows = tuple(_flow(system, numbers, place, site, method) for place, site in enumerate(sites))
+    subsystems = tuple(jacobians(peer_type) for peer_type in system.peer_types)
+    flows = tuple(
+        _flow(system, numbers, index, subsystem, method) for index, subsystem in enumerate(subsystems)
+    )
     exchange = build_exchange(system, numbers.timings)
-    patterns = [site.pattern for site in sites]
+    patterns = [subsystem.pattern for subsystem in subsystems]
     schedules = build_schedules(system, numbers.timings, patterns)
     routes = routes_of(system, numbers.timings, exchange, schedules[0].frame_s)
     if routes:
-        kept = {route.link: route.frames for route in routes}
-        schedules = build_schedules(system, numbers.timings, patterns, kept=kept)
+        stored = {route.link: route.frames for route in routes}
+        schedules = build_schedules(system, numbers.timings, patterns, stored=stored)
     if not system.clocks:  # then there is one interval, of any length
         schedules = tuple(replace(schedule, quantum=ROW / schedule.frame) for schedule in schedules)
     _check_size(system, exchange, schedules)
     _check_step(system, numbers, schedules, method)
-    return SimulationPlan(system, numbers, exchange, sites, flows, routes, schedules)
+    return SimulationPlan(system, numbers, exchange, subsystems, flows, routes, schedules)
 
 
 def _choices(plan: SimulationPlan, signals: Sequence[str]) -> tuple[SignalSelection, ...]:
-    """Return what is recorded of each group; refuse more than fits the memory."""
+    """Return the recorded signals of each group; refuse more than fits the memory."""
     system = plan.system
     available = [
-        local_signals(system.kinds[group.kind], schedule)
+        local_signals(system.peer_types[group.peer_type], schedule)
         for group, schedule in zip(system.groups, plan.schedules, strict=True)
     ]
     choices = choose(system, available, signals)
@@ -298,9 +310,12 @@ def _choices(plan: SimulationPlan, signals: Sequence[str]) -> tuple[SignalSelect
 def _members(
     plan: SimulationPlan, choices: Sequence[SignalSelection], method: Method, *, live: bool
 ) -> list[GroupProgram]:
-    """Return the groups as members of a population, those peers that are recorded apart from the others."""
+    """Return the groups as members of a population, recorded peers separate from the others."""
     system, numbers, flows = plan.system, plan.numbers, plan.flows
-    linear = [rates(kind, flow.rows if flow else ()) for kind, flow in zip(system.kinds, flows, strict=True)]
+    linear = [
+        rates(peer_type, flow.rows if flow else ())
+        for peer_type, flow in zip(system.peer_types, flows, strict=True)
+    ]
     cuts = instants_within(plan.schedules) if live else exchanges_within(plan.schedules)
     programs: dict[Any, Program] = {}
     members = []
@@ -308,46 +323,50 @@ def _members(
     for group, (item, schedule, choice) in enumerate(groups):
         rows, vectors = numbers.rows[group], numbers.parameters[group]
         moves: Sequence[Floats] | None = None
-        is_recorded = choice.wanted.any(axis=1)
+        is_recorded = choice.selected.any(axis=1)
         for which, recorded in ((is_recorded, choice.locals), (~is_recorded, ())):
             peers = np.flatnonzero(which)
             if not len(peers):
                 continue
-            key = (item.kind, id(schedule), recorded)
+            key = (item.peer_type, id(schedule), recorded)
             if key not in programs:
-                programs[key] = build_program(linear[item.kind], schedule, recorded, cuts, flows[item.kind])
-            if moves is None:  # what the different sites of a group do over every interval
-                moves = transition_rows(linear[item.kind], vectors, programs[key].seconds)
+                programs[key] = build_program(
+                    linear[item.peer_type], schedule, recorded, cuts, flows[item.peer_type]
+                )
+            if moves is None:  # transitions of a group's subsystems over every interval
+                moves = transition_rows(linear[item.peer_type], vectors, programs[key].seconds)
                 moves = perturbed(moves, 0) if method.perturbed else moves
-            numbered, site = plan.exchange.starts[group] + peers, plan.sites[item.kind]
-            members.append(build_member(group, numbered, site, rows[peers], vectors, programs[key], moves))
+            numbered, subsystem = plan.exchange.starts[group] + peers, plan.subsystems[item.peer_type]
+            members.append(
+                build_member(group, numbered, subsystem, rows[peers], vectors, programs[key], moves)
+            )
     return members
 
 
 def _chunk_length(population: Population, duration: Fraction) -> int:
-    """Return how many frames to play at once: equal chunks, none larger than need be."""
+    """Return the number of frames per block: equal blocks, none larger than necessary."""
     frames = int(duration / (population.frame * population.quantum)) + 1
     pushed = sum(member.program.impulse_rows * len(member.parameters) for member in population.members)
-    seen = sum(route.ticks * len(route.pairs) for route in population.hearing.routes)
-    numbers = population.marks * population.width + pushed + seen
+    observed = sum(route.ticks * len(route.pairs) for route in population.exchange_program.routes)
+    numbers = population.sample_count * population.width + pushed + observed
     most = max(1, min(MOST_FRAMES, CHUNK // max(1, numbers), frames))
     return -(-frames // -(-frames // most))
 
 
 def _order(system: Model, population: Population, signals: Sequence[Signal]) -> Integers:
-    """Return where each signal stands in a row of a population."""
+    """Return the index of each signal in a row of a population."""
     starts = np.cumsum([0] + [group.count for group in system.groups])
     column_of = {
-        (system.groups[member.group].name, peer, local.name): column + place * member.count + i
+        (system.groups[member.group].name, peer, local.name): column + index * member.count + i
         for member, column in zip(population.members, population.columns, strict=True)
-        for place, local in enumerate(member.program.recorded)
+        for index, local in enumerate(member.program.recorded)
         for i, peer in enumerate((member.peers - starts[member.group] + 1).tolist())
     }
     return np.array([column_of[signal.group, signal.peer, signal.local] for signal in signals], np.int64)
 
 
 def _ticks_at_zero(system: Model, numbers: ResolvedNumbers) -> bool:
-    """Say whether the fastest clock ticks at time 0."""
+    """Return whether the fastest clock ticks at time 0."""
     if not system.clocks:
         return True
     fastest = min(system.clocks, key=lambda clock: numbers.timings[clock.period])
@@ -360,49 +379,51 @@ def _check_size(
     schedules: Sequence[Schedule],
     choices: Sequence[SignalSelection] = (),
 ) -> None:
-    """Refuse so many peers, or so many of them recorded, that one frame of them would not fit the memory."""
+    """Refuse too many peers, or too many recorded peers, for one frame to fit the memory."""
     total = sum(
-        int(choice.wanted.any(axis=1).sum()) * len(choice.locals) * len(schedule.marks)
+        int(choice.selected.any(axis=1).sum()) * len(choice.locals) * len(schedule.sample_times)
         for choice, schedule in zip(choices, schedules, strict=bool(choices))
     )
     for group, schedule in zip(system.groups, schedules, strict=True):
-        kind = system.kinds[group.kind]
+        peer_type = system.peer_types[group.peer_type]
         lengths = 2  # of intervals, mostly
-        own = len(kind.parameters) + lengths * len(kind.states) * (len(kind.states) + len(kind.holds) + 1)
-        total += group.count * (own + sum(schedule.depths))
+        local = len(peer_type.parameters) + lengths * len(peer_type.states) * (
+            len(peer_type.states) + len(peer_type.holds) + 1
+        )
+        total += group.count * (local + sum(schedule.depths))
     total += NUMBERS_A_PAIR * count_pairs(system, exchange)
-    what = f"{system.peers:,} peers hold {total:,} numbers in a frame, which"
+    message = f"{system.peers:,} peers hold {total:,} numbers in a frame, which"
     refuse_beyond(
         NUMBER * total,
         "E874",
         SourceLocation(system.origin.topology),
-        what,
+        message,
         "fewer peers, or fewer --signals",
     )
 
 
 def _flow(
-    system: Model, numbers: ResolvedNumbers, place: int, site: SubsystemJacobians, method: Method
+    system: Model, numbers: ResolvedNumbers, index: int, subsystem: SubsystemJacobians, method: Method
 ) -> Flow | None:
-    """Return what the method moves of a kind, None if that is nothing."""
-    kind = system.kinds[place]
-    rows = rows_to_move(kind, method)
+    """Return the equations of a peer type that the method integrates, None if none."""
+    peer_type = system.peer_types[index]
+    rows = rows_to_move(peer_type, method)
     if not rows:
         return None
     vectors = [
         vector
         for group, parameter in zip(system.groups, numbers.parameters, strict=True)
-        if group.kind == place
+        if group.peer_type == index
         for vector in parameter
     ]
-    return flow_of(kind, method, rows, state_scales(system, kind, site, vectors))
+    return flow_of(peer_type, method, rows, state_scales(system, peer_type, subsystem, vectors))
 
 
 def _tolerances(system: Model, flows: Sequence[Flow | None]) -> tuple[Tolerance, ...]:
-    """Return the tolerances of all states, each state of several kinds once, with the smallest."""
+    """Return the tolerances of all states, each state of several peer types once, with the smallest."""
     result: dict[str, Tolerance] = {}
-    for kind, flow in zip(system.kinds, flows, strict=True):
-        for tolerance in flow.tolerances(kind) if flow else ():
+    for peer_type, flow in zip(system.peer_types, flows, strict=True):
+        for tolerance in flow.tolerances(peer_type) if flow else ():
             if tolerance.state not in result or tolerance.absolute < result[tolerance.state].absolute:
                 result[tolerance.state] = tolerance
     return tuple(result.values())
@@ -422,8 +443,10 @@ def _check_step(
 
 
 def _forces(member: GroupProgram) -> tuple[SubsystemForcing, ...]:
-    """Return the forces that change with time on each different site of a group; none if none does."""
+    """Return the forces that change with time on each different subsystem of a group; none if none does."""
     program = member.program
     if not program.impulse_rows:
         return ()
-    return tuple(site_forcing(program.rates, parameter, program.seconds) for parameter in member.parameters)
+    return tuple(
+        subsystem_forcing(program.rates, parameter, program.seconds) for parameter in member.parameters
+    )

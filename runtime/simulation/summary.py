@@ -1,4 +1,4 @@
-"""What a simulated motion amounts to, in numbers and a word: verdict, settling time, frequency, extremes.
+"""Summary of a simulated motion: verdict, settling time, frequency, extremes.
 
 Takes: the rows of a simulation, as they come. Gives: `SummaryAccumulator`, `Summary`, `SignalRange`,
 `Broken`; `agreed`.
@@ -45,13 +45,13 @@ from apc.analysis.analysis import Analysis, analyze
 from apc.compiler.compiled import ANGLES, LENGTH, Group, Model
 from apc.compiler.errors import ApcError
 from apc.frame.jacobians import jacobians
-from apc.network.nominal import unreliable
+from apc.network.nominal_criterion import unreliable
 from apc.simulation.decay import Fit, fit_motion
 from apc.simulation.driven import driven_until
-from apc.simulation.rows_in_time import OutputBlock
+from apc.simulation.motion_classes import MotionVerdict
+from apc.simulation.output_blocks import OutputBlock
 from apc.simulation.signals import Signal
 from apc.simulation.simulation import Simulation
-from apc.simulation.verdicts import MotionVerdict
 from apc.verdict import StabilityVerdict
 
 Floats = NDArray[np.float64]
@@ -100,14 +100,14 @@ class SignalRange:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """A simulation in numbers, SI.
+    """A summary of a simulation, in SI units.
 
     `verdict` is one of those above; `reason` is why it is not determined. `settled` is the settling time in
     s, at most `settled_error` too large. `fit` is that of the last part of the motion, `oscillating` the name
     of the position of its oscillation. `driven_until` is the last time in s at which an equation changed with
     time alone. `overshoot` is a part of the step from first to last. `copies` are (name, distance at the end)
-    of what is sent to the others as it is. `work` is (part, J). `broken` are the limits that recorded signals
-    went beyond, the first one first. `unrecorded` positions of the scene were not evaluated.
+    of states sent unchanged. `work` is (part, J). `broken` are the exceeded limits of recorded signals, in
+    order of time. `unrecorded` positions of the model were not evaluated.
     """
 
     verdict: MotionVerdict
@@ -135,12 +135,12 @@ class SummaryAccumulator:
     """Evaluates a simulation's rows as they pass and keeps extremes, group by group of rows."""
 
     def __init__(self, simulation: Simulation, until: float | None = None) -> None:
-        """Begin before the first row of what is played.
+        """Initialize before the first simulated row.
 
         Parameters
         ----------
         simulation
-            What is played.
+            The simulation.
         until
             Its `driven_until`, if that is known already.
         """
@@ -157,8 +157,8 @@ class SummaryAccumulator:
         self.low, self.high = np.full((groups, n), np.inf), np.full((groups, n), -np.inf)
         self.ends = np.zeros(groups)
         self.fitted = self.positions[:: -(-len(self.positions) // MOST_FITTED) or 1]
-        kept = min(simulation.rows, MOST_EXTREMES // max(len(self.fitted), 1))
-        self.samples, self.instants = np.zeros((kept, len(self.fitted))), np.zeros(kept)
+        stored = min(simulation.rows, MOST_EXTREMES // max(len(self.fitted), 1))
+        self.samples, self.instants = np.zeros((stored, len(self.fitted))), np.zeros(stored)
         self.first, self.last = np.zeros(n), np.zeros(n)
         self.peak, self.peak_at = np.full(n, -1.0), np.zeros(n)
         self.beyond = np.full(len(self.limits), np.nan)
@@ -172,9 +172,9 @@ class SummaryAccumulator:
             self.first = values[0].copy()
         self.last = values[-1].copy()
         group = (self.rows + np.arange(len(time))) // self.width
-        place = (self.rows + np.arange(len(time)))[-len(self.samples) :] % len(self.samples)
-        self.samples[place] = values[-len(self.samples) :, self.fitted]
-        self.instants[place] = time[-len(self.samples) :]
+        index = (self.rows + np.arange(len(time)))[-len(self.samples) :] % len(self.samples)
+        self.samples[index] = values[-len(self.samples) :, self.fitted]
+        self.instants[index] = time[-len(self.samples) :]
         self.rows += len(time)
         touched, starts = np.unique(group, return_index=True)
         self.low[touched] = np.minimum(self.low[touched], np.minimum.reduceat(values, starts))
@@ -191,7 +191,7 @@ class SummaryAccumulator:
         self.beyond[began] = time[over.argmax(axis=0)[began]]
 
     def summary(self, block: OutputBlock) -> Summary:
-        """Return what the rows amount to; `block` is the last."""
+        """Return the summary of the rows; `block` is the last."""
         assert self.rows, "a simulation has a row at time 0"
         number = (self.rows - 1) // self.width + 1
         low, high, ends = self.low[:number], self.high[:number], self.ends[:number]
@@ -218,7 +218,7 @@ class SummaryAccumulator:
         if largest >= 0:
             force = signals[largest].name, float(self.peak[largest]), float(self.peak_at[largest])
         row = float(ends[-1] - ends[-2]) / self.width if number > 2 and self.width > 1 else 0.0
-        oscillating = signals[self.fitted[fit.oscillation.place]].name if fit and fit.oscillation else ""
+        oscillating = signals[self.fitted[fit.oscillation.index]].name if fit and fit.oscillation else ""
         return Summary(
             verdict=verdict,
             reason=reason,
@@ -232,7 +232,7 @@ class SummaryAccumulator:
             overshoot=_overshoot(moved) if all_settled else None,
             largest_force=force,
             copies=self._copies(),
-            # Of a motion without bound the work is as meaningless as it is large.
+            # The work of an unbounded motion is meaningless.
             work=() if block.stopped else work,
             rows=self.rows,
             signals=len(signals),
@@ -281,29 +281,29 @@ class SummaryAccumulator:
 
     def _fit(self, span: Floats, end: float) -> Fit | None:
         """Return the fit of the rows kept after the last change with time, None where there is none."""
-        kept = np.arange(max(self.rows - len(self.samples), 0), self.rows) % len(self.samples)
-        kept = kept[self.instants[kept] >= self.until]
-        if len(kept) < 2 or not self.fitted:
+        stored = np.arange(max(self.rows - len(self.samples), 0), self.rows) % len(self.samples)
+        stored = stored[self.instants[stored] >= self.until]
+        if len(stored) < 2 or not self.fitted:
             return None
         # Lengths are compared with lengths, angles with angles.
         units = np.array([self.signals[i].unit for i in self.fitted])
         scale = np.zeros(len(self.fitted))
         for unit in dict.fromkeys(units.tolist()):
             scale[units == unit] = span[self.fitted][units == unit].max()
-        step = float(self.instants[kept[-1]] - self.instants[kept[0]]) / (len(kept) - 1)
-        return fit_motion(step, self.samples[kept], scale)
+        step = float(self.instants[stored[-1]] - self.instants[stored[0]]) / (len(stored) - 1)
+        return fit_motion(step, self.samples[stored], scale)
 
     def _copies(self) -> tuple[tuple[str, float], ...]:
-        """Return the distance at the end between the peers' copies of each state that is sent as it is."""
+        """Return the final distance between the peers' copies of each state that is sent unchanged."""
         copies = []
         for name in self.simulation.sent:
-            places = [
+            indices = [
                 i
                 for i, signal in enumerate(self.signals)
                 if signal.local == name and signal.unit in POSITIONS
             ]
-            if len(places) > 1:
-                copies.append((name, float(np.ptp(self.last[places]))))
+            if len(indices) > 1:
+                copies.append((name, float(np.ptp(self.last[indices]))))
         return tuple(copies)
 
     def _broken(self) -> tuple[Broken, ...]:
@@ -331,7 +331,7 @@ def _limits(system: Model, signals: Sequence[Signal]) -> list[tuple[int, str, fl
     limits = {
         (group.name, limit.name): limit.limit
         for group in system.groups
-        for limit in system.kinds[group.kind].limits
+        for limit in system.peer_types[group.peer_type].limits
     }
     return [
         (column, name, _number(groups[signal.group], signal.peer, name, common))
@@ -365,11 +365,11 @@ def agreed(summary: Summary, system: Model) -> Summary:
         or system.peers > MOST_LINEAR
     ):
         return summary
-    if not all(jacobians(kind).affine for kind in system.kinds) or unreliable(system):
+    if not all(jacobians(peer_type).affine for peer_type in system.peer_types) or unreliable(system):
         return summary
     try:
         analysis = analyze(system)
-    except ApcError:  # what can't be analysed can be simulated
+    except ApcError:  # models that cannot be analyzed can be simulated
         return summary
     if driven:
         if analysis.stable is not False or analysis.verdict is StabilityVerdict.DRIFTS:
@@ -407,9 +407,9 @@ def is_position(signal: Signal) -> bool:
 
 
 def _positions(system: Model) -> int:
-    """Return how many positions there are in a scene."""
-    each = [sum(state.unit in POSITIONS for state in kind.states) for kind in system.kinds]
-    return sum(group.count * each[group.kind] for group in system.groups)
+    """Return the number of positions in a model."""
+    each = [sum(state.unit in POSITIONS for state in peer_type.states) for peer_type in system.peer_types]
+    return sum(group.count * each[group.peer_type] for group in system.groups)
 
 
 def _overshoot(extents: Sequence[SignalRange]) -> tuple[str, float] | None:

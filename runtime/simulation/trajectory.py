@@ -1,8 +1,11 @@
-"""A scene played in time, as a person gets it: rows, columns with names and units, and what made them.
+"""The result of a simulation for the user: rows, columns with names and units, and provenance.
 
-Takes: a `Simulation`. Gives: `SimulationReport`, `Trajectory`, `Provenance`, `provenance_of`, `simulate`.
-Guarantees: no number is NaN or infinite; what diverges is kept up to the last finite row, and says so.
-Does not: write files, or draw (see `present`).
+Takes: a `Simulation`. Gives: `simulate`, `run_simulation`; `Trajectory`, `trajectory_of`, `SimulationReport`,
+`Provenance`, `provenance_of`; `Sink`, `Keeper`, where rows are stored; `parse_duration`, `duration_of`,
+`parameters_of`, `texts_of`.
+Guarantees: no number is NaN or infinite; a diverging simulation is kept up to the last finite row, and
+reported.
+Does not: write files, or draw (see `output`).
 """
 
 from __future__ import annotations
@@ -25,7 +28,7 @@ from apc.option_value import option_value
 from apc.result import PlotStyle, Result
 from apc.simulation.accuracy import ErrorEstimate, compare_with
 from apc.simulation.flow import Tolerance
-from apc.simulation.rows_in_time import OutputBlock, blocks
+from apc.simulation.output_blocks import OutputBlock, blocks
 from apc.simulation.settings import DEFAULT, EXACT, WHERE_NEEDED, Method, Settings
 from apc.simulation.signals import Signal
 from apc.simulation.simulation import Simulation, check_length, prepare
@@ -39,7 +42,7 @@ MOST_LISTED = 1000  # peers whose own numbers are written out; the digest of the
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """What made a result: `texts` is the SHA-256 of all texts of the scene, `parameters` (name, SI, unit)."""
+    """The origin of a result: `texts` is the SHA-256 of all texts, `parameters` (name, SI, unit)."""
 
     topology: str
     texts: str
@@ -52,18 +55,18 @@ class Provenance:
 
     @property
     def versions(self) -> tuple[tuple[str, str], ...]:
-        """The program and what it computes with: looked up when a result is written, not for each run."""
+        """The versions of the program and its libraries: determined when a result is written."""
         return versions("casadi", "numpy")
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class SimulationReport(Result):
-    """What a run amounts to, its rows left out; `interrupted` says that it ended before its time.
+    """The summary of a run without its rows; `interrupted` is whether it ended early.
 
-    `error` is there if it was asked for.
+    `error` is present on request.
     """
 
-    shown_by = "simulation_output:played"
+    shown_by = "simulation_output:simulation"
 
     topology: str
     summary: Summary
@@ -85,9 +88,9 @@ class Trajectory(SimulationReport):
 
     def __getitem__(self, name: str) -> Floats:
         """Return the column of a signal (rows,). Raises KeyError if there is none of that name."""
-        for place, signal in enumerate(self.signals):
+        for index, signal in enumerate(self.signals):
             if signal.name == name:
-                return self.values[:, place]
+                return self.values[:, index]
         raise KeyError(name)
 
     def to_dataframe(self) -> Any:
@@ -98,19 +101,20 @@ class Trajectory(SimulationReport):
         """Return an xarray Dataset over `time`, a variable a signal with its unit as attribute."""
         return self._shown("dataset")
 
-    def plot(self, ax: Any = None, **look: Unpack[PlotStyle]) -> Any:
-        """Draw a panel a quantity, or all signals into one Axes, as `look` says; return the Figure.
+    def plot(self, ax: Any = None, **style: Unpack[PlotStyle]) -> Any:
+        """Plot a panel per quantity, or all signals into one Axes, in the style `reduction`; return the
+        Figure.
 
         Parameters
         ----------
         ax
-            Where to draw; signals of more than one unit need a figure of their own.
+            The target Axes; signals of more than one unit need a separate figure.
         """
-        return self._drawn(ax, look=look)
+        return self._plotted(ax, style=style)
 
 
 def provenance_of(simulation: Simulation) -> Provenance:
-    """Return what makes a simulation's results."""
+    """Return the provenance of a simulation's results."""
     system = simulation.system
     return Provenance(
         topology=system.name,
@@ -125,7 +129,7 @@ def provenance_of(simulation: Simulation) -> Provenance:
 
 
 def parameters_of(system: Model) -> tuple[tuple[str, float, str], ...]:
-    """Return the parameters of a scene, its groups and peers: name, value in SI, unit."""
+    """Return the parameters of a model, its groups and peers: name, value in SI, unit."""
     parameters = [(parameter.name, parameter.value, parameter.unit) for parameter in system.parameters]
     for group in system.groups:
         parameters += [(f"{group.name}.{value.name}", value.value, value.unit) for value in group.values]
@@ -140,13 +144,13 @@ def parameters_of(system: Model) -> tuple[tuple[str, float, str], ...]:
 
 
 def texts_of(system: Model) -> str:
-    """Return the SHA-256 of all texts of a scene."""
+    """Return the SHA-256 of all texts of a model."""
     texts = "\n".join(f"{name} {digest}" for name, digest in system.origin.digests)
     return hashlib.sha256(texts.encode("utf-8", "surrogateescape")).hexdigest()
 
 
 class Sink(Protocol):
-    """What takes the blocks of a simulation as they come."""
+    """A consumer of the blocks of a simulation."""
 
     def take(self, block: OutputBlock) -> None:
         """Take one block."""
@@ -157,9 +161,11 @@ class Keeper:
 
     def __init__(self, simulation: Simulation) -> None:
         numbers = simulation.rows * len(simulation.signals)
-        what = f"{len(simulation.signals):,} signals over {float(simulation.settings.duration):g} s"
+        message = f"{len(simulation.signals):,} signals over {float(simulation.settings.duration):g} s"
         hint = "fewer --signals, a shorter --duration, or --out FILE.parquet alone"
-        refuse_beyond(NUMBER * numbers, "E876", SourceLocation(simulation.system.origin.topology), what, hint)
+        refuse_beyond(
+            NUMBER * numbers, "E876", SourceLocation(simulation.system.origin.topology), message, hint
+        )
         self.signals = len(simulation.signals)
         self.time: list[Floats] = []
         self.values: list[Floats] = []
@@ -170,20 +176,20 @@ class Keeper:
         self.values.append(block.values)
 
 
-@part("play")
-def play(
+@part("simulate")
+def run_simulation(
     simulation: Simulation, sinks: Sequence[Sink], *, progress: Callable[[float], None] | None = None
 ) -> tuple[Summary, bool]:
-    """Play a simulation into sinks; return its summary, and whether Ctrl-C ended it early.
+    """Run a simulation into sinks; return its summary, and whether Ctrl-C ended it early.
 
     Parameters
     ----------
     simulation
-        The scene, ready.
+        The prepared simulation.
     sinks
-        What takes the blocks.
+        The consumers of the blocks.
     progress
-        Is told the simulated time, in seconds, after each block.
+        Called with the simulated time, in seconds, after each block.
     """
     watch, interrupted = SummaryAccumulator(simulation), False
     try:
@@ -213,14 +219,14 @@ def simulate(
     method: Method = DEFAULT,
     error: bool = False,
 ) -> Trajectory:
-    """Play a scene in time and keep its rows.
+    """Play a model in time and keep its rows.
 
     Parameters
     ----------
     system
-        The compiled scene.
+        The model.
     duration
-        In seconds; that of the scene's experiment if not given.
+        In seconds; that of the model's experiment if not given.
     signals
         Patterns of the signals to keep, all if there is none; see `signals.choose`.
     jit
@@ -228,7 +234,7 @@ def simulate(
     seed
         Of what is random; the experiment's if not given.
     method
-        How the continuous states move between events.
+        The integration method between events.
     error
         Whether to estimate the error, by a second run.
 
@@ -241,7 +247,7 @@ def simulate(
     simulation = prepare(system, settings, signals=signals)
     keeper = Keeper(simulation)
     comparison = compare_with(simulation, signals=signals) if error else None
-    summary, interrupted = play(simulation, [keeper, *([comparison] if comparison else [])])
+    summary, interrupted = run_simulation(simulation, [keeper, *([comparison] if comparison else [])])
     estimate = comparison.estimate() if comparison else None
     return trajectory_of(simulation, keeper, summary, interrupted, estimate)
 
@@ -253,18 +259,18 @@ def trajectory_of(
     interrupted: bool,
     error: ErrorEstimate | None = None,
 ) -> Trajectory:
-    """Return what was kept as a trajectory.
+    """Return the stored rows as a trajectory.
 
     Parameters
     ----------
     simulation
-        The scene that was played.
+        The model that was played.
     keeper
         Its rows.
     summary, interrupted
-        As `play` returns them.
+        As `run_simulation` returns them.
     error
-        How far off it is, if that was estimated.
+        The error estimate, if any.
     """
     return Trajectory(
         topology=simulation.system.name,
@@ -280,31 +286,31 @@ def trajectory_of(
 
 def parse_duration(text: str) -> Fraction:
     """Read a duration such as "2 s". Raises ApcError if it is none."""
-    return option_value("--duration", text, what="duration", unit="s")
+    return option_value("--duration", text, subject="duration", unit="s")
 
 
 def duration_of(system: Model, duration: Fraction | None, *, runs: int = 1) -> Fraction:
-    """Return how long to play a scene, the experiment's duration unless one is given.
+    """Return the simulated duration: the given one, or that of the experiment.
 
     Parameters
     ----------
     system
-        The compiled scene.
+        The model.
     duration
-        How long, in seconds, if the call says it.
+        The duration in seconds, if given.
     runs
-        How often.
+        The number of runs.
 
     Raises
     ------
     ApcError
-        E877 neither call nor scene says it; E915 nobody will wait for it.
+        E877 no duration is given; E915 the run would take too long.
     """
     number = system.experiment.duration if duration is None else duration
     if number is None:
-        what = "the scene says no duration"
+        message = "the topology says no duration"
         hint = 'experiment: {duration: 3 s}  (or --duration "3 s")'
-        raise ApcError(Diagnostic("E877", SourceLocation(system.origin.topology), what, hint=hint))
+        raise ApcError(Diagnostic("E877", SourceLocation(system.origin.topology), message, hint=hint))
     if number <= 0:
         expected, got = "more than 0 s", f"{float(number):g} s"
         raise ApcError(

@@ -45,13 +45,13 @@ def cluster_workers(
     ApcError
         E888 distributed isn't installed, nobody answers at the address, or the cluster has no workers.
     """
-    place = SourceLocation(address[:80])
+    location = SourceLocation(address[:80])
     form = "--cluster tcp://HOST:8786"
     if not _ADDRESS.fullmatch(address):
-        raise ApcError(Diagnostic("E888", place, "a scheduler's address", "HOST:PORT", address[:80], form))
+        raise ApcError(Diagnostic("E888", location, "a scheduler's address", "HOST:PORT", address[:80], form))
     if importlib.util.find_spec("distributed") is None:
-        what = "a cluster needs Dask's distributed, here and on its workers"
-        raise ApcError(Diagnostic("E888", place, what, hint=install_line("cluster")))
+        message = "a cluster needs Dask's distributed, here and on its workers"
+        raise ApcError(Diagnostic("E888", location, message, hint=install_line("cluster")))
     import distributed
 
     # What goes wrong is told once, by us.
@@ -62,18 +62,18 @@ def cluster_workers(
     try:
         certificate = distributed.Security().get_connection_args("client").get("ssl_context")
         if address.startswith("tls://") and certificate is None:  # a client without one never ends well
-            what = "Dask has no certificate for it (distributed.comm.tls in its own configuration)"
-            raise ApcError(Diagnostic("E888", place, what, hint=form))
+            message = "Dask has no certificate for it (distributed.comm.tls in its own configuration)"
+            raise ApcError(Diagnostic("E888", location, message, hint=form))
         try:
             client = distributed.Client(address, timeout=PATIENCE_S, set_as_default=False)
         except (OSError, ValueError) as error:
-            what = f"no Dask scheduler answers there within {PATIENCE_S} s"
-            raise ApcError(Diagnostic("E888", place, what, hint=form)) from error
+            message = f"no Dask scheduler answers there within {PATIENCE_S} s"
+            raise ApcError(Diagnostic("E888", location, message, hint=form)) from error
         with client:
             try:
                 client.wait_for_workers(1, timeout=PATIENCE_S)
             except TimeoutError as error:
-                raise ApcError(Diagnostic("E888", place, "the cluster there has no workers")) from error
+                raise ApcError(Diagnostic("E888", location, "the cluster there has no workers")) from error
             executor = client.get_executor(pure=False)
             # A task like the others: to scatter it would wait for every worker, frozen ones included.
             with warnings.catch_warnings():
@@ -84,7 +84,7 @@ def cluster_workers(
                 future: Future[Result] = executor.submit(compute, sent, task)
                 return future
 
-            yield Workers(submit, 2 * len(client.nthreads()), lambda error: _trouble(error, place))
+            yield Workers(submit, 2 * len(client.nthreads()), lambda error: _trouble(error, location))
     finally:
         for logger, level in zip(loggers, levels, strict=True):
             logger.setLevel(level)
@@ -95,17 +95,19 @@ def _taken(shared: Shared) -> Shared:
     return shared
 
 
-def _trouble(error: BaseException, place: SourceLocation) -> ApcError | None:
+def _trouble(error: BaseException, location: SourceLocation) -> ApcError | None:
     """Return what to tell of a part that did not come back."""
     from distributed import KilledWorker
     from distributed.comm import CommClosedError
 
     if isinstance(error, KilledWorker):
-        what = "several workers of the cluster died on the same part of the sweep: out of memory, or stopped"
+        message = (
+            "several workers of the cluster died on the same part of the sweep: out of memory, or stopped"
+        )
     elif isinstance(error, (CancelledError, CommClosedError, TimeoutError, OSError)):
-        what = "the connection to the cluster is lost"
+        message = "the connection to the cluster is lost"
     elif isinstance(error, ImportError) or "deserializ" in str(error):
-        what = "the workers of the cluster can't load apc: install the same version there"
+        message = "the workers of the cluster can't load apc: install the same version there"
     else:
         return None
-    return ApcError(Diagnostic("E888", place, what))
+    return ApcError(Diagnostic("E888", location, message))

@@ -29,14 +29,14 @@ from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import RefusedError, is_special, read_file, unlink_link, unwritable, write_bytes
-from apc.compiler.seal import seal
+from apc.compiler.signing import seal
 from apc.npz import read_arrays
 from apc.sweeps.quantities import Cells
 
 SUFFIX = ".parts"
 _LARGEST = 1 << 28  # bytes of a part, which has ten thousand points at most
 _ARRAYS = {"is_text": ("|b1", 1), "numbers": ("<f8", 2), "codes": ("<i4", 2), "texts": ("|u1", 1)}
-_OWN = os.urandom(32)  # seals what this process alone takes up, where the user can have no secret
+_LOCAL = os.urandom(32)  # seals what this process alone takes up, where the user can have no secret
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ class SweepParts:
             return None
         return _unpacked(read_arrays(body, _ARRAYS, _LARGEST))
 
-    def there(self) -> set[int]:
+    def exists(self) -> set[int]:
         """Return the numbers of the parts that have a file, damaged or not. Raises ApcError E601."""
         try:
             listed = [path.name for path in self.folder.iterdir()]
@@ -85,7 +85,7 @@ class SweepParts:
 
     def remove(self) -> None:
         """Remove the parts, as the sweep is done. Raises ApcError E601 if they can't be."""
-        for part in self.there():
+        for part in self.exists():
             try:
                 self._path(part).unlink(missing_ok=True)
             except OSError as error:
@@ -102,7 +102,7 @@ class SweepParts:
 
     def _seal(self, part: int, body: bytes) -> bytes:
         content = f"sweep {self.sweep} {part}\n".encode() + body
-        return (seal(content) or hmac.digest(_OWN, content, "sha256").hex()).encode()
+        return (seal(content) or hmac.digest(_LOCAL, content, "sha256").hex()).encode()
 
 
 def _packed(cells: Cells) -> bytes:
@@ -150,8 +150,8 @@ def open_parts(target: Path, description: Mapping[str, Any]) -> SweepParts:
     """
     folder = target.with_name(target.name + SUFFIX)
     if os.path.lexists(folder) and (folder.is_symlink() or not folder.is_dir()):
-        what = "is there and is no folder, where apc sweep keeps its parts"
+        message = "is there and is no folder, where apc sweep keeps its parts"
         raise ApcError(
-            Diagnostic("E885", SourceLocation(str(folder)), what, hint=f"another --out than {target}")
+            Diagnostic("E885", SourceLocation(str(folder)), message, hint=f"another --out than {target}")
         )
     return SweepParts(folder, hashlib.sha256(json.dumps(description).encode()).hexdigest())

@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
-from apc.frame.names import ParameterRef, find, unit_of
 from apc.frame.overrides import Override, apply
+from apc.frame.parameter_names import ParameterRef, find, unit_of
 from apc.option_value import option_values
-from apc.vary.evaluator import reaches_count
+from apc.parameter_studies.evaluator import reaches_count
 
-PLACE = SourceLocation("sweep")
+LOCATION = SourceLocation("sweep")
 
 # Of a range that does not say how many: ten steps, so that the ends and the middle are round numbers.
 DEFAULT_COUNT = 11
@@ -64,11 +64,11 @@ class Grid:
         """Return the value of each axis at a point."""
         numbers = []
         for axis in reversed(self.axes):
-            point, place = divmod(point, len(axis.values))
-            numbers.append(axis.values[place])
+            point, index = divmod(point, len(axis.values))
+            numbers.append(axis.values[index])
         return tuple(reversed(numbers))
 
-    def places(self, points: Sequence[int]) -> NDArray[np.int64]:
+    def indices(self, points: Sequence[int]) -> NDArray[np.int64]:
         """Return which of each axis's values some points have (k, axes)."""
         sizes = [len(axis.values) for axis in self.axes]
         return np.stack(np.unravel_index(np.asarray(points, dtype=np.int64), sizes), axis=1)
@@ -82,11 +82,11 @@ class Grid:
 def build_grid(axes: Sequence[GridAxis]) -> Grid:
     """Return the grid of some axes. Raises ApcError E883 when they make none, or one too large."""
     if not axes:
-        raise ApcError(Diagnostic("E883", PLACE, "nothing is swept", hint=_FORM))
+        raise ApcError(Diagnostic("E883", LOCATION, "nothing is swept", hint=_FORM))
     labels = [axis.free.label for axis in axes]
-    for place, label in enumerate(labels):
-        if label in labels[:place]:
-            raise ApcError(Diagnostic("E883", PLACE, f"{label} is swept twice"))
+    for index, label in enumerate(labels):
+        if label in labels[:index]:
+            raise ApcError(Diagnostic("E883", LOCATION, f"{label} is swept twice"))
     _refuse_many([len(axis.values) for axis in axes])
     return Grid(tuple(axes))
 
@@ -110,7 +110,7 @@ def _refuse_many(counts: Sequence[int]) -> None:
     if points > MOST_POINTS:
         sizes = " × ".join(f"{count:,}" for count in counts)
         got = f"{sizes} = {points:,}" if len(counts) > 1 else sizes
-        raise ApcError(Diagnostic("E883", PLACE, "a sweep", f"at most {MOST_POINTS:,} points", got))
+        raise ApcError(Diagnostic("E883", LOCATION, "a sweep", f"at most {MOST_POINTS:,} points", got))
 
 
 def parse_axis(system: Model, name: str, text: str, *, ends: bool = False) -> GridAxis:
@@ -119,7 +119,7 @@ def parse_axis(system: Model, name: str, text: str, *, ends: bool = False) -> Gr
     Parameters
     ----------
     system
-        The scene.
+        The topology.
     name
         A parameter or timing, as in `--set`.
     text
@@ -134,7 +134,7 @@ def parse_axis(system: Model, name: str, text: str, *, ends: bool = False) -> Gr
         E881 a range or list at fault; E622, E623 no such parameter; E204 and others of a
         quantity; E624 or E625 a value out of the parameter's bounds.
     """
-    free = find(system, name.strip(), PLACE, counts=True)
+    free = find(system, name.strip(), LOCATION, counts=True)
     unit = unit_of(system, free.name)
     whole = reaches_count(system, free)
     default = 2 if ends else DEFAULT_COUNT
@@ -152,7 +152,7 @@ def _whole_numbers(label: str, values: Sequence[Fraction], *, every: bool) -> tu
     low, high = values[0], values[-1]
     if low.denominator != 1 or high.denominator != 1:
         got = f"{float(low):g} to {float(high):g}"
-        raise ApcError(Diagnostic("E881", PLACE, f"the range of {label}", "whole numbers", got))
+        raise ApcError(Diagnostic("E881", LOCATION, f"the range of {label}", "whole numbers", got))
     if every:
         _refuse_many([int(high - low) + 1])
         return tuple(Fraction(count) for count in range(int(low), int(high) + 1))
@@ -160,48 +160,50 @@ def _whole_numbers(label: str, values: Sequence[Fraction], *, every: bool) -> tu
 
 
 def _list(label: str, unit: str, text: str) -> tuple[Fraction, ...]:
-    values = option_values(label, unit, text.split(","), PLACE, between=",")
-    for place, value in enumerate(values):
-        if value in values[:place]:
+    values = option_values(label, unit, text.split(","), LOCATION, between=",")
+    for index, value in enumerate(values):
+        if value in values[:index]:
             got = f"{float(value):g} {unit} twice"
-            raise ApcError(Diagnostic("E881", PLACE, f"the list of {label}", "different values", got))
+            raise ApcError(Diagnostic("E881", LOCATION, f"the list of {label}", "different values", got))
     return values
 
 
 def _range(label: str, unit: str, text: str, default: int) -> tuple[Fraction, ...]:
     """Return the values of LOW:HIGH, so many by default, of LOW:HIGH:COUNT or LOW:HIGH:COUNT:log."""
-    what = f"the range of {label}"
+    message = f"the range of {label}"
     ends, rest = text.split(":")[:2], text.split(":")[2:]
     logarithmic = bool(rest) and rest[-1].strip() == "log"
     if logarithmic:
         rest = rest[:-1]
     if len(rest) > 1:
         raise ApcError(
-            Diagnostic("E881", PLACE, what, "LOW:HIGH:COUNT or LOW:HIGH:COUNT:log", text[:80], _FORM)
+            Diagnostic("E881", LOCATION, message, "LOW:HIGH:COUNT or LOW:HIGH:COUNT:log", text[:80], _FORM)
         )
-    count = _count(what, rest[0].strip()) if rest else default
+    count = _count(message, rest[0].strip()) if rest else default
     low, high = option_values(
-        label, unit, ends, PLACE, rest="".join(f":{part}" for part in text.split(":")[2:])
+        label, unit, ends, LOCATION, rest="".join(f":{part}" for part in text.split(":")[2:])
     )
     if low >= high:
         got = f"{ends[0].strip()} to {ends[1].strip()}"
         expected = "its lower end first, and the upper above it"
-        raise ApcError(Diagnostic("E881", PLACE, what, expected, got))
+        raise ApcError(Diagnostic("E881", LOCATION, message, expected, got))
     if not logarithmic:
         return tuple(low + (high - low) * step / (count - 1) for step in range(count))
     if low <= 0:
         got = f"{float(low):g} {unit}"
-        raise ApcError(Diagnostic("E881", PLACE, what, "a lower end above 0 for equal ratios", got))
+        raise ApcError(Diagnostic("E881", LOCATION, message, "a lower end above 0 for equal ratios", got))
     ratio = float(high / low)
     # The shortest decimal of the float, so that a table shows it whole; the ends are those given.
     inner = (Fraction(repr(float(low) * ratio ** (step / (count - 1)))) for step in range(1, count - 1))
     return (low, *inner, high)
 
 
-def _count(what: str, text: str) -> int:
+def _count(message: str, text: str) -> int:
     """Read the number of values: a single value is written as a value, not as a range."""
     if not (text.isascii() and text.isdecimal() and len(text) <= MOST_DIGITS and int(text) >= 2):
-        raise ApcError(Diagnostic("E881", PLACE, what, "2 values or more", text[:40] or "nothing", _FORM))
+        raise ApcError(
+            Diagnostic("E881", LOCATION, message, "2 values or more", text[:40] or "nothing", _FORM)
+        )
     return int(text)
 
 
@@ -220,4 +222,4 @@ def _check_bounds(system: Model, axis: GridAxis, value: Fraction) -> None:
             if mistake.code in ("E624", "E625") and mistake.subject in (axis.free.label, axis.free.name)
         ]
         if mistakes:
-            raise ApcError(replace(mistakes[0], place=PLACE)) from None
+            raise ApcError(replace(mistakes[0], location=LOCATION)) from None

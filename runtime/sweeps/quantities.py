@@ -19,14 +19,20 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
 from apc.eigen.spectrum import finite
-from apc.frame.names import find, unit_of
 from apc.frame.overrides import apply
+from apc.frame.parameter_names import find, unit_of
+from apc.parameter_studies.batch_analysis import (
+    FAULT,
+    ManyAnalyses,
+    SweptParameter,
+    by_matrices,
+    many_analyses,
+)
+from apc.parameter_studies.stability_criteria import MEAN_SQUARE, NOMINAL, PASSIVE
 from apc.sweeps.grid import Grid
 from apc.tables import Row, TableColumn
-from apc.vary.growth import MEAN_SQUARE, NOMINAL, PASSIVE
-from apc.vary.many import FAULT, ManyAnalyses, SweptParameter, by_matrices, many_analyses
 
-PLACE = SourceLocation("sweep")
+LOCATION = SourceLocation("sweep")
 
 # How the name of a quantity begins that is by another criterion than the nominal one.
 BEGINNINGS = {MEAN_SQUARE: "in mean square: ", PASSIVE: "with passive hands: "}
@@ -57,7 +63,7 @@ def find_quantity(system: Model, text: str) -> SweepQuantity:
     Parameters
     ----------
     system
-        The scene whose points are to be computed.
+        The topology whose points are to be computed.
     text
         `NAME`, or `NAME:ARGUMENT` where the quantity takes one.
 
@@ -71,10 +77,10 @@ def find_quantity(system: Model, text: str) -> SweepQuantity:
     name, _, argument = text.partition(":")
     make = QUANTITIES.get(name.strip())
     if make is None:
-        what = f"{name[:80] or 'an empty name'} is nothing a sweep computes ({', '.join(QUANTITIES)})"
-        raise ApcError(Diagnostic("E884", PLACE, what, hint=nearest(name, QUANTITIES)))
+        message = f"{name[:80] or 'an empty name'} is nothing a sweep computes ({', '.join(QUANTITIES)})"
+        raise ApcError(Diagnostic("E884", LOCATION, message, hint=nearest(name, QUANTITIES)))
     if criterion != NOMINAL:
-        make = _BY_GROWTH[criterion, name.strip()]
+        make = _SCALAR_CRITERIA[criterion, name.strip()]
     return make(system, argument.strip())
 
 
@@ -92,7 +98,7 @@ def faulty(columns: tuple[TableColumn, ...], error: ApcError) -> Row:
 def _analyze(system: Model, argument: str) -> SweepQuantity:
     """Return the verdict, the spectral radius, and how the leading mode moves."""
     if argument:
-        raise ApcError(Diagnostic("E884", PLACE, "analyze", "no parameter", argument[:80], "--of analyze"))
+        raise ApcError(Diagnostic("E884", LOCATION, "analyze", "no parameter", argument[:80], "--of analyze"))
     columns = (
         VERDICT,
         TableColumn("spectral_radius", "", "number"),
@@ -112,7 +118,7 @@ def _analyze(system: Model, argument: str) -> SweepQuantity:
                 for exact in [axis.values.__getitem__]
             ]
             made[:] = [(grid, many_analyses(system, varied))]
-        rows = made[0][1].at(grid.places(points))
+        rows = made[0][1].at(grid.indices(points))
         return (
             rows.verdict,
             *map(_finite, (rows.spectral_radius, rows.spectral_radius_error)),
@@ -128,13 +134,13 @@ def _finite(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(np.isfinite(numbers), numbers, np.nan)
 
 
-def _growth(system: Model, argument: str) -> SweepQuantity:
+def _stability_measure(system: Model, argument: str) -> SweepQuantity:
     """Return the verdict in mean square and what second moments grow by in a frame."""
-    from apc.frame.instance import prepare  # the nominal quantities need none of it
-    from apc.moments.network_verdict import growth, verdict_of
+    from apc.frame.numeric_model import prepare  # the nominal quantities need none of it
+    from apc.mean_square.mean_square_stability import mean_square_growth, verdict_of
 
     if argument:
-        raise ApcError(Diagnostic("E884", PLACE, "analyze", "no parameter", argument[:80], "--of analyze"))
+        raise ApcError(Diagnostic("E884", LOCATION, "analyze", "no parameter", argument[:80], "--of analyze"))
     columns = (
         VERDICT,
         TableColumn("mean_square_radius", "", "number"),
@@ -145,19 +151,19 @@ def _growth(system: Model, argument: str) -> SweepQuantity:
 
     def evaluate(changed: Model) -> Row:
         with np.errstate(all="ignore"):
-            result = growth(changed, prepared)
+            result = mean_square_growth(changed, prepared)
         error = max(result.high - result.radius, result.radius - result.low)
         return (verdict_of(result), finite(result.radius), finite(error), result.why or result.note)
 
-    return SweepQuantity(columns, _one_by_one(system, columns, evaluate))
+    return SweepQuantity(columns, _pointwise(system, columns, evaluate))
 
 
 def _passive(system: Model, argument: str) -> SweepQuantity:
     """Return the verdict with every passive hand, and how much damping of each device could be spared."""
-    from apc.hands.passivity import passive_hands  # the nominal quantities need none of it
+    from apc.haptics.absolute_stability import absolute_stability  # the nominal quantities need none of it
 
     if argument:
-        raise ApcError(Diagnostic("E884", PLACE, "analyze", "no parameter", argument[:80], "--of analyze"))
+        raise ApcError(Diagnostic("E884", LOCATION, "analyze", "no parameter", argument[:80], "--of analyze"))
     columns = (
         VERDICT,
         TableColumn("spare_damping", "N*s/m", "number"),
@@ -167,8 +173,8 @@ def _passive(system: Model, argument: str) -> SweepQuantity:
     )
 
     def evaluate(changed: Model) -> Row:
-        hands = passive_hands(changed)
-        worst = hands.worst
+        hands = absolute_stability(changed)
+        worst = hands.worst_mode
         if worst is None or worst.more is None or worst.error is None:
             return (hands.verdict, None, None, None, hands.why or "no damping is enough")
         return (
@@ -179,14 +185,14 @@ def _passive(system: Model, argument: str) -> SweepQuantity:
             "",
         )
 
-    return SweepQuantity(columns, _one_by_one(system, columns, evaluate))
+    return SweepQuantity(columns, _pointwise(system, columns, evaluate))
 
 
 def _critical_by(criterion: str) -> Callable[[Model, str], SweepQuantity]:
     return lambda system, argument: _critical(system, argument, criterion)
 
 
-def _one_by_one(
+def _pointwise(
     system: Model, columns: tuple[TableColumn, ...], evaluate: Callable[[Model], Row]
 ) -> Callable[[Grid, Sequence[int]], Cells]:
     """Return what evaluates some points of a grid, each by itself."""
@@ -200,7 +206,7 @@ def _one_by_one(
                 rows.append(faulty(columns, error))
         kinds = [object if column.kind == "text" else np.float64 for column in columns]  # None is NaN
         return tuple(
-            np.array(own, dtype=kind) for own, kind in zip(zip(*rows, strict=True), kinds, strict=True)
+            np.array(local, dtype=kind) for local, kind in zip(zip(*rows, strict=True), kinds, strict=True)
         )
 
     return cells
@@ -208,12 +214,12 @@ def _one_by_one(
 
 def _critical(system: Model, argument: str, criterion: str = "nominal") -> SweepQuantity:
     """Return the value at which the verdict changes with one parameter, and on which side it is stable."""
-    from apc.vary.critical_values import critical  # a sweep of verdicts needs none of it
+    from apc.parameter_studies.critical_values import critical  # a sweep of verdicts needs none of it
 
     if not argument:
         form = "--of critical:coordination.stiffness"
-        raise ApcError(Diagnostic("E884", PLACE, "critical", "a parameter", "nothing", form))
-    unit = unit_of(system, find(system, argument, PLACE).name)
+        raise ApcError(Diagnostic("E884", LOCATION, "critical", "a parameter", "nothing", form))
+    unit = unit_of(system, find(system, argument, LOCATION).name)
     shown = "" if unit == "1" else unit
     columns = (
         VERDICT,
@@ -232,7 +238,7 @@ def _critical(system: Model, argument: str, criterion: str = "nominal") -> Sweep
         proof = next(crossing.proof for crossing in result.crossings if crossing.value == result.value)
         return (verdict, finite(result.value), finite(result.error), len(result.crossings), str(proof), "")
 
-    return SweepQuantity(columns, _one_by_one(system, columns, evaluate))
+    return SweepQuantity(columns, _pointwise(system, columns, evaluate))
 
 
 QUANTITIES: Mapping[str, Callable[[Model, str], SweepQuantity]] = {
@@ -240,8 +246,8 @@ QUANTITIES: Mapping[str, Callable[[Model, str], SweepQuantity]] = {
     "critical": _critical,
 }
 
-_BY_GROWTH: Mapping[tuple[str, str], Callable[[Model, str], SweepQuantity]] = {
-    (MEAN_SQUARE, "analyze"): _growth,
+_SCALAR_CRITERIA: Mapping[tuple[str, str], Callable[[Model, str], SweepQuantity]] = {
+    (MEAN_SQUARE, "analyze"): _stability_measure,
     (MEAN_SQUARE, "critical"): _critical_by(MEAN_SQUARE),
     (PASSIVE, "analyze"): _passive,
     (PASSIVE, "critical"): _critical_by(PASSIVE),

@@ -25,9 +25,10 @@ from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import is_special
 from apc.compiler.timings import part
-from apc.frame.names import notes_for_all_groups
+from apc.frame.parameter_names import notes_for_all_groups
 from apc.memory import refuse_beyond
-from apc.network.nominal import left_out, refuse_channel_number
+from apc.network.nominal_criterion import limitations, refuse_channel_number
+from apc.parameter_studies.stability_criteria import MEAN_SQUARE, NOMINAL, PASSIVE, criterion_of, refuse_time
 from apc.processes import Patience, Workers, cores, local_processes, model_bytes, results, this_process
 from apc.result import Result
 from apc.sweeps.finished_parts import SweepParts, open_parts
@@ -35,12 +36,11 @@ from apc.sweeps.grid import Grid, build_grid, check_size, parse_axis
 from apc.sweeps.quantities import BEGINNINGS, Cells, by_criterion, find_quantity
 from apc.sweeps.work import Computed, Work, compute_part, program_versions
 from apc.tables import BLOCK, TableColumn, check_table_path, read_table, write_table
-from apc.vary.growth import MEAN_SQUARE, NOMINAL, PASSIVE, criterion_of, refuse_time
 
 if TYPE_CHECKING:
     import pandas
 
-PLACE = SourceLocation("sweep")
+LOCATION = SourceLocation("sweep")
 
 # Points of a part: a third of a second of analyses, which is what a kill can cost; more where points are
 # quick, as long as there are parts for all who compute; and no more files in a folder than one likes to list.
@@ -52,7 +52,7 @@ Progress = Callable[[int, int], None]  # points done, points in all
 
 LOST = Diagnostic(
     "E889",
-    PLACE,
+    LOCATION,
     "a process that computed ended without a word: stopped from outside, out of memory, or started by a "
     "script that sweeps when it is imported",
     hint="--jobs 1; in a script, if __name__ == '__main__': around the sweep",
@@ -69,7 +69,7 @@ class Sweep(Result):
     versions. `notes` tell what was out of the ordinary.
     """
 
-    shown_by = "vary_output:sweep"
+    shown_by = "parameter_studies_output:sweep"
 
     topology: str
     of: str
@@ -102,11 +102,11 @@ class Sweep(Result):
 
     def column(self, heading: str) -> NDArray[Any]:
         """Return the column of a heading."""
-        place = self.headings.index(heading)
+        index = self.headings.index(heading)
         if self.held is not None:
-            return self.held[place]
+            return self.held[index]
         assert self.out is not None, "what is in no file is held"
-        return read_table(self.out, self.listed[place : place + 1])[0]
+        return read_table(self.out, self.listed[index : index + 1])[0]
 
     @property
     def verdicts(self) -> tuple[tuple[str, int], ...]:
@@ -142,7 +142,7 @@ def sweep(
     Parameters
     ----------
     system
-        The compiled scene; its numbers hold for what is not swept.
+        The compiled topology; its numbers hold for what is not swept.
     over
         The values of each swept parameter by its name: a range `"0 N/m:3000 N/m:31"` (`LOW:HIGH:COUNT`, and
         `:log` for equal ratios), or a list, `"0,8 ms"` or `["0 ms", "8 ms"]`. The last one turns fastest.
@@ -172,38 +172,40 @@ def sweep(
     texts = {name: text if isinstance(text, str) else ",".join(text) for name, text in over.items()}
     check_size(list(texts.values()))
     grid = build_grid([parse_axis(system, name, text) for name, text in texts.items()])
-    meant = criterion_of(system, criterion, PLACE, [axis.free for axis in grid.axes])
+    meant = criterion_of(system, criterion, LOCATION, [axis.free for axis in grid.axes])
     work_of = by_criterion(of, meant)
     quantity = find_quantity(system, work_of)
     for axis in grid.axes:
         if meant == PASSIVE:
-            refuse_time(system, axis.free, PLACE, meant)
+            refuse_time(system, axis.free, LOCATION, meant)
         if meant == NOMINAL:
-            refuse_channel_number(system, axis.free, PLACE, instead=f"--in {MEAN_SQUARE}")
+            refuse_channel_number(system, axis.free, LOCATION, instead=f"--criterion {MEAN_SQUARE}")
         if axis.free.label == of.partition(":")[2].strip():
-            what = f"{axis.free.label} is swept: there is nothing to look for at one value of it"
-            raise ApcError(Diagnostic("E884", PLACE, what, hint="--of critical:PATH with another parameter"))
+            message = f"{axis.free.label} is swept: there is nothing to look for at one value of it"
+            raise ApcError(
+                Diagnostic("E884", LOCATION, message, hint="--of critical:PATH with another parameter")
+            )
     if out is not None:
         check_table_path(out, "out=")
     if jobs is not None and jobs < 1:
-        raise ApcError(Diagnostic("E889", PLACE, "the number of processes", "1 or more", str(jobs)))
+        raise ApcError(Diagnostic("E889", LOCATION, "the number of processes", "1 or more", str(jobs)))
     width = len(grid.axes) + len(quantity.columns)
-    what = f"{grid.points:,} points of {width} columns"
+    message = f"{grid.points:,} points of {width} columns"
     filed = _in_a_file(out)
     needed = (min(grid.points, 2 * BLOCK) if filed else grid.points) * width * CELL
     refuse_beyond(
-        needed, "E883", PLACE, what, "fewer values" if filed else "fewer values, or out=FILE.parquet"
+        needed, "E883", LOCATION, message, "fewer values" if filed else "fewer values, or out=FILE.parquet"
     )
     work = Work(model_bytes(system), work_of, grid, part_points(grid.points, quick=quantity.quick))
     made_of = _description(system, work)
-    parts = _kept(out, made_of)
+    parts = _stored(out, made_of)
     whose = Whose(jobs or cores(), cluster, patience or Patience())
     notes = _compute_missing(work, parts, whose, progress)
     columns = (*(TableColumn(axis.heading) for axis in grid.axes), *quantity.columns)
     counts = Counter[str](), Counter[str]()
     blocks, held = _blocks(work, parts, [column.kind for column in columns], counts), None
     if isinstance(parts, _Memory):
-        held = tuple(np.concatenate(own) for own in zip(*blocks, strict=True))
+        held = tuple(np.concatenate(local) for local in zip(*blocks, strict=True))
         blocks = ([column[at : at + BLOCK] for column in held] for at in range(0, grid.points, BLOCK))
     if out is not None:
         write_table(out, columns, blocks, made_of)
@@ -238,9 +240,9 @@ def _description(system: Model, work: Work) -> dict[str, Any]:
         "topology": system.name,
         "peers": system.peers,
         "of": work.of,
-        "left_out": [
+        "limitations": [
             *near_start(system),
-            *left_out(system, network=not work.of.startswith(BEGINNINGS[MEAN_SQUARE]), varied=varied),
+            *limitations(system, network=not work.of.startswith(BEGINNINGS[MEAN_SQUARE]), varied=varied),
             *notes_for_all_groups(system, varied),
         ],
         "points": work.grid.points,
@@ -272,11 +274,11 @@ class _Memory:
     def read(self, part: int) -> Cells | None:
         return self._cells.get(part)
 
-    def there(self) -> set[int]:
+    def exists(self) -> set[int]:
         return set(self._cells)
 
 
-_Kept = SweepParts | _Memory
+_Stored = SweepParts | _Memory
 
 
 def _in_a_file(out: Path | None) -> bool:
@@ -284,7 +286,7 @@ def _in_a_file(out: Path | None) -> bool:
     return out is not None and not is_special(out)
 
 
-def _kept(out: Path | None, made_of: Mapping[str, Any]) -> _Kept:
+def _stored(out: Path | None, made_of: Mapping[str, Any]) -> _Stored:
     return open_parts(out, made_of) if out is not None and _in_a_file(out) else _Memory()
 
 
@@ -297,14 +299,14 @@ class Whose:
     patience: Patience
 
 
-def _compute_missing(work: Work, kept: _Kept, whose: Whose, progress: Progress | None) -> tuple[str, ...]:
+def _compute_missing(work: Work, stored: _Stored, whose: Whose, progress: Progress | None) -> tuple[str, ...]:
     """Compute the parts that aren't there, keep each as it comes, and return what to tell of it."""
-    there = kept.there()
-    missing = [part for part in range(work.parts) if part not in there or kept.read(part) is None]
+    there = stored.exists()
+    missing = [part for part in range(work.parts) if part not in there or stored.read(part) is None]
     damaged = [part for part in missing if part in there]
     done = work.grid.points - sum(len(work.points_of(part)) for part in missing)
-    again = "was damaged, or written by somebody else, and is computed again"
-    notes = [f"part {part} {again}" for part in damaged]
+    repeated = "was damaged, or written by somebody else, and is computed again"
+    notes = [f"part {part} {repeated}" for part in damaged]
     if done:
         notes.append(f"{done:,} points were there already")
     if progress:
@@ -312,10 +314,10 @@ def _compute_missing(work: Work, kept: _Kept, whose: Whose, progress: Progress |
     if not missing:
         return tuple(notes)
     with _workers(work, min(whose.jobs, len(missing)), whose.cluster) as workers:
-        for computed in results(workers, missing, whose.patience, PLACE):
+        for computed in results(workers, missing, whose.patience, LOCATION):
             if computed.versions != program_versions():
                 raise ApcError(_other_versions(computed, whose.cluster))
-            kept.write(computed.part, computed.cells)
+            stored.write(computed.part, computed.cells)
             done += len(work.points_of(computed.part))
             if progress:
                 progress(done, work.grid.points)
@@ -336,23 +338,23 @@ def _other_versions(computed: Computed, cluster: str | None) -> Diagnostic:
     """Return the message for numbers that come from other libraries than those here."""
     here = dict(program_versions())
     other = [f"{name} {got} (here {here[name]})" for name, got in computed.versions if here[name] != got]
-    what = f"a worker has {', '.join(other)}: the same numbers can't be promised; install the same there"
-    return Diagnostic("E888", SourceLocation(cluster or "sweep"), what)
+    message = f"a worker has {', '.join(other)}: the same numbers can't be promised; install the same there"
+    return Diagnostic("E888", SourceLocation(cluster or "sweep"), message)
 
 
 def _blocks(
-    work: Work, kept: _Kept, kinds: Sequence[str], counts: tuple[Counter[str], Counter[str]]
+    work: Work, stored: _Stored, kinds: Sequence[str], counts: tuple[Counter[str], Counter[str]]
 ) -> Iterator[list[NDArray[Any]]]:
     """Yield the rows as blocks of columns, the values of the axes first; count the verdicts and messages."""
     values = [np.array([float(value) for value in axis.values]) for axis in work.grid.axes]
     waiting: list[list[NDArray[Any]]] = []
     rows = 0
     for number in range(work.parts):
-        cells = kept.read(number)
+        cells = stored.read(number)
         if cells is None:  # another process with the same sweep was done, and removed it
             cells = compute_part(work, number).cells
-        places = work.grid.places(work.points_of(number))
-        columns = [value[places[:, axis]] for axis, value in enumerate(values)] + list(cells)
+        indices = work.grid.indices(work.points_of(number))
+        columns = [value[indices[:, axis]] for axis, value in enumerate(values)] + list(cells)
         counts[0].update(cells[0].tolist())
         counts[1].update(cells[-1].tolist())
         waiting.append(
@@ -361,9 +363,9 @@ def _blocks(
                 for column, kind in zip(columns, kinds, strict=True)
             ]
         )
-        rows += len(places)
+        rows += len(indices)
         while rows >= BLOCK or (rows and number == work.parts - 1):
-            whole = [np.concatenate(own) for own in zip(*waiting, strict=True)]
+            whole = [np.concatenate(local) for local in zip(*waiting, strict=True)]
             yield [values[:BLOCK] for values in whole]
             rows = max(rows - BLOCK, 0)
             waiting = [[values[BLOCK:] for values in whole]]

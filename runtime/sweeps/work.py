@@ -25,7 +25,7 @@ from apc.threads import single_threaded
 # What makes the numbers: with another version of one of them, the last digits may be others.
 LIBRARIES = ("casadi", "numpy", "python-flint", "scipy")
 
-_ONE_AT_A_TIME = threading.Lock()
+_SEQUENTIAL = threading.Lock()
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +62,8 @@ class Computed:
 
 def compute_part(work: Work, part: int) -> Computed:
     """Compute one part of a sweep. A point that can't be computed becomes a row that says why."""
-    with _ONE_AT_A_TIME, single_threaded():
-        cells = _opened(work.model, work.of).cells(work.grid, work.points_of(part))
+    with _SEQUENTIAL, single_threaded():
+        cells = _load(work.model, work.of).cells(work.grid, work.points_of(part))
     return Computed(part, cells, program_versions())
 
 
@@ -79,5 +79,5 @@ def program_versions() -> tuple[tuple[str, str], ...]:
 
 
 @lru_cache(maxsize=1)
-def _opened(model: bytes, of: str) -> SweepQuantity:
+def _load(model: bytes, of: str) -> SweepQuantity:
     return find_quantity(model_of_bytes(model), of)

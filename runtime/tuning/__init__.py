@@ -1,1 +1,1 @@
-"""Which gains do best in all that they have to bear, and the proof that they bear it."""
+"""Gain optimization under robust specifications, with proof of the specifications at the result."""

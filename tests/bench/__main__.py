@@ -17,22 +17,21 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from apc.benchmark.speed_and_error import machine
-from apc.benchmark.timing import waited
-from tests.bench.judge import HEAD, NOISE, ROW
+from tests.bench.judge import HEAD, NOISE, ROW, elapsed
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 PAGE = HERE / "README.md"
-BESIDE = "Beside other programs"
-AVERAGE = "models/scenes/three-users-average.yaml"
+ALONGSIDE = "Beside other programs"
+AVERAGE = "models/topologies/three-users-average.yaml"
 
 # The sections of the page by their names: the title, and the words after `python -m`.
 PARTS = {
     "process": ("Whole processes", "tests.bench.process"),
-    "bench": ("Speed against error on the paper's scene", f"apc bench {AVERAGE}"),
+    "bench": ("Speed against error on the paper's topology", f"apc bench {AVERAGE}"),
     "hard": ("Hard cases", "apc bench --hard tests/hard"),
     "scale": ("More peers", f"apc bench {AVERAGE} --scale 3,30,300,3000,30000,1e6"),
-    "random_scenes": ("Random scenes", "tests.bench.random_scenes"),
+    "random_topologies": ("Random topologies", "tests.bench.random_topologies"),
     "random_scans": ("Random scans", "tests.bench.random_scans"),
     "comparison": ("Other programs", "tests.bench.comparison"),
     "work_precision": ("Methods of simulation", "tests.bench.work_precision"),
@@ -47,16 +46,16 @@ def run(title: str, words: str) -> tuple[str, list[str], int]:
     """Return a section of the page, the rows of other programs, and the code its program ended with."""
     command = [sys.executable, "-m", *words.split()]
     load = os.getloadavg()[0]
-    taken, ran = waited(
+    used, ran = elapsed(
         lambda: subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     )
     shown = words if words.startswith("apc") else f"python -m {words}"
     lines = ran.stdout.splitlines()
     rows = [f"{line} {title} |" for line in lines if line.startswith(ROW) and line != HEAD]
     told = "\n".join(line for line in lines if not line.startswith(ROW)).replace("\n\n\n", "\n\n")
-    text = "\n\n".join(said for said in (told.rstrip(), ran.stderr.rstrip()) if said)
+    text = "\n\n".join(printed for printed in (told.rstrip(), ran.stderr.rstrip()) if printed)
     end = f"\n\nIt ended with code {ran.returncode}." if ran.returncode else ""
-    how = f"{datetime.now(tz=UTC).date()}, {taken:.0f} s, load {load:.0f}"
+    how = f"{datetime.now(tz=UTC).date()}, {used:.0f} s, load {load:.0f}"
     return f"## {title}\n\n`{shown}` ({how})\n\n```text\n{text}\n```{end}\n", rows, ran.returncode
 
 
@@ -71,7 +70,7 @@ def main() -> None:
     if given.only and PAGE.is_file():
         parts = PAGE.read_text(encoding="utf-8").split("\n## ")[1:]
         before = {part.partition("\n")[0]: f"## {part.rstrip()}\n" for part in parts}
-    rows_before = [line for line in before.pop(BESIDE, "").splitlines() if line.startswith(ROW)]
+    rows_before = [line for line in before.pop(ALONGSIDE, "").splitlines() if line.startswith(ROW)]
     found, rows, failed = [], [], []
     for name, (title, words) in PARTS.items():
         if given.only and name not in given.only:
@@ -93,7 +92,7 @@ def main() -> None:
         "Smaller runs: `--quick`. One part: `--only hard`. Each part says how it was run, when, and the\n"
         "load before it: how many processes wanted a core. A target is kept, missed, or near: missed by\n"
         f"at most a factor of {NOISE:g}, as two runs may differ. `--strict` fails on a missed one.\n"
-        f"Measured on:\n\n| | |\n|---|---|\n{where}\n\n## {BESIDE}\n\n"
+        f"Measured on:\n\n| | |\n|---|---|\n{where}\n\n## {ALONGSIDE}\n\n"
         "Processor time of one core, both of a row measured in one run of the part named last. An error is\n"
         "the true one; after `≤` stands the most it may be, apc's own bound where it gives one.\n"
         f"Below 1 apc is the faster.\n\n{HEAD} measured in |\n{rule}\n"

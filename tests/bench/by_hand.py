@@ -1,6 +1,6 @@
-"""The three-user scene of Rakhsha and Constantinescu by programs written for it alone.
+"""The three-user topology of Rakhsha and Constantinescu by programs written for it alone.
 
-"Section" is the paper's; models/scenes/three-users-average.yaml states the same scene. Nothing here is
+"Section" is the paper's; models/topologies/three-users-average.yaml states the same topology. Nothing here is
 compiled: who compares with it compares with a second statement.
 """
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from apc.benchmark.timing import timed
-from apc.simulation.native import native
+from apc.simulation.c_compiler import native
 
 Floats = NDArray[np.float64]
 
@@ -28,10 +28,10 @@ CUBE_MASS = SHARED_MASS / USERS
 TICK, FRAME = 1e-3, 8e-3  # s: forces act a tick after theirs, packets are used a frame after theirs
 TICKS = 8  # in a frame
 
-# A point inside the stable region of Fig. 3 (b), the scene file's own; there B_C = B_T = 0.
+# A point inside the stable region of Fig. 3 (b), the topology file's own; there B_C = B_T = 0.
 K_C, K_T = 1000.0, 500.0  # N/m
 
-# Where the first device starts when the scene is played: the paper's has no start. m
+# Where the first device starts when the topology is played: the paper's has no start. m
 START = 0.01
 
 # ---- stability ----
@@ -48,18 +48,18 @@ def user(
 ) -> tuple[Floats, Floats]:
     """Return a tick over (x_H, v_H, x_O, v_O, F_C, F_T, packet), and what of the others' packets is heard."""
     device, cube = by_exponential(DEVICE_MASS, damping), by_exponential(CUBE_MASS, damping)
-    tick, hears = np.zeros((7, 7)), np.zeros((7, 7))
+    tick, receives = np.zeros((7, 7)), np.zeros((7, 7))
     tick[:2, :2], tick[:2, 4] = device[:, :2], -device[:, 2]
     tick[2:4, 2:4], tick[2:4, 4], tick[2:4, 5] = cube[:, :2], cube[:, 2], -cube[:, 2]
     tick[4, [0, 2]], tick[5, 2], tick[6, 6] = [contact, -contact], coordination, 1
-    hears[5, 6] = -coordination
-    return tick, hears
+    receives[5, 6] = -coordination
+    return tick, receives
 
 
-def whole_frame(tick: Floats, hears: Floats) -> Floats:
+def whole_frame(tick: Floats, receives: Floats) -> Floats:
     """Return the map (21, 21) of one frame of all users, each hearing the mean of the others."""
     mean = (np.ones((USERS, USERS)) - np.eye(USERS)) / (USERS - 1)
-    fast = np.kron(np.eye(USERS), tick) + np.kron(mean, hears)
+    fast = np.kron(np.eye(USERS), tick) + np.kron(mean, receives)
     frame = np.linalg.matrix_power(fast, TICKS)
     frame[6::7] = np.kron(np.eye(USERS), np.eye(7)[2])  # sent at the frame's start, heard in the next
     return frame
@@ -125,17 +125,17 @@ def moves() -> Floats:
 
 
 def numpy_loop(ticks: int) -> Floats:
-    """Play the three-user scene in NumPy, all users at once, a tick at a time; return (ticks, 3, 6)."""
+    """Play the three-user topology in NumPy, all users at once, a tick at a time; return (ticks, 3, 6)."""
     step = moves().T
     x, force = np.zeros((USERS, 4)), np.zeros((USERS, 2))
     x[0, 0] = START
-    sent, heard = np.zeros(USERS), np.zeros(USERS)
+    sent, received = np.zeros(USERS), np.zeros(USERS)
     rows = np.empty((ticks, USERS, 6))
     for k in range(ticks):
         rows[k, :, :4], rows[k, :, 4:] = x, force
         if k % TICKS == 0:
-            heard, sent = sent, x[:, 2].copy()
-        acting, others = force, (heard.sum() - heard) / (USERS - 1)
+            received, sent = sent, x[:, 2].copy()
+        acting, others = force, (received.sum() - received) / (USERS - 1)
         force = np.stack([K_C * (x[:, 0] - x[:, 2]), K_T * (x[:, 2] - others)], axis=1)
         x = x @ step[:4] + acting @ step[4:]
     return rows
@@ -161,7 +161,7 @@ def c_loop(number: int, frames: int, moved: int) -> Floats:
 
 
 def by_pathsim(seconds: float, tolerance: float | None) -> tuple[float, Floats]:
-    """Play the scene in PathSim (pathsim.readthedocs.io); return the seconds and the states at every tick.
+    """Play the topology in PathSim (pathsim.readthedocs.io); return the seconds and the states at every tick.
 
     It is given one linear plant of 12 states, a function of the forces, and sample-and-holds. It runs what
     happens at one instant in the order in which the blocks are listed, each seeing what those before it did;
@@ -177,22 +177,22 @@ def by_pathsim(seconds: float, tolerance: float | None) -> tuple[float, Floats]:
     own = np.kron(users, [[K_C, 0, -K_C, 0], [0, 0, K_T, 0]])
     others = np.kron((np.ones((USERS, USERS)) - users) / (USERS - 1), [[0.0], [-K_T]])
     system = StateSpace(a, b, np.eye(12), np.zeros((12, 6)), initial_value=START * np.eye(12)[0])
-    forces = Function(lambda *heard: own @ np.array(heard[:12]) + others @ np.array(heard[12:]))
+    forces = Function(lambda *received: own @ np.array(received[:12]) + others @ np.array(received[12:]))
     computed, acting = SampleHold(TICK), SampleHold(TICK)
-    taken, due = SampleHold(FRAME), SampleHold(FRAME, FRAME - TICK / 2)
+    used, due = SampleHold(FRAME), SampleHold(FRAME, FRAME - TICK / 2)
     scope = Scope(sampling_period=TICK)
     wires = [
         Connection(system[:12], forces[:12], scope[:12]),
-        *(Connection(system[4 * place + 2], taken[place]) for place in range(USERS)),
-        Connection(taken[:3], due[:3]),
+        *(Connection(system[4 * place + 2], used[place]) for place in range(USERS)),
+        Connection(used[:3], due[:3]),
         Connection(due[:3], forces[12:15]),
         Connection(forces[:6], computed[:6]),
         Connection(computed[:6], acting[:6]),
         Connection(acting[:6], system[:6]),
     ]
-    blocks = [system, forces, scope, acting, due, computed, taken]
-    asked = {} if tolerance is None else {"tolerance_lte_abs": tolerance, "tolerance_lte_rel": tolerance}
-    simulation = Simulation(blocks, wires, dt=TICK / 2, Solver=RKDP54, log=False, **asked)
+    blocks = [system, forces, scope, acting, due, computed, used]
+    requested = {} if tolerance is None else {"tolerance_lte_abs": tolerance, "tolerance_lte_rel": tolerance}
+    simulation = Simulation(blocks, wires, dt=TICK / 2, Solver=RKDP54, log=False, **requested)
     seconds_taken, _ = timed(
         partial(simulation.run, seconds + TICK / 4)
     )  # past the last tick, however rounded

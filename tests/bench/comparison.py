@@ -1,4 +1,4 @@
-"""The paper's scene asked of other programs for the same answers: `python -m tests.bench.comparison`.
+"""The paper's topology asked of other programs for the same answers: `python -m tests.bench.comparison`.
 
 First the spectral radius of one frame, without the eigenvalue 1 of the common translation:
 
@@ -26,8 +26,8 @@ from functools import partial
 import numpy as np
 
 import apc
-from apc.benchmark.timing import median_time, take_turns
-from apc.simulation.rows_in_time import blocks
+from apc.benchmark.timing import alternate, median_time
+from apc.simulation.output_blocks import blocks
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
 from tests.bench.by_hand import (
@@ -42,7 +42,7 @@ from tests.bench.by_hand import (
     numpy_loop,
     radius,
 )
-from tests.bench.judge import Judge, Timed, judged, parser_of
+from tests.bench.judge import Judge, Timed, decided, parser_of
 from tests.fifty_digits.truth import Truth, exact_course, spectral_truth
 from tests.paper_limit import truth
 from tests.topologies import AVERAGE, compiled, replaced
@@ -59,7 +59,7 @@ MOVED = replaced(AVERAGE, ("{count: 3}", f"{{count: 3, set: {{device.x: [{START}
 
 
 def radii(judge: Judge, damping: float, rounds: int) -> None:
-    """Compare the spectral radius of one scene."""
+    """Compare the spectral radius of one topology."""
     value = f"{damping!r} N*s/m"
     system = apc.set_parameters(compiled(AVERAGE), {"device.damping": value, "cube.damping": value})
     exact = spectral_truth(system)
@@ -73,11 +73,11 @@ def radii(judge: Judge, damping: float, rounds: int) -> None:
         "modes by hand": lambda: mode_radius(damping),
     }
     values = {name: call() for name, call in calls.items()} | {"apc": first.spectral_radius}
-    times = take_turns(calls, rounds)
+    times = alternate(calls, rounds)
     bounds = {"apc": first.spectral_radius_error}
     off = {name: float(abs(Fraction(one) - Fraction(exact.digits))) for name, one in values.items()}
     rows = [Timed(name, statistics.median(times[name]), off[name], bounds.get(name)) for name in calls]
-    title = f"spectral radius of the paper's scene, damping {damping:g} N·s/m"
+    title = f"spectral radius of the paper's topology, damping {damping:g} N·s/m"
     judge.table(title, rows, most={"modes by hand": 3.0})
 
 
@@ -117,7 +117,7 @@ def many(judge: Judge, rounds: int) -> None:
     calls = {"ours": lambda: apc.analyze_many(system, given), "theirs": lambda: modal_radii(k_c, k_t)}
     results = apc.analyze_many(system, given)
     naive = modal_radii(k_c, k_t)
-    times = take_turns(calls, rounds)
+    times = alternate(calls, rounds)
     some = np.random.default_rng(1).choice(len(k_c), KNOWN, replace=False)
     exact = np.array([float(truth(False, float(k_c[one]), float(k_t[one]), 0.0).radius) for one in some])
     off = np.abs(results.spectral_radius[some] - exact)
@@ -140,7 +140,7 @@ def many(judge: Judge, rounds: int) -> None:
 
 def main() -> None:
     """Print a table for each question."""
-    with judged(parser_of("comparison", __doc__)) as (judge, given):
+    with decided(parser_of("comparison", __doc__)) as (judge, given):
         rounds = 5 if given.quick else ROUNDS
         for damping in DAMPINGS:
             radii(judge, damping, rounds)

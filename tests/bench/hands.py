@@ -1,9 +1,9 @@
 """What hands do and feel, averages against meshes: `python -m tests.bench.hands --out FILE`.
 
-For two, three and five users of the paper's scene: the stiffness of the coordination that is borne with free
-hands, with devices clamped and with every passive hand; the viscosity that the network adds to each copy; how
-far copies are apart a newton of a slow push. The mesh is taken at equal stiffness (dashed) and, as circles,
-at equal effective gain, where it must be the average.
+For two, three and five users of the paper's topology: the stiffness of the coordination that is borne with
+free hands, with devices clamped and with every passive hand; the viscosity that the network adds to each
+copy; how far copies are apart a newton of a slow push. The mesh is taken at equal stiffness (dashed) and, as
+circles, at equal effective gain, where it must be the average.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from typing import Any
 
 import apc
 from apc.optional import need
-from apc.present.pictures import COLOURS, write_figure
-from apc.present.region_picture import PANEL
-from tests.bench.judge import Judge, judged, parser_of
+from apc.output.pictures import COLOURS, write_figure
+from apc.output.region_picture import PANEL
+from tests.bench.judge import Judge, decided, parser_of
 from tests.topologies import AVERAGE, MESH, compiled, replaced
 
 PEERS = (2, 3, 5)
 STIFFNESS = 200.0  # of the coordination, in N/m: stable with every passive hand, mesh or average
 HANDS = ("free", "clamped", "passive")
-SCENES = {"average": AVERAGE, "mesh": MESH}
+TOPOLOGIES = {"average": AVERAGE, "mesh": MESH}
 # By an independent program (N/m): borne with free hands, clamped, and any passive ones; right to its digits.
 KNOWN = {
     2: (1230.9581778682345, 276.5935041841296, 233.1356529292959),
@@ -35,17 +35,17 @@ Curves = Mapping[
 ]  # by the scheme and what is said of it, a value for each of PEERS
 
 
-def scene(text: str, peers: int, stiffness: float) -> apc.Model:
-    """Return the paper's scene of so many users."""
+def topology(text: str, peers: int, stiffness: float) -> apc.Model:
+    """Return the paper's topology of so many users."""
     pairs = ("count: 3", f"count: {peers}"), ("stiffness: 500", f"stiffness: {stiffness}")
     return compiled(replaced(text, *pairs))
 
 
-def borne(judge: Judge, name: str, hands: str) -> list[float]:
+def required(judge: Judge, name: str, hands: str) -> list[float]:
     """Return the largest stable stiffness with such hands, by users, and judge it."""
     values = []
     for peers in PEERS:
-        system = scene(SCENES[name], peers, STIFFNESS)
+        system = topology(TOPOLOGIES[name], peers, STIFFNESS)
         passive = hands == "passive"
         held = system if passive else apc.with_hands(system, hands)
         found = apc.critical(held, "coordination.stiffness", criterion="passive" if passive else None)
@@ -56,14 +56,14 @@ def borne(judge: Judge, name: str, hands: str) -> list[float]:
     return values
 
 
-def felt(judge: Judge, name: str) -> tuple[list[float], list[float]]:
+def used(judge: Judge, name: str) -> tuple[list[float], list[float]]:
     """Return what the network adds to the damping of each copy in N·s/m, and copies apart in mm a newton."""
     viscous, apart = [], []
     for peers in PEERS:
-        found = apc.feel(scene(SCENES[name], peers, STIFFNESS), frequencies=[0.1])
+        found = apc.transparency(topology(TOPOLOGIES[name], peers, STIFFNESS), frequencies=[0.1])
         assert found.low_frequency is not None
         viscous.append(found.low_frequency.damping / peers - 5.0 - 5.0)  # of each device and copy
-        apart.append(1e3 * abs(found.error_per_force[0]))
+        apart.append(1e3 * abs(found.coordination_error[0]))
         gain = STIFFNESS * (peers - 1 if name == "mesh" else 1)
         formula = gain * ((8e-3 - 1e-3) / 2 + 8e-3)
         what = f"{name} of {peers}: viscosity beside K((T_n − T_c)/2 + T_d) = {formula:.4f}"
@@ -107,11 +107,11 @@ def main() -> None:
     """Print, judge and draw."""
     parser = parser_of("hands", __doc__)
     parser.add_argument("--out", type=Path, help="draw it into this file: .svg, .png or .pdf")
-    with judged(parser) as (judge, given):
+    with decided(parser) as (judge, given):
         curves: dict[tuple[str, str], list[float]] = {}
-        for name in SCENES:
-            curves |= {(name, hands): borne(judge, name, hands) for hands in HANDS}
-            curves[name, "viscous"], curves[name, "apart"] = felt(judge, name)
+        for name in TOPOLOGIES:
+            curves |= {(name, hands): required(judge, name, hands) for hands in HANDS}
+            curves[name, "viscous"], curves[name, "apart"] = used(judge, name)
         print("stiffness borne with hands [N/m]; viscosity of the network [N*s/m], copies apart [mm/N]")
         for (name, what), values in curves.items():
             listed = "  ".join(f"{n} users {v:.4f}" for n, v in zip(PEERS, values, strict=True))

@@ -11,9 +11,13 @@ printed at the end are those of the first table of the page (`tests.bench.__main
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import TypeVar
+
+R = TypeVar("R")
 
 # Two medians of one program on one machine differ by up to a quarter where others work beside it.
 NOISE = 1.25
@@ -131,16 +135,16 @@ def time_of(seconds: float) -> str:
     return f"{seconds:.3g} s" if seconds >= 1 else f"{1e3 * seconds:.3g} ms"
 
 
-def parser_of(name: str, about: str | None) -> argparse.ArgumentParser:
+def parser_of(name: str, description: str | None) -> argparse.ArgumentParser:
     """Return the parser of the benchmark in a module of a name, with its docstring."""
-    parser = argparse.ArgumentParser(prog=f"python -m tests.bench.{name}", description=about)
+    parser = argparse.ArgumentParser(prog=f"python -m tests.bench.{name}", description=description)
     parser.add_argument("--strict", action="store_true", help="a missed target of time is a failure too")
     parser.add_argument("--quick", action="store_true", help="smaller sizes, fewer runs")
     return parser
 
 
 @contextmanager
-def judged(parser: argparse.ArgumentParser) -> Iterator[tuple[Judge, argparse.Namespace]]:
+def decided(parser: argparse.ArgumentParser) -> Iterator[tuple[Judge, argparse.Namespace]]:
     """Give a judge and what the command line says, one core's worth of threads, and end the program."""
     import numpy as np  # not by who measures processes: one begins as a copy
 
@@ -151,3 +155,10 @@ def judged(parser: argparse.ArgumentParser) -> Iterator[tuple[Judge, argparse.Na
     with single_threaded(), np.errstate(all="ignore"):
         yield judge, given
     judge.end()
+
+
+def elapsed(call: Callable[[], R]) -> tuple[float, R]:
+    """Return the wall-clock seconds of a call, the processes it starts included, and its result."""
+    began = time.perf_counter()
+    result = call()
+    return time.perf_counter() - began, result

@@ -1,7 +1,8 @@
-"""This version beside another, question by question over all scenes: `python -m tests.bench.paired OTHER`.
+"""This version beside another, question by question over all topologies: `python -m tests.bench.paired
+OTHER`.
 
 OTHER is the Python of an environment in which another version of apc is installed. Both answer the same
-question on the same scene in turn, in one process each, with one thread. A number is wrong if the two are
+question on the same topology in turn, in one process each, with one thread. A number is wrong if the two are
 farther apart than both their errors, a verdict if it is another one; a time is that of a processor. What one
 version answers and the other does not is listed with its message.
 
@@ -24,10 +25,10 @@ from pathlib import Path
 from typing import Any
 
 import apc
-from apc.answer import answer
+from apc.analysis_report import answer
 
 ROOT = Path(__file__).resolve().parents[2]
-FOLDERS = ("models/scenes", "tests/scenes", "tests/hard")
+FOLDERS = ("models/topologies", "tests/small_topologies", "tests/hard")
 LONGEST_S = 60
 Numbers = list[tuple[float, float]]
 
@@ -67,10 +68,10 @@ ASIDE, MORE, WIDEST = 3.0, 1e-9, 1e-6
 def _bracketed(model: Any, name: str, criterion: str) -> tuple[str, Numbers]:
     """Return what is wrong with the critical values of a parameter, and the values with their errors."""
     found = apc.critical(model, name, criterion=criterion)
-    decide = apc.passive_hands if criterion == "passive" else apc.analyze
+    decide = apc.absolute_stability if criterion == "passive" else apc.analyze
 
     def stable(value: float) -> bool | None:
-        return decide(model, set={name: f"{value!r} {found.unit}".removesuffix(" 1")}).stable
+        return decide(model, params={name: f"{value!r} {found.unit}".removesuffix(" 1")}).stable
 
     def side(crossing: Any, aside: float) -> tuple[bool | None, bool | None]:
         below, above = (stable(crossing.value + way * aside) for way in (-1, 1))
@@ -97,7 +98,7 @@ QUESTIONS: dict[str, Callable[..., tuple[str, Numbers]]] = {
     "first stiffness": lambda model: _critical(model, "stiffness", 0),
     "last delay": lambda model: _critical(model, "delay", -1),
     "region": _region,
-    "passive hands": lambda model: (apc.passive_hands(model).verdict, []),
+    "passive hands": lambda model: (apc.absolute_stability(model).verdict, []),
     "simulate": _simulate,
     "default output": lambda model: (answer(model).analysis.verdict, []),
     "bracketed": _bracketed,
@@ -150,7 +151,7 @@ def started(python: str) -> subprocess.Popen[str]:
 
 
 def answered(version: subprocess.Popen[str], *question: object) -> dict[str, Any]:
-    """Return what a version says to a scene's file, a question and a number of runs."""
+    """Return what a version says to a topology's file, a question and a number of runs."""
     assert version.stdin is not None and version.stdout is not None
     version.stdin.write(json.dumps(question) + "\n")
     return dict(json.loads(version.stdout.readline()))
@@ -158,32 +159,32 @@ def answered(version: subprocess.Popen[str], *question: object) -> dict[str, Any
 
 @dataclass(slots=True)
 class Pairs:
-    """What two versions took and how they differ, over the scenes."""
+    """What two versions took and how they differ, over the topologies."""
 
     seconds: list[tuple[float, float, str]] = field(default_factory=list)
     bounds: list[float] = field(default_factory=list)
     different: list[str] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
 
-    def add(self, scene: str, ours: dict[str, Any], theirs: dict[str, Any]) -> None:
-        """Take down the two answers of a scene."""
+    def add(self, topology: str, ours: dict[str, Any], theirs: dict[str, Any]) -> None:
+        """Take down the two answers of a topology."""
         if ours["refused"] or theirs["refused"]:
             if ours["refused"] != theirs["refused"]:
                 who = "this version" if ours["refused"] else "the other"
-                self.refused.append(f"{scene}: {who}: {ours['refused'] or theirs['refused']}")
+                self.refused.append(f"{topology}: {who}: {ours['refused'] or theirs['refused']}")
             return
-        self.seconds.append((min(ours["seconds"]), min(theirs["seconds"]), scene))
+        self.seconds.append((min(ours["seconds"]), min(theirs["seconds"]), topology))
         pairs = list(zip(ours["numbers"], theirs["numbers"], strict=False))
         self.bounds += [a[1] / b[1] for a, b in pairs if b[1] > 0 and a[1] < float("inf")]
         apart = any(abs(a[0] - b[0]) > a[1] + b[1] for a, b in pairs)
         unequal = len(ours["numbers"]) != len(theirs["numbers"])
         if apart or unequal or ours["words"] != theirs["words"]:
-            said = [f"{answer['words']} {answer['numbers'][:3]}" for answer in (ours, theirs)]
-            self.different.append(f"{scene}: {said[0]}, the other {said[1]}")
+            printed = [f"{answer['words']} {answer['numbers'][:3]}" for answer in (ours, theirs)]
+            self.different.append(f"{topology}: {printed[0]}, the other {printed[1]}")
 
     def report(self, question: str) -> None:
-        """Print what the scenes took, and where the answers differ."""
-        print(f"\n{question}: {len(self.seconds)} scenes answered by both")
+        """Print what the topologies took, and where the answers differ."""
+        print(f"\n{question}: {len(self.seconds)} topologies answered by both")
         if self.seconds:
             ours, theirs = (sum(row[place] for row in self.seconds) for place in (0, 1))
             ratios = sorted((row[0] / max(row[1], 1e-6), row[2]) for row in self.seconds)
@@ -209,13 +210,13 @@ def bracketed(version: subprocess.Popen[str], files: Sequence[Path]) -> bool:
             model = apc.compile(file)
         except apc.ApcError:
             continue
-        asked = [
+        requested = [
             (name, criterion)
             for ending, criteria in BRACKETS.items()
             for name in _named(model, ending)[:EACH]
             for criterion in criteria
         ]
-        for name, criterion in asked:
+        for name, criterion in requested:
             told = answered(version, str(file), BRACKETED, 1, name, criterion)
             wrong, numbers = told["words"], told["numbers"]
             if told["refused"].startswith("took"):
@@ -234,7 +235,7 @@ def bracketed(version: subprocess.Popen[str], files: Sequence[Path]) -> bool:
 
 
 def main() -> None:
-    """Ask both versions every question on every scene, and print the comparison."""
+    """Ask both versions every question on every topology, and print the comparison."""
     from tests.bench.judge import Judge, parser_of
 
     parser = parser_of("paired", __doc__)
@@ -250,8 +251,8 @@ def main() -> None:
     for question in [one for one in chosen if one != BRACKETED] if given.other else []:
         pairs, runs = Pairs(), 3 if question == "analyze" else 1
         for file in files:
-            asked = (str(file), question, runs)
-            pairs.add(file.stem, answered(ours, *asked), answered(theirs, *asked))
+            requested = (str(file), question, runs)
+            pairs.add(file.stem, answered(ours, *requested), answered(theirs, *requested))
         pairs.report(question)
         judge.right(f"{question}: the same answers", not pairs.different)
     if BRACKETED in chosen:

@@ -1,8 +1,8 @@
 """Peers in real time on loopback: how late their ticks are, and what `simulate` says of what they did.
 
-Run it from the project's folder: `python -m tests.bench.play`. The paper's scene, three processes, packets
-held back and lost at the sender. Then the processor time of one tick of a peer, of several scenes, without
-waiting: what is left of 1 ms is how late a tick may begin.
+Run it from the project's folder: `python -m tests.bench.play`. The paper's topology, three processes, packets
+held back and lost at the sender. Then the processor time of one tick of a peer, of several topologies,
+without waiting: what is left of 1 ms is how late a tick may begin.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from time import process_time
 
 import apc
 from apc.compiler.compiled import Model
-from apc.frame.exchange import build_exchange
+from apc.frame.communication_graph import build_exchange
 from apc.frame.parameters import resolve
-from apc.loop.beside import compare_run
-from apc.loop.peer import PeerLoop
-from apc.loop.run import RealtimeRun
-from apc.loop.start import Play, play_all
-from apc.present.loop_output import ticks_text
-from apc.simulation.rows_in_time import pushes
-from tests.bench.judge import judged, parser_of
-from tests.topologies import AVERAGE, SCENES, compiled, replaced
+from apc.output.realtime_output import ticks_text
+from apc.realtime.peer import PeerLoop
+from apc.realtime.peer_run import RealtimeRun
+from apc.realtime.run_comparison import compare_run
+from apc.realtime.start import LocalRun, run_all
+from apc.simulation.output_blocks import forces_in_time
+from tests.bench.judge import decided, parser_of
+from tests.topologies import AVERAGE, TOPOLOGIES, compiled, replaced
 
 MOVED = replaced(
     AVERAGE,
@@ -42,40 +42,40 @@ def work_of_a_tick(system: Model) -> tuple[float, int]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listening:
         addresses = {name: ("127.0.0.1", at + 1) for at, name in enumerate(names[1:])}
         loop = PeerLoop(system, names[0], listening, addresses, digest=bytes(8), duration=Fraction(1))
-        given = pushes(loop.simulation, 0)
+        given = forces_in_time(loop.simulation, 0)
         loop.player.warm_up()
-        taken = []
+        used = []
         for first in range(0, FRAMES, loop.simulation.length):
             count = min(loop.simulation.length, FRAMES - first)
             before, begin = len(loop.player.log), process_time()
-            loop.player.play(first, count, given)
-            taken.append((process_time() - begin) / (len(loop.player.log) - before))
-    return min(taken), len(system.kinds[system.groups[0].kind].states)
+            loop.player.advance(first, count, given)
+            used.append((process_time() - begin) / (len(loop.player.log) - before))
+    return min(used), len(system.peer_types[system.groups[0].peer_type].states)
 
 
 def main() -> None:
     """Print how late ticks are, what is lost, how far from `simulate`, and the work of a tick."""
     parser = parser_of("play", __doc__)
     parser.add_argument("--seconds", type=int, default=60)
-    with judged(parser) as (judge, given):
+    with decided(parser) as (judge, given):
         seconds, system = 3 if given.quick else given.seconds, compiled(MOVED)
-        how = Play(duration=Fraction(seconds), secret=bytes(16), emulate=True, seed=None, patience=60.0)
-        peers = [part.run for part in play_all(system, how) if part.run is not None]
+        how = LocalRun(duration=Fraction(seconds), secret=bytes(16), emulate=True, seed=None, patience=60.0)
+        peers = [part.run for part in run_all(system, how) if part.run is not None]
         run = RealtimeRun("", system, tuple(sorted(peers, key=lambda one: one.number)))
-        beside = compare_run(run)
+        alongside = compare_run(run)
         print(f"three peers, {seconds} s, lan: 8 ms, jitter 4 ms, loss 5 %, in the sender; sealed packets")
-        print("\n".join(ticks_text(beside.ticks)))
-        judge.right("a run that can be played again", not beside.why_not)
-        for unit, (far, large) in beside.apart.items():
+        print("\n".join(ticks_text(alongside.ticks)))
+        judge.right("a run that can be played again", not alongside.why_not)
+        for unit, (far, large) in alongside.differences.items():
             print(
                 f"  apart from simulate, fed with what each tick had: {far:.0e} {unit} of {large:.3g} {unit}"
             )
             judge.within(f"apart from simulate, {unit}", far, MOST_APART)
         print("\nwork of one tick of a peer       states   processor")
         for name in NAMES:
-            work, states = work_of_a_tick(apc.compile(SCENES / f"{name}.yaml"))
-            kept = judge.in_time(f"{name}, a tick in s", work, TICK)
-            print(f"  {name:<30} {states:6} {work * 1e6:8.0f} µs   {kept}")
+            work, states = work_of_a_tick(apc.compile(TOPOLOGIES / f"{name}.yaml"))
+            stored = judge.in_time(f"{name}, a tick in s", work, TICK)
+            print(f"  {name:<30} {states:6} {work * 1e6:8.0f} µs   {stored}")
 
 
 if __name__ == "__main__":

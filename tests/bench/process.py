@@ -16,30 +16,30 @@ import sys
 import tempfile
 from pathlib import Path
 
-from apc.benchmark.timing import spread_of, waited
-from tests.bench.judge import Judge, parser_of
+from apc.benchmark.timing import spread_of
+from tests.bench.judge import Judge, elapsed, parser_of
 
-SCENES = Path(__file__).resolve().parents[2] / "models" / "scenes"
+TOPOLOGIES = Path(__file__).resolve().parents[2] / "models" / "topologies"
 RUNS = 7
-SCENE, STAR = "three-users-average", "client-server"
+TOPOLOGY, STAR = "three-users-average", "client-server"
 # A command and its target in seconds.
 COMMANDS: tuple[tuple[str, str, float | None], ...] = (
     ("import apc", "-c import%apc", None),
     ("help", "-m apc --help", 0.1),
-    ("compile", f"-m apc compile --force {SCENE}.yaml", 0.4),
+    ("compile", f"-m apc compile --force {TOPOLOGY}.yaml", 0.4),
     ("compile star", f"-m apc compile --force {STAR}.yaml", 0.4),
-    ("unchanged", f"-m apc compile {SCENE}.yaml", 0.15),
-    ("analyze", f"-m apc analyze {SCENE}.apc", 0.25),
-    ("simulate", f"-m apc simulate --duration 1s {SCENE}.apc", None),
-    ("feel", f"-m apc feel {SCENE}.apc", None),
-    ("region", f"-m apc region {SCENE}.apc", None),
+    ("unchanged", f"-m apc compile {TOPOLOGY}.yaml", 0.15),
+    ("analyze", f"-m apc analyze {TOPOLOGY}.apc", 0.25),
+    ("simulate", f"-m apc simulate --duration 1s {TOPOLOGY}.apc", None),
+    ("transparency", f"-m apc transparency {TOPOLOGY}.apc", None),
+    ("region", f"-m apc region {TOPOLOGY}.apc", None),
 )
 
 
 def _environment(folder: Path) -> dict[str, str]:
     """Return an environment in which Python keeps its compiled files, as where apc is installed."""
-    kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
-    return kept | {"PYTHONPYCACHEPREFIX": str(folder / "python")}
+    stored = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    return stored | {"PYTHONPYCACHEPREFIX": str(folder / "python")}
 
 
 def once(words: str, folder: Path, where: Path | None = None) -> tuple[float, float, float, str]:
@@ -55,7 +55,7 @@ def once(words: str, folder: Path, where: Path | None = None) -> tuple[float, fl
         process.returncode = os.waitstatus_to_exitcode(status)
         return printed, process.returncode, used
 
-    seconds, (printed, code, used) = waited(run)
+    seconds, (printed, code, used) = elapsed(run)
     assert code == 0, words
     scale = 2.0**20 if sys.platform == "darwin" else 2.0**10
     return seconds, used.ru_utime + used.ru_stime, used.ru_maxrss / scale, printed.decode()
@@ -63,8 +63,8 @@ def once(words: str, folder: Path, where: Path | None = None) -> tuple[float, fl
 
 def commands(judge: Judge, folder: Path, runs: int) -> None:
     """Print a line a command."""
-    for scene in (SCENE, STAR):
-        shutil.copy(SCENES / f"{scene}.yaml", folder)
+    for topology in (TOPOLOGY, STAR):
+        shutil.copy(TOPOLOGIES / f"{topology}.yaml", folder)
     print(f"{'process':<12} {'median':>9} {'spread':>9} {'processor':>10} {'memory':>9}   target")
     for title, words, most in COMMANDS:
         rows = [once(words, folder) for _ in range(runs + 1)][1:]

@@ -1,6 +1,6 @@
 """Random scans of a parameter or delay against a fine grid: `python -m tests.bench.random_scans`.
 
-Stiffnesses and delays are scanned in scenes with clocks, delays and gains at random. The truth is
+Stiffnesses and delays are scanned in topologies with clocks, delays and gains at random. The truth is
 the matrix of all peers (see `tests.bruteforce`), whose eigenvalues are looked at on a grid and on either side
 of every crossing that is claimed: none may be invented or missed.
 """
@@ -17,8 +17,8 @@ import apc
 from apc.threads import single_threaded
 from apc.verdict import ProofMethod
 from tests.bench.by_hand import Floats
-from tests.bench.judge import judged, parser_of
-from tests.bruteforce import Scene, frame_matrices
+from tests.bench.judge import decided, parser_of
+from tests.bruteforce import TopologySource, frame_matrices
 from tests.topologies import compiled
 from tests.truths import text_of
 
@@ -26,7 +26,7 @@ from tests.truths import text_of
 UNSURE = 1e-10
 
 # How far beside a claimed crossing, relatively, its sides are looked at.
-BESIDE = 1e-5
+ALONGSIDE = 1e-5
 
 # Points of the grid over a parameter, and over a delay, whose every value is a schedule of its own.
 GRID, DELAYS = 400, 24
@@ -36,7 +36,7 @@ GRID, DELAYS = 400, 24
 MOST_OPEN = 2e-2
 
 
-# What is scanned, and what `Scene` calls it.
+# What is scanned, and what `TopologySource` calls it.
 _FIELDS = {
     "contact.stiffness": "kc",
     "coordination.stiffness": "kt",
@@ -48,21 +48,21 @@ _FIELDS = {
 
 @dataclass(frozen=True)
 class Draw:
-    """A scan: the scene, and what varies in it; a delay's values are looked at one by one."""
+    """A scan: the topology, and what varies in it; a delay's values are looked at one by one."""
 
-    scene: Scene
+    topology: TopologySource
     name: str
 
     @property
     def present(self) -> float:
-        """The value that the scene has."""
-        return float(getattr(self.scene, _FIELDS[self.name]))
+        """The value that the topology has."""
+        return float(getattr(self.topology, _FIELDS[self.name]))
 
     @property
     def grid(self) -> Floats:
         """Values from next to nothing to far beyond the present one; no delay at which events coincide."""
         if self.name.endswith("delay"):
-            longest = max(self.present, float(self.scene.haptic)) * 3
+            longest = max(self.present, float(self.topology.haptic)) * 3
             return longest * (np.arange(DELAYS) + np.pi / 8) / DELAYS
         wide = np.geomspace(1e-9 * self.present, 900 * self.present, GRID // 2)
         return np.concatenate([wide, np.linspace(0, 6 * self.present, GRID // 2)[1:]])
@@ -72,9 +72,9 @@ class Draw:
         field = _FIELDS[self.name]
         if self.name.endswith("delay"):
             times = [Fraction(float(one)) for one in values]
-            frames = [frame_matrices(replace(self.scene, **{field: one}), 1)[0] for one in times]
+            frames = [frame_matrices(replace(self.topology, **{field: one}), 1)[0] for one in times]
         else:
-            frames = [*frame_matrices(replace(self.scene, **{field: values}), len(values))]
+            frames = [*frame_matrices(replace(self.topology, **{field: values}), len(values))]
         listed = [np.linalg.eigvals(one) for one in frames]
         return np.array([np.abs(np.delete(one, np.argmin(np.abs(one - 1)))).max() for one in listed])
 
@@ -89,7 +89,7 @@ def draw(generator: random.Random) -> Draw:
     tick = ms * pick([Fraction(1), Fraction(1), Fraction(1, 2), Fraction(2)])
     period = tick * pick([1, 2, 4, 4, Fraction(5, 2)])
     late, contact = (pick([Fraction(0), tick, tick, ms * generator.randint(1, 250) / 100]) for _ in range(2))
-    scene = Scene(
+    topology = TopologySource(
         operator=pick(["mean", "sum"]),
         peers=generator.randint(2, 3),
         kt=decades(1.5, 3.3),
@@ -103,17 +103,17 @@ def draw(generator: random.Random) -> Draw:
         haptic=tick,
         network=period,
     )
-    return Draw(scene, pick([*_FIELDS]))
+    return Draw(topology, pick([*_FIELDS]))
 
 
 def check(scan: Draw, found: apc.Critical) -> str:
     """Return what is wrong with a scan, "" if nothing is."""
-    low, high = found.scanned
+    low, high = found.searched_to
     if not low <= scan.present <= high:
-        return f"the present value {scan.present!r} is not in what was scanned, {found.scanned}"
+        return f"the present value {scan.present!r} is not in what was scanned, {found.searched_to}"
     edges = np.array([one.value for one in found.crossings])
     errors = np.array([one.error for one in found.crossings])
-    aside = BESIDE * np.abs(edges) + 2 * errors
+    aside = ALONGSIDE * np.abs(edges) + 2 * errors
     points = np.concatenate([scan.grid, edges - aside, edges + aside])
     points = points[(points > low) & (points < high)]
     # Nearer to a crossing than its error nothing is claimed; nearer to another than the cell, neither.
@@ -143,12 +143,12 @@ class Tally:
 
 
 def run(points: int, *, seed: int = 0) -> Tally:
-    """Scan so many random scenes, of a seed."""
+    """Scan so many random topologies, of a seed."""
     generator, tally = random.Random(seed), Tally()
     with single_threaded():
         for _ in range(points):
             scan = draw(generator)
-            text = text_of(scan.scene)
+            text = text_of(scan.topology)
             tally.scans += 1
             try:
                 found = apc.critical(compiled(text), scan.name)
@@ -158,7 +158,7 @@ def run(points: int, *, seed: int = 0) -> Tally:
                 continue
             tally.crossings += len(found.crossings)
             tally.estimated += sum(one.proof.method is ProofMethod.ESTIMATED for one in found.crossings)
-            tally.open += not found.whole
+            tally.open += not found.complete
             tally.wrong += [f"{scan.name}: {fault}\n{text}"] if fault else []
     return tally
 
@@ -168,7 +168,7 @@ def main() -> None:
     parser = parser_of("random_scans", __doc__)
     parser.add_argument("--count", type=int, default=600)
     parser.add_argument("--seed", type=int, default=1)
-    with judged(parser) as (judge, given):
+    with decided(parser) as (judge, given):
         tally = run(40 if given.quick else given.count, seed=given.seed)
         print(replace(tally, wrong=[]))
         for one in tally.wrong:

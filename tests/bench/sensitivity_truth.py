@@ -1,7 +1,7 @@
-"""Sensitivities of random scenes against 320-bit arithmetic, and frequencies beside their eigenvalues.
+"""Sensitivities of random topologies against 320-bit arithmetic, and frequencies beside their eigenvalues.
 
-`run` draws scenes of the built-in library (`bench.shapes`); `check_sensitivities` and `check_frequencies`
-serve any scene. The truth of derivatives comes from the compiled functions alone, event by event
+`run` draws topologies of the built-in library (`bench.shapes`); `check_sensitivities` and `check_frequencies`
+serve any topology. The truth of derivatives comes from the compiled functions alone, event by event
 (`fifty_digits.events`): from frame matrices on either side of a value.
 """
 
@@ -21,11 +21,11 @@ import numpy as np
 
 from apc.analysis.analysis import Analysis, analyze
 from apc.compiler.compiled import Model
-from apc.eigen.balls import precision
-from apc.frame.instance import prepare
-from apc.frame.names import find, parameter_of
+from apc.eigen.ball_arithmetic import precision
+from apc.frame.numeric_model import prepare
 from apc.frame.overrides import Override, apply
-from apc.vary.sensitivity import Sensitivities, sensitivities
+from apc.frame.parameter_names import find, parameter_of
+from apc.parameter_studies.sensitivity import Sensitivities, sensitivities
 from tests.bench.shapes import PARTS, draw_shape
 from tests.fifty_digits.events import Happening, build_peers, refusal
 from tests.fifty_digits.truth import RIGID, _common_whom, _difference_whom, _from_state, _to_state, classes_of
@@ -40,7 +40,7 @@ STEP = 2.0**-30
 SAME = 1e-9
 
 # Eigenvalues of the truth that differ by more differ.
-APART = 1e-30
+SEPARATE = 1e-30
 
 # What rounding may do to a derivative, of which three digits are printed, relative to it and to the radius,
 # at least so much, over the value: as many digits are lost as the condition of its eigenvalue has.
@@ -50,7 +50,7 @@ ROUNDED, LEAST = 1e-7, 1e-3
 FADED, TURNED = 1e-9, 1e-3
 
 
-def scene(generator: random.Random) -> str:
+def topology(generator: random.Random) -> str:
     """Return a topology of the built-in library at random, in which something may be unstable."""
     own = tuple(f"type: {name}" for name in PARTS)
     texts = (draw_shape(generator).text for _ in itertools.count())
@@ -58,27 +58,27 @@ def scene(generator: random.Random) -> str:
 
 
 def check_sensitivities(system: Model, found: Analysis | Sensitivities) -> str:
-    """Return what is wrong with the derivatives of a scene's spectral radius, "" if nothing is.
+    """Return what is wrong with the derivatives of a topology's spectral radius, "" if nothing is.
 
     Of an analysis the radius is compared with theirs.
     """
-    said = found if isinstance(found, Sensitivities) else sensitivities(system)
-    if isinstance(found, Analysis) and said.active:
-        apart = abs(said.radius - found.spectral_radius)
+    printed = found if isinstance(found, Sensitivities) else sensitivities(system)
+    if isinstance(found, Analysis) and printed.active:
+        apart = abs(printed.radius - found.spectral_radius)
         if not apart <= 1e-9 + found.spectral_radius_error:
-            return f"the radius is {found.spectral_radius}, that of the derivatives {said.radius}"
-    if refusal(system, in_time=False) or not said.active:
+            return f"the radius is {found.spectral_radius}, that of the derivatives {printed.radius}"
+    if refusal(system, in_time=False) or not printed.active:
         return ""
     with precision(BITS):
         here = _matrices(system)
         radius = max((float(abs(v)) for m in here for v in _values(m) if not _is_rigid(v)), default=0.0)
-        if abs(radius - said.radius) > SAME * max(1.0, radius):
-            return f"the radius of the derivatives is {said.radius}, truth {radius}"
-        tops = [_top(here, value) for value, _ in said.active]
+        if abs(radius - printed.radius) > SAME * max(1.0, radius):
+            return f"the radius of the derivatives is {printed.radius}, truth {radius}"
+        tops = [_top(here, value) for value, _ in printed.active]
         if any(not top for top in tops):
-            return "an eigenvalue that is differentiated is none of the scene"
+            return "an eigenvalue that is differentiated is none of the topology"
         moved: dict[str, list[Any]] = {}
-        for row in said.rows:
+        for row in printed.rows:
             if row.parameter not in moved:
                 moved[row.parameter] = _slopes(system, here, row.parameter)
             truths = [rate for top in tops[row.mode] for rate in _rates(top, moved[row.parameter])]
@@ -118,7 +118,7 @@ def _top(here: Sequence[Any], value: complex) -> list[tuple[int, list[Any], Any,
         reach = SAME * max(1.0, abs(value))
         own = [one for one in values if not _is_rigid(one) and abs(complex(one) - value) < reach]
         groups = [own] if own else []
-        if any(float(abs(one - own[0])) > APART for one in own):
+        if any(float(abs(one - own[0])) > SEPARATE for one in own):
             groups += [[one] for one in own]
         for group in groups:
             with contextlib.suppress(ZeroDivisionError):  # W V of a defective cluster has no inverse
@@ -202,27 +202,27 @@ def check_frequencies(found: Analysis) -> str:
 def _happenings(system: Model) -> Iterator[Happening]:
     """Yield the common motion, and each class's differences, as peers to follow."""
     classes = classes_of(system)
-    sites = build_peers(system, classes.peers, classes.groups, linear=True)
-    yield Happening(system, sites, _common_whom(sites, classes))
+    subsystems = build_peers(system, classes.peers, classes.groups, linear=True)
+    yield Happening(system, subsystems, _common_whom(subsystems, classes))
     for place, count in enumerate(classes.counts):
         if count > 1:
-            yield Happening(system, [sites[place]], _difference_whom(sites, classes, place))
+            yield Happening(system, [subsystems[place]], _difference_whom(subsystems, classes, place))
 
 
-def _whole_map(scene: Happening, frame: Fraction) -> Any:
+def _whole_map(topology: Happening, frame: Fraction) -> Any:
     """Return the map of one frame over all states."""
-    n = sum(len(site.names) for site in scene.sites)
-    play = _from_state(scene, list(np.eye(n, dtype=int).astype(object)))
-    scene.play(play, Fraction(0), frame)
-    rows = [np.broadcast_to(np.asarray(row, dtype=object), n) for row in _to_state(scene, play)]
+    n = sum(len(subsystem.names) for subsystem in topology.subsystems)
+    play = _from_state(topology, list(np.eye(n, dtype=int).astype(object)))
+    topology.play(play, Fraction(0), frame)
+    rows = [np.broadcast_to(np.asarray(row, dtype=object), n) for row in _to_state(topology, play)]
     return flint.arb_mat(n, n, [flint.arb(entry) for row in rows for entry in row])
 
 
 def run(points: int, *, seed: int = 0) -> list[str]:
-    """Check so many random scenes; return what is wrong, with each scene's text."""
+    """Check so many random topologies; return what is wrong, with each topology's text."""
     generator, wrong = random.Random(seed), []
     for _ in range(points):
-        text = scene(generator)
+        text = topology(generator)
         system = compiled(text)
         found = analyze(system)
         wrong += [

@@ -1,5 +1,5 @@
-# ruff: noqa: E501 -- scenes are written by long lines
-"""Random topologies of every shape a scene may have: graphs, weights, groups, clocks, integrators, expressions.
+# ruff: noqa: E501 -- topologies are written by long lines
+"""Random topologies of every shape a topology may have: graphs, weights, groups, clocks, integrators, expressions.
 
 Takes: a generator. Gives: `Shape`, `SHAPES`, `draw_shape`, `numbers`, `PARTS`.
 Guarantees: each compiles, and is linear or says what of it is not.
@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from apc.compiler.compiled import Model
-from apc.frame.names import ParameterRef
 from apc.frame.overrides import Override
+from apc.frame.parameter_names import ParameterRef
 from tests.fuzz.grammar import grown, rules_of
 
 # Least and largest decade, and the chance of 0.
@@ -50,7 +50,7 @@ COORDINATION: dict[str, Decades] = {
 PARTS = {
     "WeightedMean": """
 component: WeightedMean
-about: Pulls a copy to what the weights make of the others, for rows that add up to 1.
+description: Pulls a copy to what the weights make of the others, for rows that add up to 1.
 connectors: {object: Flange}
 sends: {x: sample(object.x)}
 parameters: {stiffness: {unit: N/m}, damping: {unit: N*s/m, default: 0}, clock: clock, link: link, delay: {unit: s, default: 0}}
@@ -60,7 +60,7 @@ equations:
 """,
     "Integrator": """
 component: Integrator
-about: Proportional, integral and differential, acting at every moment.
+description: Proportional, integral and differential, acting at every moment.
 connectors: {a: Flange, b: Flange}
 parameters: {kp: {unit: N/m}, ki: {unit: N/(m*s)}, kd: {unit: N*s/m}, leak: {unit: Hz}}
 variables: {i: {unit: m*s, start: 0 m*s}}
@@ -71,7 +71,7 @@ equations:
 """,
     "SampledIntegrator": """
 component: SampledIntegrator
-about: A sum of errors at ticks, leaky or not, with a filtered difference.
+description: A sum of errors at ticks, leaky or not, with a filtered difference.
 connectors: {a: Flange, b: Flange}
 parameters:
   kp: {unit: N/m}
@@ -92,7 +92,7 @@ equations:
 """,
     "HeldIntegrator": """
 component: HeldIntegrator
-about: An integrator of a held error.
+description: An integrator of a held error.
 connectors: {a: Flange, b: Flange}
 parameters: {kp: {unit: N/m}, ki: {unit: N/(m*s)}, kd: {unit: N*s/m}, leak: {unit: Hz}, clock: clock, delay: {unit: s, default: 0}}
 variables: {i: {unit: m*s, start: 0 m*s}}
@@ -103,7 +103,7 @@ equations:
 """,
     "Memory": """
 component: Memory
-about: A second-order digital filter of an error.
+description: A second-order digital filter of an error.
 connectors: {a: Flange, b: Flange}
 parameters: {gain: {unit: N/m}, a1: {unit: 1}, a2: {unit: 1}, b0: {unit: 1}, b1: {unit: 1}, clock: clock, delay: {unit: s, default: 0}}
 variables: {e: {unit: m, start: 0 m}, y: {unit: m, start: 0 m}, z: {unit: m, start: 0 m}}
@@ -116,7 +116,7 @@ equations:
 """,
     "Expressions": """
 component: Expressions
-about: A mesh with plain expressions wherever an expression can stand.
+description: A mesh with plain expressions wherever an expression can stand.
 connectors: {object: Flange}
 sends: {z: sample(object.x) + tau*sample(der(object.x)), w: -2*sample(object.x)}
 parameters: {stiffness: {unit: N/m}, damping: {unit: N*s/m}, tau: {unit: s}, clock: clock, link: link, delay: {unit: s, default: 0}}
@@ -128,7 +128,7 @@ equations:
 """,
     "Named": """
 component: Named
-about: Expressions, every expression a variable of its own.
+description: Expressions, every expression a variable of its own.
 connectors: {object: Flange}
 sends: {z: sample(object.x) + tau*sample(der(object.x)), w: -2*sample(object.x)}
 parameters: {stiffness: {unit: N/m}, damping: {unit: N*s/m}, tau: {unit: s}, clock: clock, link: link, delay: {unit: s, default: 0}}
@@ -143,7 +143,7 @@ equations:
 """,
     "Timed": """
 component: Timed
-about: A spring whose stiffness swings with time.
+description: A spring whose stiffness swings with time.
 connectors: {a: Flange, b: Flange}
 parameters: {stiffness: {unit: N/m}, rate: {unit: Hz, default: 3 Hz}, clock: clock}
 equations:
@@ -152,7 +152,7 @@ equations:
 """,
     "Pushed": """
 component: Pushed
-about: A spring beside a force that swings with time.
+description: A spring beside a force that swings with time.
 connectors: {a: Flange, b: Flange}
 parameters: {stiffness: {unit: N/m}, rate: {unit: Hz, default: 3 Hz}, length: {unit: m, default: 1 m}, clock: clock}
 equations:
@@ -207,14 +207,14 @@ _GAINS: dict[str, Decades] = {
     "own.leak": (-2, 0, 0.5),
 }
 _SPRING: dict[str, Decades] = {"spring.stiffness": (-1, 7, 0.05), "spring.damping": (-3, 2, 0.3)}
-_OWN: dict[str, Decades] = {
+_LOCAL: dict[str, Decades] = {
     "own.stiffness": (-1, 4, 0.05),
     "own.damping": (-3, 1.5, 0.4),
     "own.tau": (-4, -1, 0.1),
 }
 _CONTACT, _WHOLE = MASSES | CONTACT, MASSES | CONTACT | COORDINATION
 
-# What it is about, its text, its ranges and what is due. The paper's scene comes twice, as it has most forms.
+# What it is about, its text, its ranges and what is due. The paper's topology comes twice, as it has most forms.
 SHAPES: tuple[Shape, ...] = (
     Shape("topology: users\n$clocks\npeers: $groups\n$bodies$contact$coordination$lan$arm", _WHOLE),
     Shape("topology: users\n$clocks\npeers: $groups\n$bodies$contact$coordination$lan", _WHOLE),
@@ -257,7 +257,7 @@ SHAPES: tuple[Shape, ...] = (
     Shape(
         "topology: expressions\n$clocks\npeers: {user: {count: $some}}\n$bodies$contact  own: {type: $expressions, object: cube, "
         "stiffness: 100 N/m, damping: 1 N*s/m, tau: 3 ms, clock: haptic, link: lan, delay: $acts}\nlinks: {lan: {clock: network, delay: $late}}\n",
-        _CONTACT | _OWN,
+        _CONTACT | _LOCAL,
     ),
     # Time that multiplies a motion is refused; time that pushes is left out.
     Shape(
@@ -267,7 +267,7 @@ SHAPES: tuple[Shape, ...] = (
     ),
     Shape(
         "topology: pushed\n$clocks\npeers: {user: {count: 2}}\n$bodies$contact  own: {type: Pushed, a: device, b: ground, stiffness: 100 N/m, clock: haptic}\n",
-        _CONTACT | _OWN,
+        _CONTACT | _LOCAL,
     ),
 )
 
@@ -283,8 +283,8 @@ def _graph(generator: random.Random) -> str:
     """Return how three peers weigh one another by decimals, that doubles round."""
     digits = generator.choice([1, 2, 3, 6, 16])
     pairs = list(itertools.permutations((1, 2, 3), 2))
-    kind, pairs = generator.choice([("edges", pairs[:2] + pairs[3:4]), ("arcs", pairs)])
-    return f"{kind}: [{', '.join(f'[{a}, {b}, {round(generator.uniform(0.05, 1.5), digits)!r}]' for a, b in pairs)}]"
+    peer_type, pairs = generator.choice([("edges", pairs[:2] + pairs[3:4]), ("arcs", pairs)])
+    return f"{peer_type}: [{', '.join(f'[{a}, {b}, {round(generator.uniform(0.05, 1.5), digits)!r}]' for a, b in pairs)}]"
 
 
 def _rows(generator: random.Random) -> str:

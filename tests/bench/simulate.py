@@ -1,23 +1,24 @@
 """How right and how fast `apc simulate` is: `python -m tests.bench.simulate`.
 
 A time is the median of a few runs in a warm process, after compiling; beside it stand programs written by
-hand for this one scene, in NumPy and C (`tests.bench.by_hand`), or time itself.
+hand for this one topology, in NumPy and C (`tests.bench.by_hand`), or time itself.
 """
 
 from __future__ import annotations
 
+import time
 from fractions import Fraction
 from functools import partial
 
 import numpy as np
 
-from apc.benchmark.timing import median_time, waited
+from apc.benchmark.timing import median_time
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare
 from apc.simulation.trajectory import simulate
 from tests.bench.by_hand import CUBE_MASS, START, TICKS, USERS, Floats, c_loop, numpy_loop
 from tests.bench.comparison import MOVED, rows_of
-from tests.bench.judge import Judge, Timed, judged, parser_of
+from tests.bench.judge import Judge, Timed, decided, parser_of
 from tests.topologies import AVERAGE, compiled, replaced
 
 REPEATS = 7
@@ -27,16 +28,18 @@ STATES = ("device.x", "device.v", "cube.x", "cube.v")
 
 
 def speed(judge: Judge) -> None:
-    """10 s of the three-user scene, every signal recorded, beside the loops in NumPy and in C."""
+    """10 s of the three-user topology, every signal recorded, beside the loops in NumPy and in C."""
     system = compiled(MOVED)
-    first, run = waited(partial(simulate, system, duration=Fraction(10)))  # a C compiler's time included
+    began = time.perf_counter()  # the C compiler's time included
+    run = simulate(system, duration=Fraction(10))
+    first = time.perf_counter() - began
     loop, by_hand = median_time(partial(numpy_loop, 10_001), 3)
     in_c, end = median_time(partial(c_loop, USERS, 1250, 1), REPEATS)
-    kept = [place for place, one in enumerate(run.signals) if not one.local.endswith(" acting")]
+    stored = [place for place, one in enumerate(run.signals) if not one.local.endswith(" acting")]
     print(f"10 s of three users, {len(run.signals)} signals, the first time {first:.2f} s")
 
     def off(values: Floats) -> float:
-        apart = np.abs(values[:, kept].reshape(-1, USERS, 6) - by_hand).max(axis=(0, 1))
+        apart = np.abs(values[:, stored].reshape(-1, USERS, 6) - by_hand).max(axis=(0, 1))
         return float((apart / np.abs(by_hand).max(axis=(0, 1))).max())
 
     size = np.abs(by_hand[:, :, :4]).max(axis=(0, 1))
@@ -50,8 +53,8 @@ def speed(judge: Judge) -> None:
         ),
     ]
     for name, jit, part, most_s in (("virtual machine", False, 0.8, None), ("machine code", True, 0.2, 0.01)):
-        taken, rows = median_time(partial(rows_of, prepare(system, Settings(Fraction(10), jit=jit))), REPEATS)
-        ours = Timed("apc", taken, off(rows), LINEAR)
+        used, rows = median_time(partial(rows_of, prepare(system, Settings(Fraction(10), jit=jit))), REPEATS)
+        ours = Timed("apc", used, off(rows), LINEAR)
         most = {others[0].program: part}
         judge.table(f"10 s of three users, {name}", [ours, *others], most_s=most_s, most=most)
 
@@ -65,11 +68,11 @@ def many_peers(judge: Judge, number: int) -> None:
     ready = prepare(compiled(text), Settings(seconds), signals=["user[1].*"])
     c_loop(number, 1, number)  # compiled
     by_hand, states = median_time(partial(c_loop, number, frames, number), REPEATS)
-    taken, rows = median_time(partial(rows_of, ready), REPEATS)
+    used, rows = median_time(partial(rows_of, ready), REPEATS)
     columns = [[one.local for one in ready.signals].index(name) for name in STATES]
     error = float((np.abs(rows[-1, columns] - states[:, 0]) / np.abs(states[:, 0])).max())
     programs = [
-        Timed("apc", taken, error, LINEAR),
+        Timed("apc", used, error, LINEAR),
         Timed("C, a frame of a peer in registers", by_hand),
         Timed("time itself", float(seconds)),
     ]
@@ -78,7 +81,7 @@ def many_peers(judge: Judge, number: int) -> None:
 
 def main() -> None:
     """Print everything."""
-    with judged(parser_of("simulate", __doc__)) as (judge, given):
+    with decided(parser_of("simulate", __doc__)) as (judge, given):
         speed(judge)
         many_peers(judge, 10**4 if given.quick else 10**5)
 

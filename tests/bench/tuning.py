@@ -17,7 +17,7 @@ from tests.topologies import AVERAGE, MESH, compiled
 
 K, B, MASS = "coordination.stiffness", "coordination.damping", "device.mass"
 FREE = {K: (10.0, 5000.0), B: (0.0, 50.0)}
-SCENES = {"average": AVERAGE, "mesh": MESH}
+TOPOLOGIES = {"average": AVERAGE, "mesh": MESH}
 
 
 def radii(model: apc.Model, spread: float, counts: range, masses: int) -> Callable[..., np.ndarray]:
@@ -26,7 +26,7 @@ def radii(model: apc.Model, spread: float, counts: range, masses: int) -> Callab
 
     def of(gains: np.ndarray) -> np.ndarray:
         at = dict(zip(FREE, map(float, gains), strict=True))
-        many = (apc.analyze_many(model, mass, set=at | {"user.count": n}) for n in counts)
+        many = (apc.analyze_many(model, mass, params=at | {"user.count": n}) for n in counts)
         return np.array([one.spectral_radius for one in many])
 
     return of
@@ -34,9 +34,11 @@ def radii(model: apc.Model, spread: float, counts: range, masses: int) -> Callab
 
 def main() -> int:
     """Print one line a question and program; return 1 if gains said to be proved violate anything."""
-    print(f"{'scene, users, mass':28}{'program':24}{'K, N/m':>10}{'violated':>10}{'points':>8}{'time, s':>9}")
+    print(
+        f"{'topology, users, mass':28}{'program':24}{'K, N/m':>10}{'violated':>10}{'points':>8}{'time, s':>9}"
+    )
     wrong = 0
-    for (name, text), (last, spread) in itertools.product(SCENES.items(), ((3, 0.0), (6, 0.2))):
+    for (name, text), (last, spread) in itertools.product(TOPOLOGIES.items(), ((3, 0.0), (6, 0.2))):
         model, counts = compiled(text), range(3 if last == 3 else 2, last + 1)
         over = {"user.count": f"{counts[0]}:{last}", MASS: f"±{100 * spread:g}%"} if spread else None
         few, dense = (radii(model, spread, counts, masses) for masses in (3, 401))
@@ -49,15 +51,15 @@ def main() -> int:
             begun = time.perf_counter()
             if program == "apc tune":
                 tuned = apc.tune(model, FREE, maximize=K, over=over)
-                gains, points = np.array([float(one.value) for one in tuned.gains]), tuned.looked
+                gains, points = np.array([float(one.value) for one in tuned.gains]), tuned.evaluations
                 program += ", proved" * tuned.proved
             else:
                 found = differential_evolution(merit, [*FREE.values()], seed=1, maxiter=40, polish=False)
                 gains, points = found.x, found.nfev
-            taken, violated = time.perf_counter() - begun, float((dense(gains) >= 1).mean())
+            used, violated = time.perf_counter() - begun, float((dense(gains) >= 1).mean())
             wrong |= violated > 0 and "proved" in program
             label = f"{name}, {counts[0]} to {last}, ±{100 * spread:g} %"
-            print(f"{label:28}{program:24}{gains[0]:10.5g}{100 * violated:8.2g} %{points:8d}{taken:9.2f}")
+            print(f"{label:28}{program:24}{gains[0]:10.5g}{100 * violated:8.2g} %{points:8d}{used:9.2f}")
     return int(wrong)
 
 

@@ -1,4 +1,4 @@
-"""Error against time: what each method gives for its work, on three scenes.
+"""Error against time: what each method gives for its work, on three topologies.
 
 Run it from the project's folder: `python -m tests.bench.work_precision`.
 
@@ -29,7 +29,7 @@ from apc.simulation.settings import CVODES, EXACT, TOLERANCE, Method, Settings
 from apc.simulation.simulation import prepare
 from tests.bench.by_hand import TICK, Floats
 from tests.bench.comparison import rows_of
-from tests.bench.judge import Judge, judged, parser_of
+from tests.bench.judge import Judge, decided, parser_of
 from tests.fifty_digits.truth import exact_course
 from tests.topologies import compiled
 
@@ -80,7 +80,9 @@ LOOSER = 100.0  # the run that shows how far the reference is certain
 
 @dataclass(frozen=True, slots=True)
 class Bounce:
-    """A scene: kg, N·s/m, N/m^(3/2), N·s/m^(5/2), N/m, N; `start` is the device's (x, v), the ball's is 0."""
+    """A topology: kg, N·s/m, N/m^(3/2), N·s/m^(5/2), N/m, N; `start` is the device's (x, v), the ball's
+    is 0.
+    """
 
     stiffness: float
     damping: float
@@ -132,26 +134,26 @@ def _until(
     return found.y[:, -1], float(found.t[-1]), found.status == 1
 
 
-def truth_of(scene: str) -> tuple[str, tuple[str, ...], Floats, float]:
-    """Return a scene's text, its positions' names, these at every tick, and how far they are certain."""
-    if scene == "arm":
+def truth_of(topology: str) -> tuple[str, tuple[str, ...], Floats, float]:
+    """Return a topology's text, its positions' names, these at every tick, and how far they are certain."""
+    if topology == "arm":
         course = exact_course(compiled(ARM), DURATION)
         assert not isinstance(course, str), course
         places = [place for place, name in enumerate(course[0]) if name.endswith(".x")]
         return ARM, tuple(course[0][place] for place in places), course[1][:, places], 0.0
-    stiffness, damping = CONTACTS[scene]
+    stiffness, damping = CONTACTS[topology]
     text = BALL.replace("STIFF", f"{stiffness!r} N/m^(3/2)").replace("DAMPING", f"{damping!r} N*s/m^(5/2)")
     bounce, ticks = Bounce(stiffness, damping), int(DURATION / MS)
     rows = positions(bounce, ticks)
-    doubt = (np.abs(rows - positions(bounce, ticks, LOOSER * RTOL)) / np.ptp(rows, axis=0)).max()
-    return text, ("user[1].device.x", "user[1].ball.x"), rows, float(doubt)
+    uncertainty = (np.abs(rows - positions(bounce, ticks, LOOSER * RTOL)) / np.ptp(rows, axis=0)).max()
+    return text, ("user[1].device.x", "user[1].ball.x"), rows, float(uncertainty)
 
 
-def compared(judge: Judge, scene: str, methods: Sequence[Method]) -> None:
-    """Print and judge what each method takes and is off by on a scene."""
-    text, names, exact, doubt = truth_of(scene)
+def compared(judge: Judge, topology: str, methods: Sequence[Method]) -> None:
+    """Print and judge what each method takes and is off by on a topology."""
+    text, names, exact, uncertainty = truth_of(topology)
     system = compiled(text)
-    print(f"\n{scene}, {float(DURATION):g} s, the truth certain to {doubt:.0e}")
+    print(f"\n{topology}, {float(DURATION):g} s, the truth certain to {uncertainty:.0e}")
     print(f"  {'method':<24}{'error / range':>14}{'of real time':>14}")
     for method in methods:
         ready = prepare(system, Settings(DURATION, method), signals=["*.x"])
@@ -160,18 +162,18 @@ def compared(judge: Judge, scene: str, methods: Sequence[Method]) -> None:
         error = float((np.abs(rows[:, places] - exact) / np.ptp(exact, axis=0)).max())
         print(f"  {method!s:<24}{error:>14.1e}{seconds / float(DURATION):>14.5f}")
         if method.name == EXACT:
-            judge.within(f"{scene}, {method}", error, ROUNDED)
+            judge.within(f"{topology}, {method}", error, ROUNDED)
         elif method == Method(CVODES, tolerance=TOLERANCE):
-            judge.within(f"{scene}, {method}", error, ADDED_UP * TOLERANCE + doubt)
+            judge.within(f"{topology}, {method}", error, ADDED_UP * TOLERANCE + uncertainty)
 
 
 def main() -> None:
-    """Print a table a scene."""
-    with judged(parser_of("work_precision", __doc__)) as (judge, given):
+    """Print a table a topology."""
+    with decided(parser_of("work_precision", __doc__)) as (judge, given):
         every = [Method("cvodes", tolerance=TOLERANCE), Method(EXACT)] if given.quick else METHODS
         stepped = [method for method in every if method.name != EXACT]
-        for scene in CONTACTS:
-            compared(judge, scene, stepped)
+        for topology in CONTACTS:
+            compared(judge, topology, stepped)
         compared(judge, "arm", every)
 
 

@@ -1,1 +1,1 @@
-"""The independent engine: scenes followed event by event in balls, to fifty digits."""
+"""The independent engine: topologies followed event by event in balls, to fifty digits."""

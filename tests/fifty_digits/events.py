@@ -2,14 +2,14 @@
 
 Takes: a `Model`.
 Gives: `Peer`, `build_peers`; `Happening`, `Play`; `refusal`, `ticks_between`.
-Guarantees: shares with the analysis and the simulation what says what the scene is, and nothing that says
+Guarantees: shares with the analysis and the simulation what says what the topology is, and nothing that says
 what it does: no Jacobian of theirs, no schedule, no lifted map, no mode. Shared are the compiled functions;
 the numbers of each peer (`parameters.resolve`, `exact_numbers`); the walk through a function's operations
 over exact numbers and whether that is possible (`exact.evaluate_exact`, `is_rational`, `guards.guards_of`);
 how a rational becomes a ball (`balls.rational_ball`, `precision`); and in `truth` who hears whom on
-a graph (`exchange.arcs`) and the row of a scene without clocks (`simulation.ROW`). A mistake in one of these
-is the reference's too: `tests.bruteforce` and `tests.schemes` share none of them and stand beside it in its
-tests.
+a graph (`exchange.arcs`) and the row of a topology without clocks (`simulation.ROW`). A mistake in one of
+these is the reference's too: `tests.bruteforce` and `tests.schemes` share none of them and stand beside it in
+its tests.
 Does not: serve what is not linear between events, or draw lots: it says why.
 
 Every computed value and every packet is kept with its time; whoever needs one takes the newest that counts.
@@ -30,8 +30,8 @@ import numpy as np
 
 from apc.compiler.compiled import Model, PeerType
 from apc.compiler.interpolation import jacobian
-from apc.eigen.balls import rational_ball
-from apc.frame.exact import evaluate_exact, is_rational
+from apc.eigen.ball_arithmetic import rational_ball
+from apc.frame.exact_arithmetic import evaluate_exact, is_rational
 from apc.frame.jacobians import guards_of
 from apc.frame.parameters import exact_numbers, resolve
 
@@ -46,7 +46,7 @@ class Peer:
     n_u + 1), exact. `back` counts the ticks kept of each clock, `sent_back` the packets of each link.
     """
 
-    kind: PeerType
+    peer_type: PeerType
     group: int
     ticks: tuple[Callable[..., list[Number]], ...]
     sends: tuple[Callable[..., list[Number]], ...]
@@ -61,10 +61,10 @@ class Peer:
     @property
     def names(self) -> tuple[str, ...]:
         """The names of its part of the state at the start of a frame."""
-        found = [state.name for state in self.kind.states]
-        for clock, count in zip(self.kind.clocks, self.back, strict=True):
+        found = [state.name for state in self.peer_type.states]
+        for clock, count in zip(self.peer_type.clocks, self.back, strict=True):
             found += [f"{name}(−{k + 1})" for k in range(count) for name in clock.outputs]
-        for send, count in zip(self.kind.sends, self.sent_back, strict=True):
+        for send, count in zip(self.peer_type.sends, self.sent_back, strict=True):
             found += [f"{name}(−{k + 1})" for k in range(count) for name in send.channels]
         return tuple(found)
 
@@ -88,29 +88,29 @@ def refusal(system: Model, *, in_time: bool) -> str:
     Parameters
     ----------
     system
-        The compiled scene.
+        The compiled topology.
     in_time
         For a run in time; else for the eigenvalues of a frame.
     """
-    for kind in (kind.linear or kind for kind in system.kinds):
-        functions = [*(c.tick for c in kind.clocks), *(s.send for s in kind.sends)]
-        if not all(map(is_rational, functions)) or not _has_exact_slopes(kind.derivative):
-            return f"the equations of {kind.name} hold functions whose values are rounded"
-        if any(receive.edge is not None for clock in kind.clocks for receive in clock.receives):
-            return f"{kind.name} looks at each sender by itself"
-        if any(r.operator not in ("mean", "sum") for clock in kind.clocks for r in clock.receives):
-            return f"{kind.name} hears a maximum or minimum"
-        if in_time and any(receive.age for clock in kind.clocks for receive in clock.receives):
-            return f"{kind.name} asks for ages, which are counted from time 0 at first"
-        if not _is_affine(kind.derivative):
-            return f"between its ticks {kind.name} is not linear"
-        if in_time and _changes_by_itself(kind.derivative):
-            return f"a force on {kind.name} changes with time"
+    for peer_type in (peer_type.linear or peer_type for peer_type in system.peer_types):
+        functions = [*(c.tick for c in peer_type.clocks), *(s.send for s in peer_type.sends)]
+        if not all(map(is_rational, functions)) or not _has_exact_slopes(peer_type.derivative):
+            return f"the equations of {peer_type.name} hold functions whose values are rounded"
+        if any(receive.edge is not None for clock in peer_type.clocks for receive in clock.receives):
+            return f"{peer_type.name} looks at each sender by itself"
+        if any(r.operator not in ("mean", "sum") for clock in peer_type.clocks for r in clock.receives):
+            return f"{peer_type.name} hears a maximum or minimum"
+        if in_time and any(receive.age for clock in peer_type.clocks for receive in clock.receives):
+            return f"{peer_type.name} asks for ages, which are counted from time 0 at first"
+        if not _is_affine(peer_type.derivative):
+            return f"between its ticks {peer_type.name} is not linear"
+        if in_time and _changes_by_itself(peer_type.derivative):
+            return f"a force on {peer_type.name} changes with time"
         if in_time and any(_switches_by_time(function) for function in functions):
-            return f"at a tick {kind.name} asks whether a moment has come, which a rounding decides"
+            return f"at a tick {peer_type.name} asks whether a moment has come, which a rounding decides"
         # What is heard at the start is not looked up: slopes must not depend on it.
-        if not in_time and not all(_is_affine(one.tick, slice(3, 4)) for one in kind.clocks):
-            return f"{kind.name} is not linear in what it hears"
+        if not in_time and not all(_is_affine(one.tick, slice(3, 4)) for one in peer_type.clocks):
+            return f"{peer_type.name} is not linear in what it hears"
     if in_time and any(link.channel is not None for link in system.links):
         return "packets get lost or come late by chance"
     return ""
@@ -201,11 +201,11 @@ def _slopes(
     return lambda time, *parts: [sum((parts[i][j] * k for i, j, k in row), 0) for row in rows]
 
 
-def _rate(kind: PeerType, parameters: Sequence[Fraction], *, linear: bool) -> Any:
+def _rate(peer_type: PeerType, parameters: Sequence[Fraction], *, linear: bool) -> Any:
     """Return [A B c; 0 0 0] of the continuous equations, exact; c is left out when `linear`."""
-    n_x, n_u = len(kind.states), len(kind.holds)
-    symbols = kind.derivative.sx_in()
-    dense = casadi.Function("dense", symbols, [casadi.densify(kind.derivative(*symbols))])
+    n_x, n_u = len(peer_type.states), len(peer_type.holds)
+    symbols = peer_type.derivative.sx_in()
+    dense = casadi.Function("dense", symbols, [casadi.densify(peer_type.derivative(*symbols))])
 
     def speed(place: int) -> list[Fraction]:
         unit = [Fraction(place == i) for i in range(n_x + n_u)]
@@ -231,9 +231,9 @@ def build_peers(system: Model, peers: Sequence[int], groups: Sequence[int], *, l
     Parameters
     ----------
     system
-        The compiled scene.
+        The compiled topology.
     peers, groups
-        Their numbers in the scene, and their groups'.
+        Their numbers in the topology, and their groups'.
     linear
         Leave constant forces out, and take the slopes at the start where something is not linear.
     """
@@ -244,18 +244,18 @@ def build_peers(system: Model, peers: Sequence[int], groups: Sequence[int], *, l
     link_of = {link.name: link for link in system.links}
     found = []
     for peer, group in zip(peers, groups, strict=True):
-        nonlinear = system.kinds[system.groups[group].kind]
-        kind = nonlinear.linear or nonlinear
+        nonlinear = system.peer_types[system.groups[group].peer_type]
+        peer_type = nonlinear.linear or nonlinear
         row = numbers.rows[group][peer - int(starts[group])]
-        parameters = exact_numbers(kind, numbers.parameters[group][row])
-        value = dict(zip(kind.parameters, parameters, strict=True))
-        delays = tuple(seconds[hold.delay] for hold in kind.holds)
-        start_x = tuple(value[state.start] for state in kind.states)
-        start_m = tuple(tuple(value[name] for name in clock.starts) for clock in kind.clocks)
-        still = [list(start_x), [Fraction(0)] * len(kind.holds)]
+        parameters = exact_numbers(peer_type, numbers.parameters[group][row])
+        value = dict(zip(peer_type.parameters, parameters, strict=True))
+        delays = tuple(seconds[hold.delay] for hold in peer_type.holds)
+        start_x = tuple(value[state.start] for state in peer_type.states)
+        start_m = tuple(tuple(value[name] for name in clock.starts) for clock in peer_type.clocks)
+        still = [list(start_x), [Fraction(0)] * len(peer_type.holds)]
         found.append(
             Peer(
-                kind=kind,
+                peer_type=peer_type,
                 group=group,
                 ticks=tuple(
                     _rule(
@@ -263,21 +263,23 @@ def build_peers(system: Model, peers: Sequence[int], groups: Sequence[int], *, l
                         parameters,
                         [*still, list(m), [Fraction(0)] * len(clock.receives)] if linear else None,
                     )
-                    for clock, m in zip(kind.clocks, start_m, strict=True)
+                    for clock, m in zip(peer_type.clocks, start_m, strict=True)
                 ),
-                sends=tuple(_rule(send.send, parameters, still if linear else None) for send in kind.sends),
-                rate=_rate(kind, parameters, linear=linear),
+                sends=tuple(
+                    _rule(send.send, parameters, still if linear else None) for send in peer_type.sends
+                ),
+                rate=_rate(peer_type, parameters, linear=linear),
                 delays=delays,
                 back=tuple(
                     max(
                         (
                             math.ceil(delay / period[clock.clock]) + 1
-                            for hold, delay in zip(kind.holds, delays, strict=True)
+                            for hold, delay in zip(peer_type.holds, delays, strict=True)
                             if hold.clock == clock.clock
                         ),
                         default=1,
                     )
-                    for clock in kind.clocks
+                    for clock in peer_type.clocks
                 ),
                 sent_back=tuple(
                     math.ceil(
@@ -285,7 +287,7 @@ def build_peers(system: Model, peers: Sequence[int], groups: Sequence[int], *, l
                         / period[link_of[send.link].clock]
                     )
                     + 1
-                    for send in kind.sends
+                    for send in peer_type.sends
                 ),
                 start_x=start_x,
                 start_m=start_m,
@@ -303,8 +305,8 @@ def _delays(system: Model, name: str) -> list[str]:
 class Happening:
     """Some peers and who hears whom among them; what happens when."""
 
-    def __init__(self, system: Model, sites: Sequence[Peer], whom: Whom) -> None:
-        self.sites, self.whom = sites, whom
+    def __init__(self, system: Model, subsystems: Sequence[Peer], whom: Whom) -> None:
+        self.subsystems, self.whom = subsystems, whom
         self.seconds = resolve(system).timings
         clocks = {clock.name: clock for clock in system.clocks}
         self.clocks = {
@@ -327,8 +329,8 @@ class Happening:
         found = {start, end}
         for phase, period in self.clocks.values():
             found |= ticks_between(phase, period, start, end)
-        for site in self.sites:
-            for hold, delay in zip(site.kind.holds, site.delays, strict=True):
+        for subsystem in self.subsystems:
+            for hold, delay in zip(subsystem.peer_type.holds, subsystem.delays, strict=True):
                 phase, period = self.clocks[hold.clock]
                 found |= ticks_between((phase + delay) % period, period, start, end)
         return sorted(found)
@@ -337,22 +339,24 @@ class Happening:
         """Go from `start`⁻ to `end`⁻."""
         times = self.instants(start, end)
         for now, following in itertools.pairwise(times):
-            held = [self._held(play, i, now, before=True) for i in range(len(self.sites))]
-            for i, site in enumerate(self.sites):
-                for send, rule, packets in zip(site.kind.sends, site.sends, play.packets[i], strict=True):
+            held = [self._held(play, i, now, before=True) for i in range(len(self.subsystems))]
+            for i, subsystem in enumerate(self.subsystems):
+                for send, rule, packets in zip(
+                    subsystem.peer_type.sends, subsystem.sends, play.packets[i], strict=True
+                ):
                     if self._ticks_now(self.clock_of[send.link], now):
                         packets.append((now, rule(now, play.x[i], held[i])))
-            for i, site in enumerate(self.sites):
-                for place, clock in enumerate(site.kind.clocks):
+            for i, subsystem in enumerate(self.subsystems):
+                for place, clock in enumerate(subsystem.peer_type.clocks):
                     if self._ticks_now(clock.clock, now):
                         period = self.clocks[clock.clock][1]
-                        r = [self._heard(play, i, one, now, period) for one in clock.receives]
+                        r = [self._received(play, i, one, now, period) for one in clock.receives]
                         before = play.computed[i][place]
                         m = [before[-1][1][row] for row in clock.memories] if clock.memories else []
-                        before.append((now, site.ticks[place](now, play.x[i], held[i], m, r)))
-            for i, site in enumerate(self.sites):
+                        before.append((now, subsystem.ticks[place](now, play.x[i], held[i], m, r)))
+            for i, subsystem in enumerate(self.subsystems):
                 u = self._held(play, i, now, before=False)
-                play.x[i] = _move(site, play.x[i], u, following - now)
+                play.x[i] = _move(subsystem, play.x[i], u, following - now)
 
     def _ticks_now(self, clock: str, now: Fraction) -> bool:
         phase, period = self.clocks[clock]
@@ -360,10 +364,10 @@ class Happening:
 
     def _held(self, play: Play, i: int, now: Fraction, *, before: bool) -> list[Number]:
         """Return what the holds of a peer put out, just before or after a moment."""
-        site = self.sites[i]
-        place = {clock.clock: number for number, clock in enumerate(site.kind.clocks)}
+        subsystem = self.subsystems[i]
+        place = {clock.clock: number for number, clock in enumerate(subsystem.peer_type.clocks)}
         found: list[Number] = []
-        for hold, delay in zip(site.kind.holds, site.delays, strict=True):
+        for hold, delay in zip(subsystem.peer_type.holds, subsystem.delays, strict=True):
             for time, values in reversed(play.computed[i][place[hold.clock]]):
                 if time + delay < now or (time + delay == now and not before):
                     found.append(values[hold.output] if len(values) > hold.output else 0)
@@ -372,14 +376,14 @@ class Happening:
                 found.append(0)
         return found
 
-    def _heard(self, play: Play, i: int, receive: Any, now: Fraction, period: Fraction) -> Number:
+    def _received(self, play: Play, i: int, receive: Any, now: Fraction, period: Fraction) -> Number:
         """Return what a receive of a peer hears at a tick, or heard at the one before, a period ago."""
         total: Number = 0
         then = now - period if receive.before else now
         for j, weight in self.whom(receive.link, receive.operator, i):
-            site = self.sites[j]
-            delay = self.delay[receive.link, site.group, self.sites[i].group]
-            place = next(n for n, send in enumerate(site.kind.sends) if send.link == receive.link)
+            subsystem = self.subsystems[j]
+            delay = self.delay[receive.link, subsystem.group, self.subsystems[i].group]
+            place = next(n for n, send in enumerate(subsystem.peer_type.sends) if send.link == receive.link)
             sent, packet = next(one for one in reversed(play.packets[j][place]) if one[0] + delay <= then)
             value = packet[receive.channel] if receive.age != "alone" else 1
             if receive.age:
@@ -400,13 +404,13 @@ def ticks_between(phase: Fraction, period: Fraction, start: Fraction, end: Fract
     return {phase + k * period for k in range(first, math.ceil((end - phase) / period))}
 
 
-def _move(site: Peer, x: Sequence[Number], u: Sequence[Number], duration: Fraction) -> list[Number]:
+def _move(subsystem: Peer, x: Sequence[Number], u: Sequence[Number], duration: Fraction) -> list[Number]:
     """Let the continuous states run with held inputs."""
-    if duration not in site.steps:
+    if duration not in subsystem.steps:
         length = flint.fmpq(duration.numerator, duration.denominator)
-        site.steps[duration] = [
+        subsystem.steps[duration] = [
             [(place, entry) for place, entry in enumerate(row) if not entry.is_zero()]
-            for row in flint.arb_mat(site.rate * length).exp().tolist()[: len(x)]
+            for row in flint.arb_mat(subsystem.rate * length).exp().tolist()[: len(x)]
         ]
     both = [*x, *u, 1]
-    return [sum((both[place] * entry for place, entry in row), 0) for row in site.steps[duration]]
+    return [sum((both[place] * entry for place, entry in row), 0) for row in subsystem.steps[duration]]

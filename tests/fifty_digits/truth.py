@@ -1,9 +1,9 @@
-"""What a scene does to fifty digits, whatever method is measured against it.
+"""What a topology does to fifty digits, whatever method is measured against it.
 
 Takes: a `Model`.
 Gives: `Classes`, `classes_of`; `frame_matrices`, `eigenvalues`, `Truth`, `spectral_truth`; `exact_course`.
 Guarantees: digits that are not certain are not given.
-Does not: serve every scene (see `bench.events.refusal`).
+Does not: serve every topology (see `bench.events.refusal`).
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import numpy as np
 
 from apc.compiler.compiled import Model
 from apc.compiler.weights import exact_weight
-from apc.eigen.balls import precision, rational_ball
-from apc.frame.exchange import arcs
+from apc.eigen.ball_arithmetic import precision, rational_ball
+from apc.frame.communication_graph import arcs
 from apc.frame.parameters import resolve
 from apc.simulation.simulation import ROW
 from tests.fifty_digits.events import Happening, Number, Peer, Play, Whom, build_peers, refusal, ticks_between
@@ -100,80 +100,82 @@ def frame_matrices(system: Model, classes: Classes) -> list[tuple[str, int, Any]
     Parameters
     ----------
     system, classes
-        The compiled scene, for which `refusal` is "", and its `classes_of`.
+        The compiled topology, for which `refusal` is "", and its `classes_of`.
     """
-    sites = build_peers(system, classes.peers, classes.groups, linear=True)
-    found = [("common", 1, _map(Happening(system, sites, _common_whom(sites, classes))))]
+    subsystems = build_peers(system, classes.peers, classes.groups, linear=True)
+    found = [("common", 1, _map(Happening(system, subsystems, _common_whom(subsystems, classes))))]
     for place, count in enumerate(classes.counts):
         if count > 1:
-            whom = _difference_whom(sites, classes, place)
-            found.append((f"difference {place}", count - 1, _map(Happening(system, [sites[place]], whom))))
+            whom = _difference_whom(subsystems, classes, place)
+            found.append(
+                (f"difference {place}", count - 1, _map(Happening(system, [subsystems[place]], whom)))
+            )
     return found
 
 
-def _totals(sites: Sequence[Peer], classes: Classes, link: str, i: int) -> list[tuple[int, Fraction]]:
+def _totals(subsystems: Sequence[Peer], classes: Classes, link: str, i: int) -> list[tuple[int, Fraction]]:
     """Return what a peer of class i weighs each class that sends over a link by, all its peers together."""
     found = []
-    for j, site in enumerate(sites):
+    for j, subsystem in enumerate(subsystems):
         weight = classes.weights[link][i][j] * (classes.counts[j] - (1 if i == j else 0))
-        if weight and any(send.link == link for send in site.kind.sends):
+        if weight and any(send.link == link for send in subsystem.peer_type.sends):
             found.append((j, weight))
     return found
 
 
-def _common_whom(sites: Sequence[Peer], classes: Classes) -> Whom:
+def _common_whom(subsystems: Sequence[Peer], classes: Classes) -> Whom:
     def whom(link: str, operator: str, i: int) -> list[tuple[int, Fraction]]:
-        heard = _totals(sites, classes, link, i)
-        share = sum((w for _, w in heard), Fraction(0)) if operator == "mean" else Fraction(1)
-        return [(j, weight / share) for j, weight in heard]
+        received = _totals(subsystems, classes, link, i)
+        share = sum((w for _, w in received), Fraction(0)) if operator == "mean" else Fraction(1)
+        return [(j, weight / share) for j, weight in received]
 
     return whom
 
 
-def _difference_whom(sites: Sequence[Peer], classes: Classes, place: int) -> Whom:
+def _difference_whom(subsystems: Sequence[Peer], classes: Classes, place: int) -> Whom:
     def whom(link: str, operator: str, i: int) -> list[tuple[int, Fraction]]:
-        heard = _totals(sites, classes, link, place)
-        share = sum((w for _, w in heard), Fraction(0)) if operator == "mean" else Fraction(1)
+        received = _totals(subsystems, classes, link, place)
+        share = sum((w for _, w in received), Fraction(0)) if operator == "mean" else Fraction(1)
         own = classes.weights[link][place][place]
-        return [(0, -own / share)] if own and any(j == place for j, _ in heard) else []
+        return [(0, -own / share)] if own and any(j == place for j, _ in received) else []
 
     return whom
 
 
-def _map(scene: Happening) -> Any:
+def _map(topology: Happening) -> Any:
     """Return the map of one frame, without the states that nobody reads: a matrix of balls."""
-    n = sum(len(site.names) for site in scene.sites)
+    n = sum(len(subsystem.names) for subsystem in topology.subsystems)
     # Every number of the state is a row: what it is of each number of the state at the frame's start.
-    play = _from_state(scene, list(np.eye(n, dtype=int).astype(object)))
-    scene.play(play, Fraction(0), scene.frame)
-    rows = [np.broadcast_to(np.asarray(row, dtype=object), n) for row in _to_state(scene, play)]
-    kept = list(range(n))
+    play = _from_state(topology, list(np.eye(n, dtype=int).astype(object)))
+    topology.play(play, Fraction(0), topology.frame)
+    rows = [np.broadcast_to(np.asarray(row, dtype=object), n) for row in _to_state(topology, play)]
+    stored = list(range(n))
     while True:  # what nobody reads adds an eigenvalue 0 and nothing else
-        read = [c for c in kept if any(not _is_zero(rows[r][c]) for r in kept)]
-        if len(read) == len(kept):
+        read = [c for c in stored if any(not _is_zero(rows[r][c]) for r in stored)]
+        if len(read) == len(stored):
             break
-        kept = read
-    return flint.arb_mat(len(kept), len(kept), [flint.arb(rows[r][c]) for r in kept for c in kept])
+        stored = read
+    return flint.arb_mat(len(stored), len(stored), [flint.arb(rows[r][c]) for r in stored for c in stored])
 
 
 def _is_zero(entry: Number) -> bool:
     return entry == 0 if isinstance(entry, int) else bool(entry.is_zero())
 
 
-def _from_state(scene: Happening, state: Sequence[Number]) -> Play:
+def _from_state(topology: Happening, state: Sequence[Number]) -> Play:
     """Return the peers at the start of a frame."""
     play = Play([], [], [])
     rest = iter(state)
-    for site in scene.sites:
-        play.x.append([next(rest) for _ in site.kind.states])
+    for subsystem in topology.subsystems:
+        play.x.append([next(rest) for _ in subsystem.peer_type.states])
         computed, packets = [], []
-        for clock, count in zip(site.kind.clocks, site.back, strict=True):
-            phase, period = scene.clocks[clock.clock]
+        for clock, count in zip(subsystem.peer_type.clocks, subsystem.back, strict=True):
+            phase, period = topology.clocks[clock.clock]
             computed.append(
                 [(phase - (k + 1) * period, [next(rest) for _ in clock.outputs]) for k in range(count)][::-1]
             )
-        for send, count in zip(site.kind.sends, site.sent_back, strict=True):
-            phase, period = scene.clocks[scene.clock_of[send.link]]
+        for send, count in zip(subsystem.peer_type.sends, subsystem.sent_back, strict=True):
+            phase, period = topology.clocks[topology.clock_of[send.link]]
             packets.append(
                 [(phase - (k + 1) * period, [next(rest) for _ in send.channels]) for k in range(count)][::-1]
             )
@@ -182,14 +184,14 @@ def _from_state(scene: Happening, state: Sequence[Number]) -> Play:
     return play
 
 
-def _to_state(scene: Happening, play: Play) -> list[Number]:
+def _to_state(topology: Happening, play: Play) -> list[Number]:
     """Return the state at the end of a frame."""
     state: list[Number] = []
-    for i, site in enumerate(scene.sites):
+    for i, subsystem in enumerate(topology.subsystems):
         state += play.x[i]
-        for listed, count in zip(play.computed[i], site.back, strict=True):
+        for listed, count in zip(play.computed[i], subsystem.back, strict=True):
             state += [value for _, values in listed[: -count - 1 : -1] for value in values]
-        for listed, count in zip(play.packets[i], site.sent_back, strict=True):
+        for listed, count in zip(play.packets[i], subsystem.sent_back, strict=True):
             state += [value for _, values in listed[: -count - 1 : -1] for value in values]
     return state
 
@@ -229,7 +231,7 @@ class Truth:
 
 
 def spectral_truth(system: Model) -> Truth | str:
-    """Return the truth about one frame of a scene, or why there is none.
+    """Return the truth about one frame of a topology, or why there is none.
 
     Two precisions have to agree on the digits.
     """
@@ -237,7 +239,7 @@ def spectral_truth(system: Model) -> Truth | str:
     if reason:
         return reason
     classes = classes_of(system)
-    moving = sum(len(system.kinds[system.groups[group].kind].states) for group in classes.groups)
+    moving = sum(len(system.peer_types[system.groups[group].peer_type].states) for group in classes.groups)
     last: Truth | None = None
     for bits in PRECISIONS:
         with precision(bits):
@@ -278,7 +280,7 @@ def exact_course(system: Model, duration: Fraction) -> tuple[tuple[str, ...], An
     Parameters
     ----------
     system
-        The compiled scene, each peer on its own.
+        The compiled topology, each peer on its own.
     duration
         In seconds.
 
@@ -301,36 +303,38 @@ def exact_course(system: Model, duration: Fraction) -> tuple[tuple[str, ...], An
 
 
 def _course(system: Model, duration: Fraction) -> tuple[tuple[str, ...], list[list[Any]]]:
-    """Play a scene from time 0 and keep the states at the ticks."""
+    """Play a topology from time 0 and keep the states at the ticks."""
     whole = _everybody(system)
-    sites = build_peers(system, whole.peers, whole.groups, linear=False)
-    scene = Happening(system, sites, _common_whom(sites, whole))
+    subsystems = build_peers(system, whole.peers, whole.groups, linear=False)
+    topology = Happening(system, subsystems, _common_whom(subsystems, whole))
     long_ago = Fraction(-(10**9))
     play = Play([], [], [])
-    for site in sites:
-        play.x.append([rational_ball(one) + flint.arb(0) for one in site.start_x])
+    for subsystem in subsystems:
+        play.x.append([rational_ball(one) + flint.arb(0) for one in subsystem.start_x])
         play.computed.append(
             [
                 [(Fraction(10**9), _remembered(c, m))]
-                for c, m in zip(site.kind.clocks, site.start_m, strict=True)
+                for c, m in zip(subsystem.peer_type.clocks, subsystem.start_m, strict=True)
             ]
         )
-        nothing: list[Number] = [flint.arb(0)] * len(site.kind.holds)
-        play.packets.append([[(long_ago, rule(Fraction(0), play.x[-1], nothing))] for rule in site.sends])
+        nothing: list[Number] = [flint.arb(0)] * len(subsystem.peer_type.holds)
+        play.packets.append(
+            [[(long_ago, rule(Fraction(0), play.x[-1], nothing))] for rule in subsystem.sends]
+        )
     nothing_ticks = Fraction(0), ROW
-    phase, period = min(scene.clocks.values(), key=lambda one: one[1], default=nothing_ticks)
+    phase, period = min(topology.clocks.values(), key=lambda one: one[1], default=nothing_ticks)
     rows, now = [], Fraction(0)
     instants = sorted({Fraction(0), *ticks_between(phase, period, Fraction(0), duration + period)})
     for instant in (one for one in instants if one <= duration):
         if instant > now:
-            scene.play(play, now, instant)
+            topology.play(play, now, instant)
             now = instant
         rows.append([flint.arb(value) for x in play.x for value in x])
     starts = np.cumsum([0] + [group.count for group in system.groups])
     names = tuple(
-        f"{system.groups[site.group].name}[{peer - int(starts[site.group]) + 1}].{state.name}"
-        for peer, site in zip(whole.peers, sites, strict=True)
-        for state in site.kind.states
+        f"{system.groups[subsystem.group].name}[{peer - int(starts[subsystem.group]) + 1}].{state.name}"
+        for peer, subsystem in zip(whole.peers, subsystems, strict=True)
+        for state in subsystem.peer_type.states
     )
     return names, rows
 

@@ -26,7 +26,7 @@ def main() -> int:
     for what in FORGERIES:
         number(f"--{what}", default=0, help=f"how many forged {what}")
     number("--packets", default=0, help="how many forged datagrams")
-    number("--scenes", default=0, help="how many valid scenes against brute force")
+    number("--topologies", default=0, help="how many valid topologies against brute force")
     number("--seed", default=1)
     number("--start", default=0, help="the first input of the seed to run")
     parser.add_argument("--sort", choices=[name for name, _, _ in SORTS], help="inputs of this sort only")
@@ -44,11 +44,11 @@ def main() -> int:
             f"{options.packets} forged datagrams, {len(failures)} taken or not survived", *failures, sep="\n"
         )
         wrong |= bool(failures)
-    if options.scenes:
-        from tests.lifting.test_frame import check_scenes
+    if options.topologies:
+        from tests.lifting.test_frame import check_topologies
 
-        check_scenes(options.scenes)
-        print(f"{options.scenes} scenes agree with brute force")
+        check_topologies(options.topologies)
+        print(f"{options.topologies} topologies agree with brute force")
     return int(wrong)
 
 

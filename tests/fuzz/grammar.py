@@ -1,5 +1,5 @@
 # ruff: noqa: E501 -- a line of a grammar is one name's
-"""Texts at random by a grammar: expressions, and components and scenes that are nearly right.
+"""Texts at random by a grammar: expressions, and components and topologies that are nearly right.
 
 Takes: a seeded generator. Gives: `grown`, `rules_of`, `odd_equations`, `odd_vectors`.
 Guarantees: of equal seed comes equal text; most units and sizes agree, some don't; nearly always there are as
@@ -119,7 +119,7 @@ SENDSparameters:
   T0: {unit: s, default: $T0}
   G: {unit: 1, default: 2}
 REFERENCES"""
-_SCENE = """\
+_TOPOLOGY = """\
 topology: odd
 library: ./parts
 clocks: {h: 1 ms, c: 4 ms}
@@ -134,14 +134,14 @@ _UNITS = {"m": "L", "v": "L/T0", "N": "F", "1": "1"}
 _UNLIKE = {f"{context}{one}": f"{context}{other}" for context in "ct" for one, other in zip("mvN1", "N1mv", strict=True)}  # fmt: skip
 
 
-def _context(rng: random.Random, heard: bool) -> dict[str, str]:
-    """Return what a scene that ticks, or that is heard too, or neither, says of its clock and link."""
-    clocked = heard or rng.random() < 0.5
+def _context(rng: random.Random, received: bool) -> dict[str, str]:
+    """Return what a topology that ticks, or that is heard too, or neither, says of its clock and link."""
+    clocked = received or rng.random() < 0.5
     return {
-        "REFERENCES": "  clock: clock\n" * clocked + "  link: link\n" * heard,
-        "GIVEN": ", clock: h" * clocked + ", link: lan" * heard,
-        "LINKS": "links: {lan: {clock: c, delay: 4 ms}}\n" * heard,
-        "COUNT": rng.choice("12233") if heard else "1",
+        "REFERENCES": "  clock: clock\n" * clocked + "  link: link\n" * received,
+        "GIVEN": ", clock: h" * clocked + ", link: lan" * received,
+        "LINKS": "links: {lan: {clock: c, delay: 4 ms}}\n" * received,
+        "COUNT": rng.choice("12233") if received else "1",
     }
 
 
@@ -152,11 +152,11 @@ def _replaced(text: str, words: Mapping[str, str]) -> str:
 
 
 def odd_equations(rng: random.Random) -> dict[str, bytes]:
-    """Return a scene whose one coupler has odd equations."""
-    heard = rng.random() < 0.25
-    words = _context(rng, heard) | {"SENDS": "sends: {x: '$sent'}\n" * heard}
+    """Return a topology whose one coupler has odd equations."""
+    received = rng.random() < 0.25
+    words = _context(rng, received) | {"SENDS": "sends: {x: '$sent'}\n" * received}
     rules = _in_contexts(_EQUATIONS, _UNITS, "ct") | rules_of(_DEFAULTS)
-    rules |= rules_of(_HEARD) if heard else {}
+    rules |= rules_of(_HEARD) if received else {}
     clocked = bool(words["GIVEN"])
     if not clocked:
         del rules["force+"]
@@ -174,8 +174,8 @@ def odd_equations(rng: random.Random) -> dict[str, bytes]:
     declared = "".join(f"  {name}: {{unit: m, start: $start}}\n" for name in names if rng.random() < 0.97)
     part = _replaced(_PART, words) + f"variables:\n{declared}" * bool(declared)
     part = grown(rng, rules, part) + "equations:\n" + "".join(f"  - {one}\n" for one in lines)
-    scene = grown(rng, rules, _replaced(_SCENE, words))
-    return {"scene.yaml": scene.encode(), "parts/own.yaml": part.encode()}
+    topology = grown(rng, rules, _replaced(_TOPOLOGY, words))
+    return {"topology.yaml": topology.encode(), "parts/own.yaml": part.encode()}
 
 
 # ---- odd vectors ----
@@ -223,7 +223,7 @@ flows: {f: {unit: N, size: SIZE}THIRD}
     "parts/body.yaml": """\
 component: Body
 connectors: {flange: Point}
-parameters: {mass: {unit: kg, above: 0, shared: divided}}
+parameters: {mass: {unit: kg, exclusive_min: 0, shared: divided}}
 variables:
   x: {unit: m, size: SIZE, start: $list_m}
   v: {unit: m/s, size: $size, start: $list_v}
@@ -246,14 +246,14 @@ equations:
 component: Row
 connectors: {end: Point}
 parameters:
-  mass: {unit: kg, above: 0}
+  mass: {unit: kg, exclusive_min: 0}
   O: {unit: m, size: SIZE}
 REFERENCESparts:
   link: {type: Body, count: $count, mass: mass, x: '$handed'}
   tie: {type: Own, count: 2, a: "link[1:2]", b: "link[2:3]", O: O OWN}
 connect: {end: "link[$first].flange"}
 """,
-    "scene.yaml": """\
+    "topology.yaml": """\
 topology: odd
 library: ./parts
 clocks: {h: 1 ms, c: 4 ms}
@@ -269,12 +269,12 @@ _OF_VECTORS = {"m": "L", "N": "F"}
 
 
 def odd_vectors(rng: random.Random) -> dict[str, bytes]:
-    """Return a scene whose couplers and masses are of vectors."""
-    size, heard = rng.choice((2, 3)), rng.random() < 0.3
+    """Return a topology whose couplers and masses are of vectors."""
+    size, received = rng.choice((2, 3)), rng.random() < 0.3
     twist, row = rng.random() < 0.3, rng.random() < 0.4  # a second pair at each connector; an array of parts
-    words = _context(rng, heard) | {
+    words = _context(rng, received) | {
         "SIZE": str(size),
-        "SENDS": "sends: {x: sample(a.x)}\n" * heard,
+        "SENDS": "sends: {x: sample(a.x)}\n" * received,
         "SECOND": ", s: {unit: m}" * twist,
         "THIRD": ", n: {unit: N}" * (twist and rng.random() > ODD),
         "TWISTED_STATES": "  s: {unit: m, start: 0 m}\n  w: {unit: m/s, start: 0 m/s}\n" * twist,
@@ -291,7 +291,7 @@ def odd_vectors(rng: random.Random) -> dict[str, bytes]:
     rules = _in_contexts(grammar, _OF_VECTORS, "ct") | rules_of(
         f"size: {size}\nindex: {'  '.join('123'[:size])}\nlist_v: [{', '.join(['$value m/s'] * size)}]"
     )
-    rules |= rules_of(_TOLD) if heard else {}
+    rules |= rules_of(_TOLD) if received else {}
     rules |= rules_of("of_row: row.O: $list_m  row.link.x: $list_m") if row else {}
     context = "t" if words["GIVEN"] else "c"
     odd = {f"{one}V{unit}": f"{one}S{unit}" for one in "ct" for unit in "mN"}

@@ -19,7 +19,7 @@ from tests.fuzz.grammar import grown, odd_equations, odd_vectors, rules_of
 from tests.fuzz.trees import Pairs, Tree, as_yaml, changed, of_yaml, spots
 
 MODELS = Path(__file__).resolve().parents[2] / "models"
-TOPOLOGY = "scene.yaml"
+TOPOLOGY = "topology.yaml"
 PLAYED = "equations"  # the sort that is analysed and simulated as well
 SENTINEL = "sentinel"  # the file that a run of foreign code would leave behind
 Files = dict[str, bytes]
@@ -37,9 +37,9 @@ def _read(folder: str) -> dict[str, str]:
     return {path.stem: path.read_text(encoding="utf-8") for path in sorted((MODELS / folder).rglob("*.yaml"))}
 
 
-SCENES = _read("scenes")
+TOPOLOGIES = _read("topologies")
 COMPONENTS = [text for text in _read("").values() if "component: " in text]
-USERS = (MODELS / "scenes" / "users.csv").read_text(encoding="utf-8")
+USERS = (MODELS / "topologies" / "users.csv").read_text(encoding="utf-8")
 PUSH = "time [s],force [N]\n0,0\n1,2\n2,-1\n"
 
 # Values that YAML, units, names or expressions may stumble over: three spaces or a line apart in the file.
@@ -71,7 +71,7 @@ _MARKS = [b"\0", b"\t", b"\r", b"\r\n", b"\x1b", b"\xff", b"\xc0\xaf", b"\xed\xa
 
 # What is asked for too much of. Between « and » stands what comes hundreds of times, ‹ › at most a hundred
 # times, ¿ ‡ thousands of bytes; # is the number of a time and @ the next. What stands before => is replaced;
-# the rest is added to a scene.
+# the rest is added to a topology.
 BOMBS = (
     "x0: &x0 [1]\n«x@: &x@ [*x#, *x#, *x#, *x#, *x#, *x#, *x#, *x#, *x#]\n»", "x: «[»«]»\n", "x: «{a: »1«}»\n",
     "«- »1\n", "about2: ¿x‡\n", "0.1 kg=>¿1‡ kg", "0.1 kg=>«(»1 kg«)»", '0.1 kg=>"«1+»1"', "0.1 kg=>1 «m*»kg",
@@ -87,8 +87,8 @@ BOMBS = (
 
 def make_input(rng: random.Random, sort: str | None = None) -> Input:
     """Return one input, of a sort if one is given."""
-    wanted = [one for one in SORTS if sort in (None, one[0])]
-    sort, make, _ = rng.choices(wanted, weights=[weight for _, _, weight in wanted])[0]
+    requested = [one for one in SORTS if sort in (None, one[0])]
+    sort, make, _ = rng.choices(requested, weights=[weight for _, _, weight in requested])[0]
     files = {"users.csv": USERS.encode(), "push.csv": PUSH.encode()} | make(rng)
     return Input(sort, tuple(files.items()))
 
@@ -105,11 +105,11 @@ def mutated(rng: random.Random, data: bytes) -> bytes:
         at = rng.randrange(max(1, len(pieces)))
         old = b"".join(pieces[at : at + 1])
         new = _encoded(grown(rng, _RULES, rng.choice(_NEW), 2))
-        alike = _encoded(old.decode("utf-8", "replace").translate(_LIKE))
+        interchangeable = _encoded(old.decode("utf-8", "replace").translate(_LIKE))
         turned = bytes(one ^ (1 << rng.randrange(8)) for one in old[:1]) + old[1:]
         marked = rng.choice(_MARKS) + old
         pieces[at : at + 1] = rng.choice(
-            ([], [old, old], [new], [new], [marked], [alike], [old.lstrip()], [turned])
+            ([], [old, old], [new], [new], [marked], [interchangeable], [old.lstrip()], [turned])
         )
         data = (rng.choice(_MARKS) if rng.random() < 0.03 else between).join(pieces)
     if rng.random() < 0.05:
@@ -117,8 +117,8 @@ def mutated(rng: random.Random, data: bytes) -> bytes:
     return data[: rng.randrange(len(data) + 1)] if rng.random() < 0.05 else data
 
 
-def _scene(rng: random.Random) -> str:
-    return rng.choice(list(SCENES.values()))
+def _topology(rng: random.Random) -> str:
+    return rng.choice(list(TOPOLOGIES.values()))
 
 
 def _encoded(text: str) -> bytes:
@@ -135,7 +135,9 @@ def _mutated(rng: random.Random, text: str) -> str:
 
 def _bytes(rng: random.Random) -> Files:
     return {
-        TOPOLOGY: rng.choice([rng.randbytes(rng.randrange(400)), *[mutated(rng, _encoded(_scene(rng)))] * 20])
+        TOPOLOGY: rng.choice(
+            [rng.randbytes(rng.randrange(400)), *[mutated(rng, _encoded(_topology(rng)))] * 20]
+        )
     }
 
 
@@ -154,7 +156,7 @@ def _once_changed(tree: Tree, rng: random.Random, donor: Tree) -> None:
 
 
 def _structure(rng: random.Random) -> Files:
-    tree, donor = of_yaml(_scene(rng)), of_yaml(_scene(rng))
+    tree, donor = of_yaml(_topology(rng)), of_yaml(_topology(rng))
     for _ in range(rng.choice([1, 1, 1, 2, 3, 6])):
         _once_changed(tree, rng, donor)
     return {TOPOLOGY: _encoded(as_yaml(tree, rng))}
@@ -165,7 +167,7 @@ def _structure(rng: random.Random) -> Files:
 
 def _numbers(rng: random.Random) -> Files:
     """Put expressions, quantities and units where a topology has numbers."""
-    tree = of_yaml(_scene(rng))
+    tree = of_yaml(_topology(rng))
     numbers = [pair for pair in _pairs_of(tree) if isinstance(pair[1], str) and re.match(r"-?[\d.]", pair[1])]
     tree[:] = [pair for pair in tree if pair[0] != "parameters"]
     named = [["kt", "2000 N/m"], ["tick", "1 ms"], ["q", "3"]]
@@ -189,17 +191,17 @@ def _pairs_of(tree: Tree) -> list[list[Tree]]:
 
 
 def _component(rng: random.Random) -> Files:
-    """Shadow a component of the library by a changed one of the same name, in a folder of the scene's own."""
-    scene = of_yaml(_scene(rng))
-    shown = str(scene)
+    """Shadow a component of the library by a changed one of the same name, in a folder of the topology's own."""
+    topology = of_yaml(_topology(rng))
+    shown = str(topology)
     used = [text for text in COMPONENTS if text.partition("component: ")[2].split()[0] in shown]
     text = rng.choice(used or COMPONENTS)
     tree, donor = of_yaml(text), of_yaml(rng.choice(COMPONENTS))
     for _ in range(rng.choice([1, 1, 2, 4])):
         rng.choice([_change_equation, _once_changed])(tree, rng, donor)
     part = mutated(rng, _encoded(text)) if rng.random() < 0.3 else _encoded(as_yaml(tree))
-    scene.append(["library", rng.choice(["parts"] * 40 + ["./parts", ["parts"], "."])])
-    return {TOPOLOGY: _encoded(as_yaml(scene)), "parts/own.yaml": part}
+    topology.append(["library", rng.choice(["parts"] * 40 + ["./parts", ["parts"], "."])])
+    return {TOPOLOGY: _encoded(as_yaml(topology)), "parts/own.yaml": part}
 
 
 def _change_equation(tree: Tree, rng: random.Random, donor: Tree) -> None:
@@ -217,27 +219,27 @@ def _change_equation(tree: Tree, rng: random.Random, donor: Tree) -> None:
 
 def _table(rng: random.Random) -> Files:
     """Change a table, or what names it."""
-    scene, name, text = rng.choice(
+    topology, name, text = rng.choice(
         (
-            (SCENES["users-table"], "users.csv", USERS),
+            (TOPOLOGIES["users-table"], "users.csv", USERS),
             (
-                f"{SCENES['three-users-average']}hands: {{h: {{type: TableForce, flange: device, force: push.csv}}}}\n",
+                f"{TOPOLOGIES['three-users-average']}hands: {{h: {{type: TableForce, flange: device, force: push.csv}}}}\n",
                 "push.csv",
                 PUSH,
             ),
             (
-                SCENES["three-users-average"].replace("8 ms}", "8 ms, graph: {arcs: edges.csv}}"),
+                TOPOLOGIES["three-users-average"].replace("8 ms}", "8 ms, graph: {arcs: edges.csv}}"),
                 "edges.csv",
                 "from,to,weight\n1,2,1\n2,3,0.5\n3,1,2\n",
             ),
         )
     )
-    return {TOPOLOGY: _encoded(scene), name: mutated(rng, _encoded(text))}
+    return {TOPOLOGY: _encoded(topology), name: mutated(rng, _encoded(text))}
 
 
 def _bomb(rng: random.Random) -> Files:
     """Ask for too much: of memory, depth, length or number."""
-    scene = _scene(rng)
+    topology = _topology(rng)
     count = rng.choice([10, 100, 300, 1000] * 5 + [10_000])
     large = rng.choice([1 << 16, 1 << 20, 10 << 20]) if rng.random() < 0.15 else 1 << 12
     old, replaces, new = rng.choice(BOMBS).partition("=>")
@@ -249,7 +251,7 @@ def _bomb(rng: random.Random) -> Files:
         return "".join(text.replace("#", str(at)).replace("@", str(at + 1)) for at in range(times))
 
     made = re.sub("(?s)«.*?»|‹.*?›|¿.*?‡", many, grown(rng, _RULES, new if replaces else old))
-    return {TOPOLOGY: _encoded(scene.replace(old, made, 1) if replaces else scene + made)}
+    return {TOPOLOGY: _encoded(topology.replace(old, made, 1) if replaces else topology + made)}
 
 
 CONSTANT = """\

@@ -1,5 +1,5 @@
-# ruff: noqa: E501 -- scenes, and lists of hostile values, read best as they are
-"""Damaged and forged files: compiled models, what `apc play` recorded of a peer, parts of a sweep, networks.
+# ruff: noqa: E501 -- topologies, and lists of hostile values, read best as they are
+"""Damaged and forged files: compiled models, what `apc run` recorded of a peer, parts of a sweep, networks.
 
 Takes: a seed. Gives: `FORGERIES`; `zipped`, `recorded`.
 Guarantees: of equal seed comes equal input, but for what a clock says in a recording; no forged model has a
@@ -34,19 +34,19 @@ from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
 from apc.compiler.store import model_of
 from apc.inputs import load_fresh
-from apc.loop.beside import compare_run
-from apc.loop.peer import PeerLoop
-from apc.loop.run import run_of, write_run
-from apc.loop.run_folder import read_run
 from apc.processes import digest_of
+from apc.realtime.peer import PeerLoop
+from apc.realtime.peer_run import run_of, write_run
+from apc.realtime.run_comparison import compare_run
+from apc.realtime.run_folder import read_run
 from apc.sweeps.finished_parts import open_parts
 from tests.fuzz.inputs import MODELS, Input, any_value, mutated
 from tests.fuzz.networks import ask_network, make_network, whole_networks
 from tests.fuzz.trees import Pairs, Tree, as_json, changed, of_json
 from tests.topologies import AVERAGE, replaced
 
-FILE = "scene.apc"
-_SCENES = ("three-users-average", "users-table", "finger", "mixed-clocks", "experiment-mesh")
+FILE = "topology.apc"
+_TOPOLOGIES = ("three-users-average", "users-table", "finger", "mixed-clocks", "experiment-mesh")
 # In place of a text, a name, a number or all that a model was made from.
 _HOSTILE = (
     *("", "..", "/etc/passwd", "../../x", "./users.csv", "/dev/zero", "x\0", "\x1b[31m", "Mass", "./parts/"),
@@ -159,7 +159,7 @@ def _changed_array(rng: random.Random, content: bytes) -> bytes:
 @functools.cache
 def bases() -> tuple[tuple[Origin, bytes], ...]:
     """Return whole models to start from: what each was made from, and itself."""
-    found = (compile_topology(MODELS / "scenes" / f"{scene}.yaml") for scene in _SCENES)
+    found = (compile_topology(MODELS / "topologies" / f"{topology}.yaml") for topology in _TOPOLOGIES)
     return tuple((system.origin, model_of(system)) for system in found)
 
 
@@ -238,8 +238,8 @@ def recorded() -> dict[str, bytes]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         moving = replaced(AVERAGE, ("{count: 3}", "{count: 2, set: {device.x: 3 mm}}"))
-        (folder / "scene.yaml").write_text(moving, encoding="utf-8")
-        system = compile_topology(folder / "scene.yaml")
+        (folder / "topology.yaml").write_text(moving, encoding="utf-8")
+        system = compile_topology(folder / "topology.yaml")
         names = ("user[1]", "user[2]")
         sockets = {peer: socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for peer in names}
         for one in sockets.values():
@@ -269,7 +269,7 @@ def _forge_recording(seed: str) -> Input:
 
 
 def _ask_recording() -> str:
-    """Read the run in this folder and lay it beside its scene, unless it is refused."""
+    """Read the run in this folder and lay it beside its topology, unless it is refused."""
     try:
         run = read_run(Path(RUN))
     except ApcError as error:

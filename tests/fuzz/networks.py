@@ -15,7 +15,7 @@ import re
 from pathlib import Path
 
 from apc.compiler.errors import ApcError
-from apc.network.recorded import describe
+from apc.network.link_fit import fit_recording
 from tests.fuzz.inputs import HOSTILE, Input, mutated
 
 FILE = "lan.txt"
@@ -90,13 +90,13 @@ def _changed(rng: random.Random, sort: str, data: bytes) -> bytes:
 def ask_network() -> str:
     """Describe the recording in this folder: a result that agrees with itself, or a diagnostic."""
     try:
-        found = describe(FILE)
+        found = fit_recording(FILE)
     except ApcError as error:
         lines = len(re.split(rb"\r\n|\n|\r", Path(FILE).read_bytes()))
         for mistake in error.mistakes:
             assert re.match("E70[1-4]|E22", mistake.code), str(error)  # E22 of a unit in a heading
-            assert mistake.place.file == FILE, str(error)
-            assert mistake.place.line <= lines, str(error)
+            assert mistake.location.file == FILE, str(error)
+            assert mistake.location.line <= lines, str(error)
         return "refused"
     assert len(found.delays) == found.packets > 0
     assert found.lost.count == sum(map(math.isinf, found.delays.tolist()))

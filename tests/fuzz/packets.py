@@ -14,8 +14,8 @@ from collections.abc import Callable
 import pytest
 
 from apc.compiler.compiled import Model
-from apc.loop.packets import ANSWER, DATA, HELLO, Address, Hello, Post
-from apc.loop.peer import PeerLoop
+from apc.realtime.packets import ANSWER, DATA, HELLO, Address, Hello, Post
+from apc.realtime.peer import PeerLoop
 from tests.fuzz.inputs import mutated
 from tests.surfaces.wire import OWN, SOON, Other, Wire, loop_at, send_packets
 
@@ -44,16 +44,16 @@ def run_packets(system: Model, count: int, seed: int) -> tuple[list[str], Counte
             here = _met(patch, system)
             _play(here)
             for index in range(given is _playing, count, 2):
-                luck = random.Random(f"{seed}/{index}")
-                sort = luck.choice(list(FORGED))
-                told = given(here, FORGED[sort](luck, here, earlier), sort in INSIDE)
+                noise = random.Random(f"{seed}/{index}")
+                sort = noise.choice(list(FORGED))
+                told = given(here, FORGED[sort](noise, here, earlier), sort in INSIDE)
                 outcomes[sort] += 1
                 if told:
                     failures.append(f"{sort}, seed {seed}, datagram {index}: {told}")
     return failures, outcomes
 
 
-class _Scene:
+class _Topology:
     """A peer that plays with two others: `given` are the datagrams that it took from them."""
 
     def __init__(self, wire: Wire, loop: PeerLoop, others: list[Other]) -> None:
@@ -63,25 +63,32 @@ class _Scene:
     def state(self) -> object:
         """Return all that a datagram might change."""
         loop = self.loop
-        kept = loop.player.packets.tobytes(), list(loop.player.arrivals), len(loop.player.ahead)
-        return kept, dict(loop.post.nonces), dict(loop.post.keys), dict(loop.offsets), loop.began, loop.begins
+        stored = loop.player.packets.tobytes(), list(loop.player.arrivals), len(loop.player.ahead)
+        return (
+            stored,
+            dict(loop.post.nonces),
+            dict(loop.post.keys),
+            dict(loop.offsets),
+            loop.began,
+            loop.begins,
+        )
 
 
-def _met(patch: pytest.MonkeyPatch, system: Model) -> _Scene:
+def _met(patch: pytest.MonkeyPatch, system: Model) -> _Topology:
     wire = Wire(patch)
     loop = loop_at(wire, system, DIGEST, SECRET)
     others = [Other(wire, number, DIGEST, SECRET) for number in (1, 2)]
     loop.meet(60)
-    return _Scene(wire, loop, others)
+    return _Topology(wire, loop, others)
 
 
-def _play(scene: _Scene) -> None:
-    send_packets(scene.loop, scene.others, 1.0)
-    scene.loop.take_in(scene.loop.begins + scene.loop.frame_ns)
-    scene.given = [(datagram, address) for _, datagram, address in scene.wire.given]
+def _play(topology: _Topology) -> None:
+    send_packets(topology.loop, topology.others, 1.0)
+    topology.loop.take_in(topology.loop.begins + topology.loop.frame_ns)
+    topology.given = [(datagram, address) for _, datagram, address in topology.wire.given]
 
 
-def _playing(here: _Scene, forged: Forgery, may: bool) -> str:
+def _playing(here: _Topology, forged: Forgery, may: bool) -> str:
     """Return what is wrong as a peer that plays is given a datagram, empty if nothing is."""
     before = here.state()
     here.wire.coming.clear()
@@ -93,7 +100,7 @@ def _playing(here: _Scene, forged: Forgery, may: bool) -> str:
     return "" if may or here.state() == before else "it was taken"
 
 
-def _meeting(here: _Scene, forged: Forgery, may: bool) -> str:
+def _meeting(here: _Topology, forged: Forgery, may: bool) -> str:
     """Return what is wrong as a peer meets the others and is given a datagram first."""
     loop, told = here.loop, ""
     loop.begins, loop.session, loop.began = 0, 0, None
@@ -102,75 +109,77 @@ def _meeting(here: _Scene, forged: Forgery, may: bool) -> str:
     here.wire.send(*forged)
     try:
         loop.meet(60)
-        told = "" if may or loop.session == loop.post.nonce else "it was told when the scene begins"
+        told = "" if may or loop.session == loop.post.nonce else "it was told when the topology begins"
     except Exception as error:
         told = f"{type(error).__name__}: {error}"
     return told or _playing(here, (here.others[0].post.hello(1, 0), here.others[0].address), True)
 
 
-def _torn(luck: random.Random, here: _Scene, _: _Scene) -> Forgery:
+def _torn(noise: random.Random, here: _Topology, _: _Topology) -> Forgery:
     """Return a good one changed anyhow, but for one that is as it was."""
-    datagram, address = luck.choice(here.given)
-    torn = next(one for one in iter(lambda: mutated(luck, datagram), None) if one != datagram)
+    datagram, address = noise.choice(here.given)
+    torn = next(one for one in iter(lambda: mutated(noise, datagram), None) if one != datagram)
     return torn, address
 
 
-def _again(luck: random.Random, here: _Scene, _: _Scene) -> Forgery:
+def _again(noise: random.Random, here: _Topology, _: _Topology) -> Forgery:
     """Return one that was heard, or one of somebody else's at an address."""
-    datagram, address = luck.choice(here.given)
+    datagram, address = noise.choice(here.given)
     stranger = ("192.0.2.1", 5000)
     where = [address, OWN, stranger, *(one.address for one in here.others)]
-    return datagram, luck.choice(where)
+    return datagram, noise.choice(where)
 
 
-def _own(luck: random.Random, here: _Scene, _: _Scene) -> Forgery:
+def _local(noise: random.Random, here: _Topology, _: _Topology) -> Forgery:
     """Return what the peer itself may have sent."""
-    post, other = here.loop.post, luck.choice(here.others)
-    data = post.data(1, other.post.own, 0, 1, (1.0, 1.0))
+    post, other = here.loop.post, noise.choice(here.others)
+    data = post.data(1, other.post.local, 0, 1, (1.0, 1.0))
     assert data is not None
-    return luck.choice([data, post.hello(1, other.post.own)]), other.address
+    return noise.choice([data, post.hello(1, other.post.local)]), other.address
 
 
-def _guessed(luck: random.Random, here: _Scene, _: _Scene) -> Forgery:
+def _guessed(noise: random.Random, here: _Topology, _: _Topology) -> Forgery:
     """Return one of somebody who knows everything but the secret."""
-    other = luck.choice(here.others)
-    post = Post(other.post.own, DIGEST, luck.choice([b"", b"password", SECRET[:-1]]), {OWN: 0})
+    other = noise.choice(here.others)
+    post = Post(other.post.local, DIGEST, noise.choice([b"", b"password", SECRET[:-1]]), {OWN: 0})
     post.nonces = {0: here.loop.post.nonce}
-    post.keys = {0: luck.choice([post.secret, SECRET, luck.randbytes(32)])}
-    asked = Hello(0, here.wire.time, here.loop.post.nonce, 0)
-    data = post.data(1, 0, 0, luck.randrange(99), (1.0, 1.0))
-    told = [post.hello(1, 0), post.answer(1, asked, 2, 3, 4), data]
-    return luck.choice(told) or b"", other.address
+    post.keys = {0: noise.choice([post.secret, SECRET, noise.randbytes(32)])}
+    requested = Hello(0, here.wire.time, here.loop.post.nonce, 0)
+    data = post.data(1, 0, 0, noise.randrange(99), (1.0, 1.0))
+    told = [post.hello(1, 0), post.answer(1, requested, 2, 3, 4), data]
+    return noise.choice(told) or b"", other.address
 
 
-def _wrong(luck: random.Random, here: _Scene, _: _Scene) -> Forgery:
+def _wrong(noise: random.Random, here: _Topology, _: _Topology) -> Forgery:
     """Return one that a peer gone wrong has sealed: numbers that can't be, lengths that don't fit."""
-    post, whole = (other := luck.choice(here.others)).post, lambda: luck.choice(EXTREME)
+    post, whole = (other := noise.choice(here.others)).post, lambda: noise.choice(EXTREME)
     times = struct.pack("<qqq", whole(), whole(), whole())
-    own, heard = luck.choice([0, *[post.nonce] * 9]), luck.choice([0, *[here.loop.post.nonce] * 9])
-    nonces = struct.pack("<QQ", own, heard)
-    values = [luck.choice([0.0, 1e308, float("nan"), float("inf")]) for _ in range(luck.randrange(4))]
-    data = struct.pack("<HQH", luck.choice([0, 1, 2**16 - 1]), whole() % 2**64, luck.choice([len(values), 9]))
+    own, received = noise.choice([0, *[post.nonce] * 9]), noise.choice([0, *[here.loop.post.nonce] * 9])
+    nonces = struct.pack("<QQ", own, received)
+    values = [noise.choice([0.0, 1e308, float("nan"), float("inf")]) for _ in range(noise.randrange(4))]
+    data = struct.pack(
+        "<HQH", noise.choice([0, 1, 2**16 - 1]), whole() % 2**64, noise.choice([len(values), 9])
+    )
     bodies = {
         HELLO: nonces,
-        ANSWER: nonces + times + struct.pack("<Q", luck.choice([0, 1])),
+        ANSWER: nonces + times + struct.pack("<Q", noise.choice([0, 1])),
         DATA: data + struct.pack(f"<{len(values)}d", *values),
-        luck.randrange(3, 256): nonces,
+        noise.randrange(3, 256): nonces,
     }
-    sort = luck.choice(list(bodies))
-    body = bodies[sort][: None if luck.random() < 0.8 else luck.randrange(20)]
+    sort = noise.choice(list(bodies))
+    body = bodies[sort][: None if noise.random() < 0.8 else noise.randrange(20)]
     return post._sealed(sort, whole(), body, post.keys[0] if sort == DATA else SECRET), other.address
 
 
-FORGED: dict[str, Callable[[random.Random, _Scene, _Scene], Forgery]] = {
-    "random bytes": lambda luck, here, _: (
-        luck.randbytes(luck.randrange(200)),
-        luck.choice(here.others).address,
+FORGED: dict[str, Callable[[random.Random, _Topology, _Topology], Forgery]] = {
+    "random bytes": lambda noise, here, _: (
+        noise.randbytes(noise.randrange(200)),
+        noise.choice(here.others).address,
     ),
     "torn": _torn,
     "heard before": _again,
-    "of an earlier session": lambda luck, _, earlier: luck.choice(earlier.given),
-    "this peer's own": _own,
+    "of an earlier session": lambda noise, _, earlier: noise.choice(earlier.given),
+    "this peer's own": _local,
     "sealed without the secret": _guessed,
     "of a peer gone wrong": _wrong,
 }

@@ -126,36 +126,36 @@ def run_all(
 def kind_of(what: str, sort: str | None = None) -> Kind:
     """Return inputs, of a sort if one is given, or the forged files of a name."""
     if what == "inputs":
-        return Kind(_warm_up, lambda seed: make_input(random.Random(seed), sort), _judged)
+        return Kind(_warm_up, lambda seed: make_input(random.Random(seed), sort), _decided)
     forgery = FORGERIES[what]
-    return Kind(partial(_warm_files, forgery), forgery.make, partial(_asked, forgery), forgery.memory)
+    return Kind(partial(_warm_files, forgery), forgery.make, partial(_requested, forgery), forgery.memory)
 
 
 def _warm_files(forgery: Forgery) -> None:
     """Load everything once: what is loaded later looks as if a file had had it loaded."""
     for given in forgery.whole():
-        assert _asked(forgery, given) == ("answered", ""), "nobody changed it"
+        assert _requested(forgery, given) == ("answered", ""), "nobody changed it"
 
 
-def _asked(forgery: Forgery, given: Input) -> tuple[str, str]:
+def _requested(forgery: Forgery, given: Input) -> tuple[str, str]:
     return _traced(given, lambda: (forgery.ask(), ""), forgery.seconds)
 
 
 def _warm_up() -> None:
     """Load everything once, so that no input pays for it and processes share it."""
-    # What is loaded when it is first needed, and compiles text then: for a hint, for a large scene.
+    # What is loaded when it is first needed, and compiles text then: for a hint, for a large topology.
     late = "numpy.ma numpy.random difflib tempfile traceback scipy.linalg sympy.physics.units"
     for module in late.split():
         importlib.import_module(module)
     before = Path.cwd()
-    os.chdir(MODELS / "scenes")
-    for scene in ("three-users-average", "experiment-average", "finger", "users-table"):
-        system = apc.compile(f"{scene}.yaml")
+    os.chdir(MODELS / "topologies")
+    for topology in ("three-users-average", "experiment-average", "finger", "users-table"):
+        system = apc.compile(f"{topology}.yaml")
         apc.analyze(system)
         apc.simulate(system, duration="20 ms", jit=False)
     os.chdir(before)
-    odd = MODELS.joinpath("scenes", "three-users-average.yaml").read_bytes()
-    _judged(
+    odd = MODELS.joinpath("topologies", "three-users-average.yaml").read_bytes()
+    _decided(
         Input("rare", ((TOPOLOGY, odd.replace(b"0.1 kg", b"1 furlong")),))
     )  # a unit that is looked up late
 
@@ -168,14 +168,14 @@ def _watched(
     The text of an input that did nothing wrong is its sort.
     """
     context = multiprocessing.get_context("fork")
-    heard, tell = context.Pipe(duplex=False)
+    received, tell = context.Pipe(duplex=False)
     child = context.Process(target=_become_worker, args=(work, tell, memory))
     child.start()
     tell.close()
     following = start
     try:
-        while following < stop and heard.poll(PATIENCE):
-            index, key, told = heard.recv()
+        while following < stop and received.poll(PATIENCE):
+            index, key, told = received.recv()
             yield index, key, told
             following = index + 1
         silent = following < stop
@@ -223,7 +223,7 @@ def _listen(event: str, arguments: tuple[object, ...]) -> None:
         _foreign.append(f"{event} {str(arguments)[:200]}")
 
 
-def _judged(given: Input) -> tuple[str, str]:
+def _decided(given: Input) -> tuple[str, str]:
     """Run one input in this process: "compiled", "refused", or the key and text of what is wrong."""
 
     def run() -> tuple[str, str]:
@@ -317,8 +317,8 @@ def _fault_of(error: ApcError, files: dict[str, bytes]) -> tuple[str, str] | Non
         fault = _fault_in(mistake, texts)
         if fault:
             return f"{fault}: {mistake.code} {_shape(mistake.sentence)}", told
-    for name in {one.place.file for one in mistakes}:
-        places = [(one.place.line, one.place.column) for one in mistakes if one.place.file == name]
+    for name in {one.location.file for one in mistakes}:
+        places = [(one.location.line, one.location.column) for one in mistakes if one.location.file == name]
         if places != sorted(places):
             return f"not in the file's order: {mistakes[0].code}", told
     return None
@@ -330,7 +330,7 @@ def _shape(sentence: str) -> str:
 
 
 def _fault_in(mistake: Diagnostic, texts: dict[str, list[bytes]]) -> str:
-    sentence, place = mistake.sentence, mistake.place
+    sentence, place = mistake.sentence, mistake.location
     if not re.fullmatch(r"E\d{3}", mistake.code):
         return "no code"
     if len(sentence.strip(" .")) < 8:

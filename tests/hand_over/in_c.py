@@ -66,7 +66,7 @@ class Running:
             if line.sending >= 0:
                 names += [f"{line.link} sent", *(f"{line.link} {one}" for one in line.channels)]
         ticking = {p for one in peer.instants for p in one.ticks}
-        names += [name for p in sorted(ticking) for name in peer.kind.clocks[p].outputs]
+        names += [name for p in sorted(ticking) for name in peer.peer_type.clocks[p].outputs]
         process = subprocess.Popen(
             [build(peer, folder)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
@@ -78,10 +78,10 @@ class Running:
         assert self.process.stdin is not None and self.process.stdout is not None and self.turns is not None
         self.process.stdin.write((" ".join(map(repr, row)) or ".") + "\n")
         self.process.stdin.flush()
-        said = [float(one) for one in self.process.stdout.readline().split()]
-        assert len(said) == len(self.names), f"{self.peer.name} ended"
+        printed = [float(one) for one in self.process.stdout.readline().split()]
+        assert len(printed) == len(self.names), f"{self.peer.name} ended"
         self.at += next(self.turns)
-        return dict(zip(self.names, said, strict=True))
+        return dict(zip(self.names, printed, strict=True))
 
     def end(self) -> None:
         assert self.process.stdin is not None and self.process.stdout is not None
@@ -94,10 +94,10 @@ class Running:
 def differences(
     system: apc.Model, folder: Path, *, duration: str, method: str = "", device: str | None = None
 ) -> dict[str, tuple[float, float]]:
-    """Play a scene, and its peers in C with the devices' motion and the packets' arrivals of that run.
+    """Play a topology, and its peers in C with the devices' motion and the packets' arrivals of that run.
 
-    Packets go from peer to peer as they come out of C, late by what the scene says, or as the links' luck has
-    it. Returns by signal the largest difference and the largest value.
+    Packets go from peer to peer as they come out of C, late by what the topology says, or as the links' luck
+    has it. Returns by signal the largest difference and the largest value.
     """
     how = parse_method(method) if method else DEFAULT
     plan = plan_of(system, how)
@@ -114,18 +114,20 @@ def differences(
         row = int(np.searchsorted(marks, at, side="right")) - 1
         for one in [one for one in running if one.at == at]:
             peer = one.peer
-            given = [float(column[f"{peer.name}.{peer.kind.states[i].name}"][row]) for i in peer.measured]
-            heard = network.heard(peer, at)
-            said = one.done([*given, *heard])
-            network.send(peer, at, said)
-            assert said["time"] == float(at * quantum)
+            given = [
+                float(column[f"{peer.name}.{peer.peer_type.states[i].name}"][row]) for i in peer.measured
+            ]
+            received = network.received(peer, at)
+            printed = one.done([*given, *received])
+            network.send(peer, at, printed)
+            assert printed["time"] == float(at * quantum)
             if at == marks[row] and one.at <= marks[row + 1]:
                 for name in one.names:
                     key = f"{peer.name}.{name}"
                     if key in column:
                         his = float(column[key][row + 1])
                         before = off.get(key, (0.0, 0.0))
-                        gap = 0.0 if said[name] == his else abs(said[name] - his)
+                        gap = 0.0 if printed[name] == his else abs(printed[name] - his)
                         off[key] = max(before[0], gap), max(before[1], abs(his))
     for one in running:
         one.end()
@@ -151,18 +153,20 @@ class _Network:
             if link.channel is None:
                 continue
             law = channel_law(plan.system, link, timings[link.delay])
-            for way in itertools.permutations(range(plan.exchange.peers), 2):
-                taken = PacketSource(law, name, [way], seed=plan.system.experiment.seed).take(MOST_PACKETS)
-                self.late[(name, *way)] = taken[0].tolist()
+            for coupling_term in itertools.permutations(range(plan.exchange.peers), 2):
+                used = PacketSource(law, name, [coupling_term], seed=plan.system.experiment.seed).take(
+                    MOST_PACKETS
+                )
+                self.late[(name, *coupling_term)] = used[0].tolist()
 
-    def send(self, peer: ExportedPeer, at: int, said: Mapping[str, float]) -> None:
+    def send(self, peer: ExportedPeer, at: int, printed: Mapping[str, float]) -> None:
         for line in peer.lines:
-            if line.sending >= 0 and said[f"{line.link} sent"]:
+            if line.sending >= 0 and printed[f"{line.link} sent"]:
                 period, phase = self.grid[line.link]
-                packet = {one: said[f"{line.link} {one}"] for one in line.channels}
+                packet = {one: printed[f"{line.link} {one}"] for one in line.channels}
                 self.sent[line.link, peer.number, (at - phase) // period] = packet
 
-    def heard(self, peer: ExportedPeer, at: int) -> list[float]:
+    def received(self, peer: ExportedPeer, at: int) -> list[float]:
         """Return the numbers that are heard at an instant, in the driver's order."""
         found: list[float] = []
         exchange, timings = self.plan.exchange, self.plan.numbers.timings
@@ -172,10 +176,10 @@ class _Network:
             for sender in line.senders:
                 late = exchange.delay(line.link, int(groups[sender.peer]), int(groups[peer.number]))
                 number, gone = (at - int(timings[late] / self.quantum) - phase) // period, False
-                if (way := (line.link, sender.peer, peer.number)) in self.late:
+                if (coupling_term := (line.link, sender.peer, peer.number)) in self.late:
                     newest = self.links[line.link].channel.reorder != "all"
                     tick = int(at * self.quantum * 1000)  # ticks every millisecond, packets every eight
-                    number, gone = effective(self.late[way], tick, newest=newest)
+                    number, gone = effective(self.late[coupling_term], tick, newest=newest)
                 if number < 0:
                     found += sender.start
                 else:

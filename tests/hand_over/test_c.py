@@ -15,13 +15,13 @@ from apc.exports.peer_step import peer_of
 from apc.simulation.settings import DEFAULT, parse_method
 from apc.simulation.simulation import plan_of
 from tests.hand_over.in_c import SANITIZED, STRICT, build, compiler, differences, worst
-from tests.topologies import AVERAGE, ROOT, SCENES, compiled, replaced
+from tests.topologies import AVERAGE, ROOT, TOPOLOGIES, compiled, replaced
 
 MOVED = replaced(AVERAGE, ("user: {count: 3}", "user: {count: 3, set: {device.x: [30 mm, -20 mm, 7 mm]}}"))
 RING = replaced(MOVED, ("delay: 8 ms}", "delay: 8 ms, graph: ring}"))
-PAPER = (SCENES / "experiment-average.yaml").read_text(encoding="utf-8").partition("\n")[2]
+PAPER = (TOPOLOGIES / "experiment-average.yaml").read_text(encoding="utf-8").partition("\n")[2]
 MIXED = replaced(
-    (SCENES / "mixed-clocks.yaml").read_text(encoding="utf-8").partition("\n")[2],
+    (TOPOLOGIES / "mixed-clocks.yaml").read_text(encoding="utf-8").partition("\n")[2],
     ("near: {count: 2}", "near: {count: 2, set: {device.x: [30 mm, -20 mm]}}"),
 )
 INSIDE = replaced(MOVED, ("delay: 1 ms, link: lan", "delay: 2.3 ms, link: lan"))
@@ -32,7 +32,7 @@ PAIRS = replaced(
             "type: SaturatedMesh, object: cube, stiffness: 500 N/m, limit: 2 N"),
 )  # fmt: skip
 AGED = replaced(
-    (SCENES / "three-users-scheduled.yaml").read_text(encoding="utf-8"),
+    (TOPOLOGIES / "three-users-scheduled.yaml").read_text(encoding="utf-8"),
     ("{count: 3}", "{count: 3, set: {device.x: [3 mm, -2 mm, 1 mm]}}"),
     ("loss: 0 %", "loss: 20 %, jitter: 3 ms"),
 )  # fmt: skip
@@ -65,10 +65,12 @@ def test_its_forces_are_those_of_simulate_to_the_last_bits(name: str, tmp_path: 
 
 
 @pytest.mark.whole
-@pytest.mark.parametrize("scene", ["planar-users", "two-users-waves", "two-users-passivity", "client-server"])
-def test_so_are_those_of_other_couplers(scene: str, tmp_path: Path) -> None:
-    text = (SCENES / f"{scene}.yaml").read_text(encoding="utf-8").partition("\n")[2]
-    device = "none" if scene == "client-server" else None
+@pytest.mark.parametrize(
+    "topology", ["planar-users", "two-users-waves", "two-users-passivity", "client-server"]
+)
+def test_so_are_those_of_other_couplers(topology: str, tmp_path: Path) -> None:
+    text = (TOPOLOGIES / f"{topology}.yaml").read_text(encoding="utf-8").partition("\n")[2]
+    device = "none" if topology == "client-server" else None
     off = differences(compiled(text), tmp_path, duration="0.2 s", device=device)
     assert max(gap for gap, _ in off.values()) < 1e-11
 
@@ -89,9 +91,13 @@ TIED = replaced(
 
 def test_the_device_is_what_a_hand_holds() -> None:
     """A finger on a spring moves with it, so it is outside too; what is asked of a motor is no member."""
-    plan = plan_of(apc.compile(SCENES / "finger.yaml"), DEFAULT)
+    plan = plan_of(apc.compile(TOPOLOGIES / "finger.yaml"), DEFAULT)
     peer = peer_of(plan, 0, DEFAULT, device=None)
-    assert {peer.kind.states[row].name for row in peer.outside} >= {"device.x", "device.v", "finger.bone.x"}
+    assert {peer.peer_type.states[row].name for row in peer.outside} >= {
+        "device.x",
+        "device.v",
+        "finger.bone.x",
+    }
     assert [force.name for force in peer.forces.values()] == ["device.f"]
     assert not any(signal.name == "device.asked" for signal in peer.signals)
 
@@ -112,8 +118,8 @@ def test_nothing_in_it_changes_but_what_is_given(tmp_path: Path) -> None:
     told = subprocess.run(
         ["nm", f"{code.identifier}.o"], cwd=tmp_path, capture_output=True, text=True, check=True
     )
-    kinds = {line.split()[-2]: line.split()[-1] for line in told.stdout.splitlines()}
-    assert not set(kinds) & set("dDbBCgGsS"), told.stdout
+    peer_types = {line.split()[-2]: line.split()[-1] for line in told.stdout.splitlines()}
+    assert not set(peer_types) & set("dDbBCgGsS"), told.stdout
     called = {line.split()[-1] for line in told.stdout.splitlines() if line.split()[-2] == "U"}
     assert called <= {"_GLOBAL_OFFSET_TABLE_", "__stack_chk_fail"}
     text = (tmp_path / f"{code.identifier}.c").read_text(encoding="ascii")
@@ -122,8 +128,8 @@ def test_nothing_in_it_changes_but_what_is_given(tmp_path: Path) -> None:
 
 
 def test_the_loop_of_the_readme_compiles(tmp_path: Path) -> None:
-    scene = str(SCENES / "experiment-average.yaml")
-    assert run(["export", scene, "--peer", "left[1]", "--out", str(tmp_path / "left.c")]) == 0
+    topology = str(TOPOLOGIES / "experiment-average.yaml")
+    assert run(["export", topology, "--peer", "left[1]", "--out", str(tmp_path / "left.c")]) == 0
     text = (ROOT / "runtime" / "exports" / "README.md").read_text(encoding="utf-8")
     _, _, after = text.partition("<!-- compiled with left.h of experiment-average.yaml -->\n```c\n")
     (tmp_path / "loop.c").write_text(after.partition("```")[0], encoding="ascii")

@@ -13,7 +13,7 @@ import pytest
 import apc
 from apc.__main__ import run
 from apc.exports.c_text import driver, header, source
-from apc.exports.code import scene_unit
+from apc.exports.code import topology_unit
 from apc.exports.fmu import OPTIONS
 from apc.exports.identifiers import identifier, prefixed
 from apc.exports.peer_step import ExportedPeer, peer_of
@@ -39,7 +39,7 @@ NAN INFINITY M_PI M_E HUGE_VAL MATH_ERRNO FP_NAN FP_ZERO isnan linux unix NULL E
 gamma
 """
 OWN = """
-in out start unheard time tick next send force move p p_sent x y u t k late quanta instant missing
+in out start clear time tick next send force move p p_sent x y u t k late quanta instant missing
 none model peer begin run real flag given own link value state packet
 """
 LANGUAGE = {"else", "if", "and", "not", "or", "time"}  # no names of a topology
@@ -94,7 +94,7 @@ def compile_all(peer: ExportedPeer, folder: Path) -> None:
 int main() {{
   {name} peer; {name}_in in; {name}_out out;
   {name}_start(&peer);
-  {name}_unheard(&in);
+  {name}_clear(&in);
   {name}_send(&peer, &in, &out);
   {name}_force(&peer, &in, &out);
   {name}_move(&peer);
@@ -123,7 +123,7 @@ def test_links_of_any_name_compile_as_c_and_cpp(tmp_path: Path) -> None:
 
 
 def compile_fmu(system: apc.Model, folder: Path, peer: str = "") -> None:
-    unit = scene_unit(system, peer=peer)
+    unit = topology_unit(system, peer=peer)
     for file, text in unit.texts.items():
         (folder / file).write_text(text, encoding="ascii")
     listed = [file for file in unit.texts if file.endswith(".c")]
@@ -138,8 +138,8 @@ def compile_fmu(system: apc.Model, folder: Path, peer: str = "") -> None:
 def test_a_name_that_no_include_can_hold_is_refused(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    scene = ROOT / "models" / "scenes" / "three-users-average.yaml"
-    assert run(["export", str(scene), "--peer", "user[1]", "--out", str(tmp_path / name)]) == 1
+    topology_text = ROOT / "models" / "topologies" / "three-users-average.yaml"
+    assert run(["export", str(topology_text), "--peer", "user[1]", "--out", str(tmp_path / name)]) == 1
     assert "E601" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
@@ -149,7 +149,8 @@ def test_so_does_an_fmu_of_them(tmp_path: Path) -> None:
     compile_fmu(hostile(), tmp_path)
 
 
-# A type of one peer, were it put together from names alone, would be another peer or a function of the scene.
+# A type of one peer, were it put together from names alone, would be another peer or a function of the
+# topology.
 GROUPS = ["begin", "next", "a", "A", "a_1_link_b", "link_b_1", "newest_link_b", "class", "M_SQRT1", "site0_a"]
 
 

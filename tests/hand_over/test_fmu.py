@@ -17,7 +17,7 @@ import pytest
 import apc
 from apc.__main__ import run
 from apc.compiler.errors import ApcError
-from apc.exports.code import scene_unit
+from apc.exports.code import topology_unit
 from apc.exports.fmu import FmuContent, write_fmu
 from tests.hand_over.in_c import STRICT, compiler
 from tests.hand_over.test_c import BENT, INSIDE, LOSSY, LOSSY_HOLD, MIXED, MOVED, PAIRS, PAPER
@@ -32,7 +32,7 @@ OWN = replaced(
 BURSTS = replaced(
     MOVED, ("delay: 8 ms}", "delay: 8 ms, jitter: 4 ms, distribution: pareto, loss: {p: 10 %, r: 30 %}}")
 )
-SCENES = {
+TOPOLOGIES = {
     "moved": MOVED,
     "mixed clocks": MIXED,
     "a delay inside a tick": INSIDE,
@@ -55,8 +55,8 @@ def fmpy() -> Any:
 
 
 def written(text: str, folder: Path, *, peer: str = "", method: str = "") -> tuple[Path, FmuContent]:
-    unit = scene_unit(compiled(text), peer=peer, method=method)
-    write_fmu(path := folder / f"{unit.scene.name}.fmu", unit)
+    unit = topology_unit(compiled(text), peer=peer, method=method)
+    write_fmu(path := folder / f"{unit.topology.name}.fmu", unit)
     return path, unit
 
 
@@ -73,20 +73,20 @@ def gap(system: apc.Model, path: Path, unit: FmuContent, method: str = "", secon
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize("name", SCENES)
-def test_a_scene_is_played_as_simulate_plays_it(name: str, fmpy: Any, tmp_path: Path) -> None:
-    path, unit = written(SCENES[name], tmp_path)
+@pytest.mark.parametrize("name", TOPOLOGIES)
+def test_a_topology_is_played_as_simulate_plays_it(name: str, fmpy: Any, tmp_path: Path) -> None:
+    path, unit = written(TOPOLOGIES[name], tmp_path)
     assert not fmpy.validate_fmu(path)
-    assert gap(compiled(SCENES[name]), path, unit) < 1e-9
+    assert gap(compiled(TOPOLOGIES[name]), path, unit) < 1e-9
 
 
 @pytest.mark.whole
 def test_recorded_delays_are_played_one_after_another(fmpy: Any, tmp_path: Path) -> None:
     (tmp_path / "delays.csv").write_text("delay [ms]\n8\n9.5\n\n21\n7\n8\n30\n", encoding="utf-8")
     text = replaced(MOVED, ("delay: 8 ms}", "trace: delays.csv}"))
-    (tmp_path / "scene.yaml").write_text(text, encoding="utf-8")
-    system = apc.compile(tmp_path / "scene.yaml")
-    write_fmu(path := tmp_path / "scene.fmu", unit := scene_unit(system))
+    (tmp_path / "topology.yaml").write_text(text, encoding="utf-8")
+    system = apc.compile(tmp_path / "topology.yaml")
+    write_fmu(path := tmp_path / "topology.fmu", unit := topology_unit(system))
     assert gap(system, path, unit) < 1e-9
 
 
@@ -141,7 +141,7 @@ class Instance:
 
 @pytest.mark.whole
 @pytest.mark.parametrize(("text", "late"), [(PAPER, 8), (AT_ONCE, 0), (MOVED, 8)])
-def test_peers_joined_by_a_network_of_ones_own_are_the_scene(
+def test_peers_joined_by_a_network_of_ones_own_are_the_topology(
     text: str, late: int, fmpy: Any, tmp_path: Path
 ) -> None:
     """Each is told at every millisecond what the others' outputs were so long ago."""
@@ -152,7 +152,7 @@ def test_peers_joined_by_a_network_of_ones_own_are_the_scene(
     for name in names:
         path, unit = written(text, tmp_path, peer=name)
         assert not fmpy.validate_fmu(path)
-        running[name] = Instance(path, tmp_path / unit.scene.name)
+        running[name] = Instance(path, tmp_path / unit.topology.name)
     known = running[names[0]].references
     channels = [one for one in ("coordination.x", "coordination.v") if f"lan.{one}" in known]
     sent: list[dict[str, list[float]]] = []
@@ -195,11 +195,11 @@ def test_a_device_that_is_pushed_moves_as_by_a_hand(fmpy: Any, tmp_path: Path) -
 
 
 @pytest.mark.whole
-def test_a_scene_begins_where_its_states_and_parameters_are_set(fmpy: Any, tmp_path: Path) -> None:
+def test_a_topology_begins_where_its_states_and_parameters_are_set(fmpy: Any, tmp_path: Path) -> None:
     path, _ = written(PAPER, tmp_path)
     starts = {f"{one}.device.x": 0.0125 for one in ("left[1]", "left[2]", "right[1]")}
     numbers = {"device.x": 0.0125, "contact.stiffness": 800.0}
-    course = apc.simulate(compiled(PAPER), set=numbers, duration="0.1 s", jit=False)
+    course = apc.simulate(compiled(PAPER), params=numbers, duration="0.1 s", jit=False)
     one = Instance(path, tmp_path / "unzipped")
     one.unit.reset()
     softer = {f"{one.removesuffix('device.x')}contact.stiffness": 800.0 for one in starts}
@@ -232,10 +232,10 @@ def test_a_step_may_be_of_any_length_and_a_state_can_be_had_back(fmpy: Any, tmp_
         return at
 
     begun = walk(Fraction(0))
-    kept, before = one.unit.serializeFMUState(one.unit.getFMUState()), one.read(*names)
+    stored, before = one.unit.serializeFMUState(one.unit.getFMUState()), one.read(*names)
     walk(begun)
     end = one.read(*names)
-    one.unit.setFMUState(one.unit.deSerializeFMUstate(kept))
+    one.unit.setFMUState(one.unit.deSerializeFMUstate(stored))
     assert one.read(*names) == before
     walk(begun)
     assert one.read(*names) == end
@@ -253,16 +253,16 @@ def test_a_peer_says_what_it_hears_and_sends(tmp_path: Path) -> None:
         told = xml.fromstring(archive.read("modelDescription.xml"))
         names = archive.namelist()
     causes = {one.get("name"): one.get("causality") for one in told.iter("ScalarVariable")}
-    heard = {name for name, cause in causes.items() if cause == "input"}
-    told_of = ("coordination.x", "coordination.v", "missing")
-    assert heard == {f"lan.user[{k}].{what}" for k in (1, 3) for what in told_of} | {"force on device"}
+    received = {name for name, cause in causes.items() if cause == "input"}
+    reported_by = ("coordination.x", "coordination.v", "missing")
+    assert received == {f"lan.user[{k}].{what}" for k in (1, 3) for what in reported_by} | {"force on device"}
     assert causes["lan.coordination.x"] == "output"
     assert next(one for one in names if one.startswith("binaries/")).split("/")[1].endswith("64")
     assert all(f"sources/{one.get('name')}" in names for one in told.iter("File"))
 
 
 def test_its_sources_compile_strictly(tmp_path: Path) -> None:
-    unit = scene_unit(compiled(LOSSY))
+    unit = topology_unit(compiled(LOSSY))
     for name, text in unit.texts.items():
         (tmp_path / name).write_text(text, encoding="ascii")
     sources = [name for name in unit.texts if name.endswith(".c")]
@@ -271,7 +271,7 @@ def test_its_sources_compile_strictly(tmp_path: Path) -> None:
 
 
 @pytest.mark.whole
-def test_another_program_is_not_given_another_scene(fmpy: Any, tmp_path: Path) -> None:
+def test_another_program_is_not_given_another_topology(fmpy: Any, tmp_path: Path) -> None:
     """A library whose description was exchanged refuses to begin."""
     path, _ = written(PAPER, tmp_path)
     with zipfile.ZipFile(path) as archive:
@@ -286,17 +286,20 @@ def test_another_program_is_not_given_another_scene(fmpy: Any, tmp_path: Path) -
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["scene.fmu"], "E960 user[1]: between ticks cube.x, cube.v move by CVODES"),
+        (["topology.fmu"], "E960 user[1]: between ticks cube.x, cube.v move by CVODES"),
         (["peer.c"], 'E963 --peer: the peers differ, and a text of C is of one. Write: --peer "user[1]"'),
         (
             ["peer.c", "--peer", "user[4]"],
             'E970 a peer wants one of user[1], user[2], user[3], got user[4]. Write: --peer "user[1]"',
         ),
         (
-            ["scene.fmu", "--peer", "usr[1]"],
+            ["topology.fmu", "--peer", "usr[1]"],
             'E970 a peer wants one of user[1], user[2], user[3], got usr[1]. Write: --peer "user[1]"',
         ),
-        (["scene.fmu", "--device", "device"], "E953 --device means nothing to the format fmu. Write: --to c"),
+        (
+            ["topology.fmu", "--device", "device"],
+            "E953 --device means nothing to the format fmu. Write: --to c",
+        ),
     ],
 )
 def test_what_cannot_be_is_told_and_nothing_is_written(
@@ -307,14 +310,19 @@ def test_what_cannot_be_is_told_and_nothing_is_written(
 
 def test_more_ways_than_fit_a_text_are_refused() -> None:
     with pytest.raises(ApcError, match="E960 200 peers hear each other on 39,800 ways; 20,000 fit"):
-        scene_unit(compiled(replaced(AVERAGE, ("count: 3", "count: 200"))))
+        topology_unit(compiled(replaced(AVERAGE, ("count: 3", "count: 200"))))
 
 
 def test_where_all_peers_are_alike_one_serves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    (tmp_path / "topology.yaml").write_text(AVERAGE, encoding="utf-8")
     assert run(["export", "--out", "peer.c"]) == 0
-    assert sorted(one.name for one in tmp_path.iterdir()) == ["peer.c", "peer.h", "peer_test.c", "scene.yaml"]
+    assert sorted(one.name for one in tmp_path.iterdir()) == [
+        "peer.c",
+        "peer.h",
+        "peer_test.c",
+        "topology.yaml",
+    ]
 
 
 def test_without_a_compiler_there_is_a_message_and_no_archive(

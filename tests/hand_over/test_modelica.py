@@ -1,4 +1,4 @@
-"""A scene as a Modelica model, compiled and played by Rumoca beside `apc simulate`."""
+"""A topology as a Modelica model, compiled and played by Rumoca beside `apc simulate`."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from apc.__main__ import run
 from apc.compiler.errors import ApcError
 from apc.exports.expressions import identifier
 from apc.exports.modelica import modelica
-from tests.topologies import AVERAGE, SCENES, compiled, replaced
+from tests.topologies import AVERAGE, TOPOLOGIES, compiled, replaced
 
 needs_rumoca = pytest.mark.skipif(
     find_spec("rumoca") is None, reason="Rumoca, which compiles Modelica, is not installed"
 )
 
-APART = replaced(
+SEPARATE = replaced(
     AVERAGE, ("{count: 3}", "{count: 3, set: {device.x: [3 mm, -1 mm, 0.5 mm], cube.x: [2 mm, -1 mm, 0 mm]}}")
 )
 # Nothing about its times is even: what is heard when, what acts when, from which instant clocks tick.
@@ -61,7 +61,7 @@ links: {lan: {clock: network, delay: 8 ms}}
 
 
 def worst(system: apc.Model, seconds: float, method: str | None = None) -> float:
-    """Play a scene by Rumoca and by apc; return how far states are apart, of the largest of each kind."""
+    """Play a topology by Rumoca and by apc; return how far states are apart, of the largest of each kind."""
     rumoca = import_module("rumoca")
     made = modelica(system)
     played = apc.simulate(system, duration=f"{seconds} s", jit=False, method=method)
@@ -82,8 +82,8 @@ def worst(system: apc.Model, seconds: float, method: str | None = None) -> float
 @pytest.mark.few(1)
 @needs_rumoca
 @pytest.mark.parametrize("times", TIMES)
-def test_rumoca_plays_the_papers_scene_at_any_times_as_simulate_does(times: str) -> None:
-    assert worst(compiled(replaced(APART, *TIMES[times])), 0.06) < 1e-9
+def test_rumoca_plays_the_papers_topology_at_any_times_as_simulate_does(times: str) -> None:
+    assert worst(compiled(replaced(SEPARATE, *TIMES[times])), 0.06) < 1e-9
 
 
 @pytest.mark.few(1)
@@ -108,8 +108,8 @@ def test_rumoca_plays_the_papers_scene_at_any_times_as_simulate_does(times: str)
         ("lifted-box", {}),
     ],
 )
-def test_rumoca_plays_scenes_of_the_library_as_simulate_does(name: str, settings: dict[str, str]) -> None:
-    system = apc.set_parameters(apc.compile(SCENES / f"{name}.yaml"), settings)
+def test_rumoca_plays_topologies_of_the_library_as_simulate_does(name: str, settings: dict[str, str]) -> None:
+    system = apc.set_parameters(apc.compile(TOPOLOGIES / f"{name}.yaml"), settings)
     assert worst(system, 0.06) < 1e-7  # what switches in time is found by each to its own tolerance
 
 
@@ -133,7 +133,7 @@ HANDS = {
 @pytest.mark.parametrize("hand", HANDS)
 def test_rumoca_plays_hands_as_simulate_does(hand: str, tmp_path: Path) -> None:
     (tmp_path / "push.csv").write_text("time [s],force [N]\n0,0\n0.01,1\n0.02,-1\n", encoding="utf-8")
-    path = tmp_path / "scene.yaml"
+    path = tmp_path / "topology.yaml"
     held = f"hands:\n  hand: {{type: {hand}, flange: device, {HANDS[hand]}}}\n"
     path.write_text(AVERAGE + held, encoding="utf-8")
     assert worst(apc.compile(path), 0.04) < 1e-9
@@ -154,7 +154,7 @@ def test_the_text_is_readable() -> None:
     ):
         assert line in text.splitlines()
     assert "StopTime=1.0, Interval=0.001" in text
-    assert re.search(r"// Written by apc \S+ from scene.yaml", text)
+    assert re.search(r"// Written by apc \S+ from topology.yaml", text)
     declared = set(re.findall(r"^  (?:Real|Boolean) ('.*?'|\w+)[(; ]", text, re.MULTILINE))
     defined = re.findall(r"^  (?:der\()?('.*?'|\w+)\)? = ", text.partition("\nequation\n")[2], re.MULTILINE)
     assert sorted(defined) == sorted(declared)  # as many equations as unknowns, one each
@@ -186,7 +186,7 @@ def test_what_modelica_has_no_words_for_is_refused_by_name(text: str, message: s
 
 SOFT = """\
 component: SoftSpring
-about: A spring that gives way more the harder it is pulled.
+description: A spring that gives way more the harder it is pulled.
 connectors: {a: Flange, b: Flange}
 parameters: {stiffness: {unit: N/m}, soft: {unit: 1/N^2}}
 variables: {f: {unit: N}}
@@ -196,7 +196,7 @@ equations: [f + soft*f^3 = stiffness*(a.x - b.x), a.f = f, b.f = -a.f]
 
 def test_a_loop_that_newtons_method_solves_is_refused_by_name(tmp_path: Path) -> None:
     (tmp_path / "soft.yaml").write_text(SOFT, encoding="utf-8")
-    path = tmp_path / "scene.yaml"
+    path = tmp_path / "topology.yaml"
     spring = "{type: SoftSpring, a: device, b: cube, stiffness: 100 N/m, soft: 1 1/N^2}"
     couplers = ("couplers:", f"couplers:\n  spring: {spring}")
     path.write_text(replaced(AVERAGE, ("topology:", "library: ./\ntopology:"), couplers), encoding="utf-8")
@@ -204,17 +204,17 @@ def test_a_loop_that_newtons_method_solves_is_refused_by_name(tmp_path: Path) ->
         modelica(apc.compile(path))
 
 
-def test_a_refused_scene_leaves_no_file(
+def test_a_refused_topology_leaves_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "scene.yaml").write_text(LOSSY, encoding="utf-8")
-    assert run(["export", "--out", "scene.mo"]) == 1
+    (tmp_path / "topology.yaml").write_text(LOSSY, encoding="utf-8")
+    assert run(["export", "--out", "topology.mo"]) == 1
     assert "E955" in capsys.readouterr().err
-    assert run(["export", "--out", "scene.mo", "--set", "lan.loss=0"]) == 0
-    assert (tmp_path / "scene.mo").read_text(encoding="utf-8").startswith("model three_users_average")
-    assert run(["export", "--out", "scene.mo", "--cut", "lan"]) == 1
-    assert "E953 --cut means nothing to the format modelica" in capsys.readouterr().err
+    assert run(["export", "--out", "topology.mo", "--set", "lan.loss=0"]) == 0
+    assert (tmp_path / "topology.mo").read_text(encoding="utf-8").startswith("model three_users_average")
+    assert run(["export", "--out", "topology.mo", "--open-at", "lan"]) == 1
+    assert "E953 --open-at means nothing to the format modelica" in capsys.readouterr().err
 
 
 # Keywords, predefined types, operators and functions of the Modelica Language Specification 3.6.
@@ -246,7 +246,7 @@ def test_no_name_of_the_language_is_declared() -> None:
         ("Clock", "Real", "firstTick"),
     ],
 )
-def test_a_scene_of_such_names_is_a_model(model: str, fast: str, slow: str) -> None:
+def test_a_topology_of_such_names_is_a_model(model: str, fast: str, slow: str) -> None:
     """No line declares the name without quotes; Rumoca, where it is installed, compiles the model."""
     text = replaced(AVERAGE, ("topology: three-users-average", f"topology: {model}"))
     text = text.replace("haptic", fast).replace("network", slow)

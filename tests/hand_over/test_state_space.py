@@ -1,4 +1,4 @@
-"""A scene handed over as a state space: its loop, closed or cut open, opened again by other tools."""
+"""A topology handed over as a state space: its loop, closed or cut open, opened again by other tools."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import apc
 from apc.__main__ import run
 from apc.compiler.errors import ApcError
 from apc.exports.lifted import StateSpace, state_space
-from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
+from tests.topologies import AVERAGE, MESH, TOPOLOGIES, compiled, replaced
 
 Floats = NDArray[np.float64]
 
@@ -44,7 +44,7 @@ couplers: {wall: {type: SampledSpringDamper, a: device, b: ground, stiffness: 40
 
 
 TEXTS = {"average": AVERAGE, "mesh": MESH, "late": LATE}
-# The scenes every export has to carry.
+# The topologies every export has to carry.
 EVERY = (*TEXTS, *NAMES)
 
 
@@ -54,7 +54,7 @@ def made(name: str) -> apc.Model:
 
 @functools.cache
 def shipped(name: str) -> apc.Model:
-    return apc.compile(SCENES / f"{name}.yaml")
+    return apc.compile(TOPOLOGIES / f"{name}.yaml")
 
 
 def magnitudes(matrix: Floats) -> Floats:
@@ -63,8 +63,8 @@ def magnitudes(matrix: Floats) -> Floats:
 
 
 def cuts(system: apc.Model) -> list[str]:
-    """Return all that a scene can be cut at."""
-    forces = {hold.name.rpartition(".")[0] for kind in system.kinds for hold in kind.holds}
+    """Return all that a topology can be cut at."""
+    forces = {hold.name.rpartition(".")[0] for peer_type in system.peer_types for hold in peer_type.holds}
     return [*(link.name for link in system.links), *sorted(forces)]
 
 
@@ -73,12 +73,12 @@ def cuts(system: apc.Model) -> list[str]:
 def test_cut_open_and_closed_again_it_is_the_loop(name: str) -> None:
     whole = state_space(made(name))
     for cut in cuts(made(name)):
-        found = state_space(made(name), cut=cut)
+        found = state_space(made(name), open_at=cut)
         assert found.states == whole.states
-        again = np.linalg.solve(np.eye(len(found.d)) + found.d, found.c)
+        repeated = np.linalg.solve(np.eye(len(found.d)) + found.d, found.c)
         # The forces of a stiff contact are thousands of newtons a metre: roundings of the solution.
-        scale = np.abs(found.b) @ np.abs(again) + np.abs(whole.a)
-        assert (np.abs(found.a - found.b @ again - whole.a) <= 1e-13 * (1 + scale)).all(), cut
+        scale = np.abs(found.b) @ np.abs(repeated) + np.abs(whole.a)
+        assert (np.abs(found.a - found.b @ repeated - whole.a) <= 1e-13 * (1 + scale)).all(), cut
 
 
 def grows(found: StateSpace, gain: float) -> bool:
@@ -92,30 +92,30 @@ def grows(found: StateSpace, gain: float) -> bool:
 def test_the_gain_margin_of_a_coupler_cut_open_is_that_of_its_stiffness(cut: str) -> None:
     """Its force is its stiffness times a length: all else is as it was."""
     margin = next(one for one in apc.margins(made("average")).rows if one.parameter == f"{cut}.stiffness")
-    found = state_space(made("average"), cut=cut)
-    assert margin.factor is not None
-    assert not grows(found, margin.factor * (1 - 1e-8))
-    assert grows(found, margin.factor * (1 + 1e-8))
+    found = state_space(made("average"), open_at=cut)
+    assert margin.gain_margin is not None
+    assert not grows(found, margin.gain_margin * (1 - 1e-8))
+    assert grows(found, margin.gain_margin * (1 + 1e-8))
 
 
 @pytest.mark.whole
 def test_python_control_finds_the_poles_and_margins_that_apc_finds() -> None:
     """A loop of one peer and one tick a frame has one input and one output, cut at its wall."""
     control = pytest.importorskip("control")
-    opened = state_space(made("average"), cut="lan").to_control()
+    opened = state_space(made("average"), open_at="lan").to_control()
     assert opened.dt == 0.008
     closed = control.feedback(opened, np.eye(opened.ninputs))
     poles = np.sort(np.abs(closed.poles()))[::-1]
     assert poles[:2] == pytest.approx([1.0, apc.analyze(made("average")).spectral_radius], abs=1e-11)
     system = compiled(HELD)
-    gain, _, crossing, _ = control.margin(state_space(system, cut="wall").to_control())
+    gain, _, crossing, _ = control.margin(state_space(system, open_at="wall").to_control())
     margin = next(one for one in apc.margins(system).rows if one.parameter == "wall.stiffness")
-    assert gain == pytest.approx(margin.factor, rel=1e-9)
+    assert gain == pytest.approx(margin.gain_margin, rel=1e-9)
     assert crossing / (2 * np.pi) == pytest.approx(margin.frequency_hz, rel=1e-9)
 
 
 HAND = "hands:\n  hand: {type: ConstantForce, flange: PART, force: 0 N}\n"
-# A scene, whose part is pushed, and what else is set.
+# A topology, whose part is pushed, and what else is set.
 PUSHED: dict[str, tuple[str, str, str, dict[str, str]]] = {
     "unlike masses": ("unlike-devices", "trainee", "device", {}),
     "late": ("unlike-devices", "trainee", "device", {"lan.delay": "3.5 ms"}),
@@ -133,11 +133,11 @@ PUSHED: dict[str, tuple[str, str, str, dict[str, str]]] = {
 @pytest.mark.few(3)
 @pytest.mark.parametrize("name", PUSHED)
 def test_its_step_response_is_what_simulate_plays(name: str) -> None:
-    scene, group, part, settings = PUSHED[name]
-    text = (SCENES / f"{scene}.yaml").read_text(encoding="utf-8") + HAND.replace("PART", part)
+    topology, group, part, settings = PUSHED[name]
+    text = (TOPOLOGIES / f"{topology}.yaml").read_text(encoding="utf-8") + HAND.replace("PART", part)
     system = apc.set_parameters(compiled(text), settings)
     found = state_space(system)
-    run = apc.simulate(system, set={f"{group}.hand.force": "1 N"}, duration="0.3 s", jit=False)
+    run = apc.simulate(system, params={f"{group}.hand.force": "1 N"}, duration="0.3 s", jit=False)
     pushed = [port.name.startswith(f"force on {group}[") and part in port.name for port in found.inputs]
     x, every = np.zeros(len(found.a)), round(found.frame_s / float(run.time[1] - run.time[0]))
     for row in range(0, len(run.time), every):
@@ -178,10 +178,10 @@ def test_every_file_holds_the_same(
     suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
-    assert run(["export", "--out", f"loop{suffix}", "--cut", "lan", "--json"]) == 0
+    (tmp_path / "topology.yaml").write_text(AVERAGE, encoding="utf-8")
+    assert run(["export", "--out", f"loop{suffix}", "--open-at", "lan", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
-    found = state_space(compiled(AVERAGE), cut="lan")
+    found = state_space(compiled(AVERAGE), open_at="lan")
     read = opened(tmp_path / f"loop{suffix}")
     assert [told[name] for name in "abcd"] == matrices(found)
     assert [np.asarray(read[name]).tolist() for name in "ABCD"] == matrices(found)
@@ -195,11 +195,11 @@ def test_every_file_holds_the_same(
         assert json.loads(str(read["provenance"]))["topology"] == "three-users-average"
 
 
-def test_a_scenes_words_are_never_read_as_python(tmp_path: Path) -> None:
-    """Python quotes, ends of lines and braces in what a scene says of itself."""
+def test_a_topologies_words_are_never_read_as_python(tmp_path: Path) -> None:
+    """Python quotes, ends of lines and braces in what a topology says of itself."""
     found = state_space(compiled(AVERAGE))
     evil = StateSpace(
-        'x"""\\\nimport os; os.abort()\n"""{0}', found.cut, found.frame_s, *found.matrices,
+        'x"""\\\nimport os; os.abort()\n"""{0}', found.open_at, found.frame_s, *found.matrices,
         *(found.states, found.inputs, found.outputs), ('"""\nraise SystemExit',), '"""\nraise SystemExit',
     )  # fmt: skip
     from apc.exports.state_space_files import write_script
@@ -216,15 +216,21 @@ def test_a_scenes_words_are_never_read_as_python(tmp_path: Path) -> None:
         (["--out", "x.npz", "--to", "mat"], "x.npz: E878 the suffix of --out wants .mat, got .npz"),
         (["--out", "x.mat", "--to", "matlab"], "--to: E952 a format wants one of control"),
         (
-            ["--out", "x.mat", "--cut", "lann"],
-            "--cut: E950 lann is no link or coupler with ticks of three-users-average",
+            ["--out", "x.mat", "--open-at", "lann"],
+            "--open-at: E950 lann is no link or coupler with ticks of three-users-average",
         ),
-        (["--out", "x.npz", "--free", "lan.delay"], "--free: E954 lan.delay is a time"),
-        (["--out", "x.npz", "--free", "device.mas"], "--free: E622 device.mas is no parameter"),
-        (["--out", "x.npz", "--free", "device.mass", "--free", "device.mass"], "--free: E954 device.mass is"),
-        (["--out", "x.py", "--free", "device.mass"], "--free: E953 --free means nothing to the format"),
+        (["--out", "x.npz", "--symbolic", "lan.delay"], "--symbolic: E954 lan.delay is a time"),
+        (["--out", "x.npz", "--symbolic", "device.mas"], "--symbolic: E622 device.mas is no parameter"),
+        (
+            ["--out", "x.npz", "--symbolic", "device.mass", "--symbolic", "device.mass"],
+            "--symbolic: E954 device.mass is",
+        ),
+        (
+            ["--out", "x.py", "--symbolic", "device.mass"],
+            "--symbolic: E953 --symbolic means nothing to the format",
+        ),
         (["--out", "no/x.mat"], "no/x.mat: E601 can't be written"),
-        (["--out", "scene.yaml", "--to", "npz"], "scene.yaml: E878"),
+        (["--out", "topology.yaml", "--to", "npz"], "topology.yaml: E878"),
     ],
 )
 def test_what_cannot_be_is_told_and_nothing_is_written(
@@ -258,14 +264,14 @@ FREE = {
 def test_with_a_number_free_it_is_at_each_value_what_it_is_with_that_set(name: str, cut: str) -> None:
     system = made(name)
     at = {"": "", "link": cuts(system)[0], "coupler": cuts(system)[-1]}[cut]
-    found = apc.export(system, "npz", free=FREE[name], cut=at)
+    found = apc.export(system, "npz", symbolic=FREE[name], open_at=at)
     assert isinstance(found, StateSpace)
     now = {one.name: one.value for one in system.parameters}
     for factor in (1.0, 1.7, 30.0):
         values = [(now[label.removeprefix("near.")] or 1.0) * factor for label in FREE[name]]
-        texts = [f"{value!r} {port.unit}" for value, port in zip(values, found.free, strict=True)]
+        texts = [f"{value!r} {port.unit}" for value, port in zip(values, found.symbolic, strict=True)]
         changed = apc.set_parameters(system, dict(zip(FREE[name], texts, strict=True)))
-        there = state_space(changed, cut=found.cut)
+        there = state_space(changed, open_at=found.open_at)
         for one, other in zip(found.function(*values), there.matrices, strict=True):
             assert np.abs(np.array(one) - other).max() <= 1e-12 * max(1.0, np.abs(other).max())
 
@@ -273,9 +279,9 @@ def test_with_a_number_free_it_is_at_each_value_what_it_is_with_that_set(name: s
 def test_a_free_named_number_moves_all_that_follows_from_it_and_is_in_the_file(tmp_path: Path) -> None:
     casadi = pytest.importorskip("casadi")
     named = ("peers:", "parameters: {kt: 500 N/m}\npeers:"), ("stiffness: 500 N/m", "stiffness: 2*kt")
-    apc.export(compiled(replaced(AVERAGE, *named)), out=tmp_path / "family.npz", free=["kt"])
+    apc.export(compiled(replaced(AVERAGE, *named)), out=tmp_path / "family.npz", symbolic=["kt"])
     with np.load(tmp_path / "family.npz", allow_pickle=False) as archive:
         function = casadi.Function.deserialize(str(archive["casadi_function"]))
-        assert archive["free"].tolist() == ["kt"]
+        assert archive["symbolic"].tolist() == ["kt"]
     there = state_space(compiled(replaced(AVERAGE, ("stiffness: 500 N/m", "stiffness: 1400 N/m"))))
     assert np.abs(np.array(function(700.0)[0]) - there.a).max() < 1e-12 * np.abs(there.a).max()

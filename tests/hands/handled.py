@@ -31,9 +31,9 @@ def responses(
     mean = np.zeros((count, 4, 7 * count + 1), dtype=complex)
     sent = whole[6 : 7 * count : 7]
     if ring:
-        heard = (np.roll(sent, 1, axis=0) + np.roll(sent, -1, axis=0)) / 2
+        received = (np.roll(sent, 1, axis=0) + np.roll(sent, -1, axis=0)) / 2
     else:
-        heard = (sent.sum(axis=0) - sent) / (count - 1)
+        received = (sent.sum(axis=0) - sent) / (count - 1)
     for i in range(count):
         whole[7 * i + 6] = whole[7 * i + 2]
     for tick in range(TICKS):
@@ -41,7 +41,7 @@ def responses(
         for i, step in enumerate(steps):
             now = np.concatenate([whole[7 * i : 7 * i + 6], whole[-1:] * turned * (i == 0)])
             moved = step @ now
-            pressed, drawn = 1000 * (now[0] - now[2]), stiffness * (now[2] - heard[i])
+            pressed, drawn = 1000 * (now[0] - now[2]), stiffness * (now[2] - received[i])
             whole[7 * i : 7 * i + 4], whole[7 * i + 4], whole[7 * i + 5] = moved[:4], pressed, drawn
             mean[i] += moved[4:] / turned / (TICKS * TICK)
     z = np.exp(omega * TICKS * TICK)

@@ -9,11 +9,11 @@ import pytest
 import apc
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
-from tests.topologies import AVERAGE, SCENES, compiled, replaced
+from tests.topologies import AVERAGE, TOPOLOGIES, compiled, replaced
 
 AT_ONCE = ("delay: 8 ms}            # negligible", "delay: 0 ms}            # negligible")
 TEXT = {
-    name: (SCENES / f"experiment-{name}.yaml").read_text(encoding="utf-8") for name in ("average", "mesh")
+    name: (TOPOLOGIES / f"experiment-{name}.yaml").read_text(encoding="utf-8") for name in ("average", "mesh")
 }
 
 
@@ -24,7 +24,7 @@ def experiment(name: str, *pairs: tuple[str, str]) -> Model:
 @pytest.mark.whole
 def test_the_buzz_of_the_experiment_is_predicted_and_played() -> None:
     """An independent program: predicted 47.10 Hz, 2.437 mm, 80.5 %; played 46.95 Hz, 2.545 mm, 79.3 %."""
-    found = apc.buzz(experiment("average", AT_ONCE))
+    found = apc.limit_cycle(experiment("average", AT_ONCE))
     known = found.predicted
     assert known is not None and known.attracts
     assert known.frequency_hz == pytest.approx(47.10, abs=0.005)
@@ -58,16 +58,16 @@ def test_the_buzz_of_the_experiment_is_predicted_and_played() -> None:
 
 @pytest.mark.whole
 def test_what_is_not_one_cycle_that_motions_come_to_is_told() -> None:
-    """Stable with contacts closed, unstable with weaker ones: from its start the scene settles."""
-    leave = apc.buzz(experiment("average"))
+    """Stable with contacts closed, unstable with weaker ones: from its start the topology settles."""
+    leave = apc.limit_cycle(experiment("average"))
     assert leave.predicted is not None and not leave.predicted.attracts
     assert leave.lines == () and leave.steady and leave.bounded and leave.settles
     assert any("one that motions leave" in text for text in leave.notes)
-    mesh = apc.buzz(experiment("mesh"))
+    mesh = apc.limit_cycle(experiment("mesh"))
     slow, fast = sorted(line.frequency_hz for line in mesh.lines)
     assert 37 < slow < 38 and 50 < fast < 51
     assert any("one sinusoid says nothing" in text for text in mesh.notes)
-    grows = apc.buzz(experiment("mesh", AT_ONCE))
+    grows = apc.limit_cycle(experiment("mesh", AT_ONCE))
     assert grows.predicted is None and not grows.steady and grows.lines == ()
     assert grows.reason == "no buzz: with contacts of any part of their stiffness it is unstable"
 
@@ -85,14 +85,14 @@ hands: {hand: {type: ConstantForce, flange: device, force: 3 N}}
 
 @pytest.mark.whole
 def test_a_wall_buzzes_under_the_hand_that_presses_it_and_a_hand_that_pulls_lets_go() -> None:
-    found = apc.buzz(compiled(WALL))
+    found = apc.limit_cycle(compiled(WALL))
     assert found.predicted is not None and found.predicted.attracts
     # Alone: m s² + b s + g K e^{−s (T/2 + delay)} = 0 on the axis, but for what a hold is beside a delay.
     assert found.contacts[0].load_n == pytest.approx(3.0, rel=1e-6)
     assert found.lines[0].frequency_hz == pytest.approx(found.predicted.frequency_hz, rel=0.05)
     omega = 2 * math.pi * found.predicted.frequency_hz
     assert math.tan(omega * 1.5e-3) == pytest.approx(2 / (0.1 * omega), rel=0.02)
-    away = apc.buzz(compiled(WALL.replace("3 N}", "-1 N}").replace("N*s/m}", "N*s/m, x: 1 mm}")))
+    away = apc.limit_cycle(compiled(WALL.replace("3 N}", "-1 N}").replace("N*s/m}", "N*s/m, x: 1 mm}")))
     assert (len(away.notes), away.lines, away.settles) == (1, (), False)
 
 
@@ -110,12 +110,14 @@ FORCE = "OneSidedContact, a: device, b: cube, half_width: 20 mm, stiffness: 3900
 def test_what_is_no_one_sided_spring_from_tick_to_tick_is_refused_by_name(instead: str, why: str) -> None:
     sides = [(f"contact.side: {side}, ", "") for side in ("right", "left")]
     with pytest.raises(ApcError, match=r"E864 .*contact") as caught:
-        apc.buzz(experiment("average", *sides, (f"{FORCE}, clock: haptic", f"{instead}, a: device, b: cube")))
+        apc.limit_cycle(
+            experiment("average", *sides, (f"{FORCE}, clock: haptic", f"{instead}, a: device, b: cube"))
+        )
     assert why in str(caught.value)
 
 
 def test_what_cannot_be_played_is_refused_and_lost_packets_are_named() -> None:
     with pytest.raises(ApcError, match="nothing touches"):
-        apc.buzz(compiled(AVERAGE))
+        apc.limit_cycle(compiled(AVERAGE))
     with pytest.raises(ApcError, match="1,000,000 peers are too many to play for 8 s"):
-        apc.buzz(compiled(replaced(WALL, ("count: 1", "count: 1000000"))))
+        apc.limit_cycle(compiled(replaced(WALL, ("count: 1", "count: 1000000"))))

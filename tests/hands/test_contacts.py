@@ -1,4 +1,6 @@
-"""Contacts on and off: each mode is the scene of springs it stands for, and the ticks of it brute force."""
+"""Contacts on and off: each mode is the topology of springs it stands for, and the ticks of it brute
+force.
+"""
 
 from __future__ import annotations
 
@@ -14,10 +16,10 @@ import apc
 from apc.analysis.contact_modes import ContactModes
 from apc.compiler.errors import ApcError
 from tests import bruteforce
-from tests.topologies import AVERAGE, MESH, SCENES, compiled, library, replaced, wall
+from tests.topologies import AVERAGE, MESH, TOPOLOGIES, compiled, library, replaced, wall
 
 EXPERIMENTS = {
-    name: (SCENES / f"experiment-{name}.yaml").read_text(encoding="utf-8") for name in ("average", "mesh")
+    name: (TOPOLOGIES / f"experiment-{name}.yaml").read_text(encoding="utf-8") for name in ("average", "mesh")
 }
 TOUCHING = {
     "on at every peer": (True, True),
@@ -33,15 +35,15 @@ def radii(found: ContactModes) -> dict[str, float | None]:
     return {one.name: one.spectral_radius for one in found.modes}
 
 
-@pytest.mark.parametrize("scene", EXPERIMENTS)
-def test_each_mode_agrees_with_brute_force(scene: str) -> None:
-    found = apc.contact_modes(compiled(EXPERIMENTS[scene]))
+@pytest.mark.parametrize("topology", EXPERIMENTS)
+def test_each_mode_agrees_with_brute_force(topology: str) -> None:
+    found = apc.contact_modes(compiled(EXPERIMENTS[topology]))
     assert found.parts == ("contact.push",)
     assert [one.name for one in found.modes] == [*TOUCHING]
     numbers = {"kt": 2000.0, "bt": 1.0, "kc": 3900.0, "bc": 0.05, "cube": 0.1, "comp": Fraction(0)}
     for one, (right, left) in zip(found.modes, TOUCHING.values(), strict=True):
         free = tuple({} if on else {"kc": 0.0, "bc": 0.0} for on in (right, left, left))
-        common = bruteforce.Scene(OPERATORS[scene], users=free, **numbers)
+        common = bruteforce.TopologySource(OPERATORS[topology], users=free, **numbers)
         values = np.linalg.eigvals(np.array(bruteforce.frame_matrix(common)))
         # A device that touches nothing stays where it is: as many translations as there are bodies apart.
         others = np.delete(values, np.argsort(np.abs(values - 1.0))[: 1 + sum(map(bool, free))])
@@ -105,9 +107,9 @@ def test_a_piece_that_is_not_linear_is_taken_at_the_start_or_refused_there() -> 
     assert "right is not linear and has no slope at the start values" in every.refusal
     # Ten millimetres deep, the slope of 3900 d^1.5 is 5850 · 0.1 N/m.
     deep = apc.contact_modes(compiled(pressed.replace("30 mm", "10 mm"))).modes[0]
-    alike = replaced(EXPERIMENTS["average"], ("3900 N/m, damping: 0.05", "585 N/m, damping: 5e-5"))
+    interchangeable = replaced(EXPERIMENTS["average"], ("3900 N/m, damping: 0.05", "585 N/m, damping: 5e-5"))
     assert deep.linearized
-    expected = apc.contact_modes(compiled(alike)).modes[0].spectral_radius
+    expected = apc.contact_modes(compiled(interchangeable)).modes[0].spectral_radius
     assert deep.spectral_radius == pytest.approx(expected, abs=1e-12)
 
 
@@ -121,7 +123,7 @@ equations:
   - f = {law}
   - a.f = hold(f)
 """
-SCENE = """\
+TOPOLOGY = """\
 topology: one
 clocks: {tick: 1 ms}
 peers: {user: {count: 1}}
@@ -144,7 +146,7 @@ couplers: {it: {type: Own, a: device, k: 700 N/m, clock: tick}}
 def test_each_kind_of_decision_has_the_slopes_of_its_pieces(
     law: str, on: float | None, off: float | None, tmp_path: Path
 ) -> None:
-    found = apc.contact_modes(compiled(SCENE, library(tmp_path, OWN.format(law=law))))
+    found = apc.contact_modes(compiled(TOPOLOGY, library(tmp_path, OWN.format(law=law))))
     if on is None or off is None:
         assert found.parts == ()
         return
@@ -153,7 +155,7 @@ def test_each_kind_of_decision_has_the_slopes_of_its_pieces(
         spring = OWN.format(law="k*d") if slope >= 0 else OWN.format(law="-k*d")
         (tmp_path / f"{slope}").mkdir()
         truth = apc.analyze(
-            compiled(SCENE, library(tmp_path / f"{slope}", spring)), set={"it.k": f"{abs(slope)} N/m"}
+            compiled(TOPOLOGY, library(tmp_path / f"{slope}", spring)), params={"it.k": f"{abs(slope)} N/m"}
         )
         assert mode.spectral_radius == pytest.approx(truth.spectral_radius, abs=1e-12)
 
@@ -161,4 +163,4 @@ def test_each_kind_of_decision_has_the_slopes_of_its_pieces(
 def test_a_part_that_decides_too_much_is_refused(tmp_path: Path) -> None:
     law = " + ".join(f"max(0, k*d - {step}*k*most)" for step in range(7))
     with pytest.raises(ApcError, match=r"E863 it.f of user takes 7 decisions; at most 6"):
-        apc.contact_modes(compiled(SCENE, library(tmp_path, OWN.format(law=law))))
+        apc.contact_modes(compiled(TOPOLOGY, library(tmp_path, OWN.format(law=law))))

@@ -14,18 +14,18 @@ import pytest
 import apc
 from apc.__main__ import run
 from apc.compiler.errors import ApcError
-from apc.hands.frequency_response import feel
+from apc.haptics.frequency_response import transparency
 from tests.hands.handled import responses
-from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, compiled, replaced
+from tests.topologies import AVERAGE, MESH, ONE_MASS, TOPOLOGIES, compiled, replaced
 
 
 def users(count: int, stiffness: float) -> str:
-    """Return the paper's scene of so many users."""
+    """Return the paper's topology of so many users."""
     return replaced(AVERAGE, ("count: 3", f"count: {count}"), ("stiffness: 500", f"stiffness: {stiffness}"))
 
 
 def unlike(masses: np.ndarray, text: str) -> str:
-    """Return a scene whose devices weigh so much, one after the other."""
+    """Return a topology whose devices weigh so much, one after the other."""
     listed = ", ".join(f"{mass!r} kg" for mass in masses.tolist())
     return re.sub(r"count: \d+", f"set: {{device.mass: [{listed}]}}", text, count=1)
 
@@ -45,12 +45,12 @@ def test_responses_are_those_of_one_dense_system_of_all_users(count: int, ring: 
         masses = np.linspace(0.08, 0.13, count)
         text = unlike(masses, text)
     hertz = (0.7, 2.9, 9.7, 21.7, 58.3)
-    found = feel(compiled(text), hertz, beside=())
+    found = transparency(compiled(text), hertz, alongside=())
     for place, one in enumerate(hertz):
         here, there, apart = responses(masses, 300.0, one, ring=ring)
         assert found.impedance[place] == pytest.approx(1 / here, rel=1e-9)
         assert found.transmitted_admittance[place] == pytest.approx(there, rel=1e-7)
-        assert found.error_per_force[place] == pytest.approx(apart, rel=1e-8)
+        assert found.coordination_error[place] == pytest.approx(apart, rel=1e-8)
     assert (found.bound < 1e-6).all()
 
 
@@ -82,10 +82,10 @@ PUBLISHED = (
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize(("count", "felt", "arrives", "apart", "alias", "ticks", "sampled", "rms"), PUBLISHED)
+@pytest.mark.parametrize(("count", "used", "arrives", "apart", "alias", "ticks", "sampled", "rms"), PUBLISHED)
 def test_numbers_of_an_independent_program(
     count: int,
-    felt: tuple[complex, ...],
+    used: tuple[complex, ...],
     arrives: complex,
     apart: complex,
     alias: float,
@@ -93,11 +93,11 @@ def test_numbers_of_an_independent_program(
     sampled: tuple[float, ...],
     rms: float,
 ) -> None:
-    found = apc.feel(compiled(users(count, 500)), [1.0, 20.0])
-    assert found.impedance.tolist() == pytest.approx(felt, rel=1e-11)
+    found = apc.transparency(compiled(users(count, 500)), [1.0, 20.0])
+    assert found.impedance.tolist() == pytest.approx(used, rel=1e-11)
     assert found.transmitted_admittance[1] == pytest.approx(arrives, rel=1e-11)
-    assert found.error_per_force[1] * 1e3 == pytest.approx(apart, rel=1e-11)
-    assert found.alias[1] == pytest.approx(alias, rel=1e-8)
+    assert found.coordination_error[1] * 1e3 == pytest.approx(apart, rel=1e-11)
+    assert found.aliased_fraction[1] == pytest.approx(alias, rel=1e-8)
     # Its norms are good to 3e-10 (on ticks) and 5e-10 of themselves.
     assert [one.on_ticks.norm for one in found.hinf] == pytest.approx(ticks, rel=1e-9)
     assert [one.sampled_data.norm for one in found.hinf] == pytest.approx(sampled, rel=1e-9)
@@ -108,11 +108,11 @@ def test_numbers_of_an_independent_program(
 def test_a_lone_mass_feels_like_itself() -> None:
     """No tick, no network: Z = b + jωm."""
     idle = "{type: SampledSpringDamper, a: device, b: ground, stiffness: 0 N/m, clock: tick}"
-    found = apc.feel(
+    found = apc.transparency(
         compiled(f"{ONE_MASS}clocks: {{tick: 1 ms}}\ncouplers: {{idle: {idle}}}\n"), [0.5, 50.0, 400.0]
     )
     np.testing.assert_allclose(found.impedance, 3 + 2j * np.pi * found.frequency_hz * 2, rtol=1e-13)
-    assert (found.alias < 1e-13).all()
+    assert (found.aliased_fraction < 1e-13).all()
     slow = found.low_frequency
     assert slow is not None
     for value, expected, off in zip(
@@ -138,19 +138,19 @@ RING = replaced(MESH, ("delay: 8 ms}", "delay: 8 ms, graph: ring}"))
 
 @pytest.mark.few(2)
 @pytest.mark.parametrize("count", [2, 3, 5])
-@pytest.mark.parametrize(("text", "heard"), [(AVERAGE, 1), (MESH, 4), (RING, 2)])
-def test_a_network_feels_viscous_by_as_much_as_dampers_lack(text: str, heard: int, count: int) -> None:
+@pytest.mark.parametrize(("text", "received"), [(AVERAGE, 1), (MESH, 4), (RING, 2)])
+def test_a_network_feels_viscous_by_as_much_as_dampers_lack(text: str, received: int, count: int) -> None:
     """Copies lag what they hear by half the network's hold and its delay: K ((T_n − T_c)/2 + T_d) of damping.
 
     Each user has 5 N·s/m at the device and 5 at the copy, and 150 N/m to each other that is heard or to their
     mean. The formula is the first order in the age of what is heard; the rest is some 0.3 %.
     """
     system = compiled(replaced(text, ("count: 3", f"count: {count}"), ("stiffness: 500", "stiffness: 150")))
-    found = apc.feel(system, [1.0])
-    assert found.low_frequency is not None and found.network_viscosity is not None
-    network, off = found.network_viscosity.network, found.network_viscosity.error
+    found = apc.transparency(system, [1.0])
+    assert found.low_frequency is not None and found.network_damping is not None
+    network, off = found.network_damping.network, found.network_damping.error
     assert abs(found.low_frequency.damping - 10.0 * count - network) <= off + found.low_frequency.errors[1]
-    formula = count * 150.0 * min(heard, count - 1) * ((0.008 - 0.001) / 2 + 0.008)
+    formula = count * 150.0 * min(received, count - 1) * ((0.008 - 0.001) / 2 + 0.008)
     assert network == pytest.approx(formula, rel=0.02)
 
 
@@ -173,14 +173,14 @@ def test_noise_of_groups_whose_forces_switch_at_other_times(
     late = "contact.delay: 1.5 ms, device.mass: 0.2 kg"
     groups = f"left: {{count: 2, set: {{{late}}}}}\n  right: {{count: 2}}"
     text = replaced(AVERAGE, ("stiffness: 500", "stiffness: 200"), ("user: {count: 3}", groups))
-    for one, (error, velocity) in zip(apc.feel(compiled(text), [1.0], at=at).h2, known, strict=True):
+    for one, (error, velocity) in zip(apc.transparency(compiled(text), [1.0], at=at).h2, known, strict=True):
         assert one.error_m == pytest.approx(error, rel=1e-8)
         assert one.velocity_m_s == pytest.approx(velocity, rel=1e-8)
 
 
-def test_an_unstable_scene_has_no_response_in_time_but_its_map_has_one() -> None:
-    found = apc.feel(compiled(users(3, 1200)), [1.0], unstable=True)
-    below = apc.feel(compiled(users(3, 1090)), [1.0])
+def test_an_unstable_topology_has_no_response_in_time_but_its_map_has_one() -> None:
+    found = apc.transparency(compiled(users(3, 1200)), [1.0], unstable=True)
+    below = apc.transparency(compiled(users(3, 1090)), [1.0])
     assert found.notes and math.inf in [one.sampled_data.norm for one in found.hinf]
     assert np.allclose([one.gains for one in found.hinf], [one.gains for one in below.hinf], rtol=0.2)
     assert all((one.gains <= one.sampled_data.norm).all() for one in below.hinf)
@@ -195,7 +195,7 @@ masses: {cube: {mass: 1 kg, damping: 1 N*s/m, shared: true}}
 couplers: {c: {type: AveragePosition, object: cube, stiffness: 9 N/m, clock: fast, link: lan}}
 links: {lan: {clock: tick, delay: 8 ms}}
 """
-TOOL = (SCENES / "two-handed-tool.yaml").read_text(encoding="utf-8")
+TOOL = (TOPOLOGIES / "two-handed-tool.yaml").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(
@@ -211,7 +211,7 @@ TOOL = (SCENES / "two-handed-tool.yaml").read_text(encoding="utf-8")
         (AVERAGE, [1.0], "contact", "E936"),
         (AVERAGE, [1.0], "user[4].device", r'--at "user\[3\].device"'),
         (AVERAGE, [1.0], "usr[2].device", r'--at "user\[2\].device"'),
-        (ONE_MASS, [1.0], "", "E935 the scene has nothing that ticks, .* Write: a coupler with a clock"),
+        (ONE_MASS, [1.0], "", "E935 the topology has nothing that ticks, .* Write: a coupler with a clock"),
         (BARE, [1.0], "", "E931"),
         (TOOL, [1.0], "", r"E931 left moves with masses .*, and a hand may hold any of them \(user\)\.$"),
         (users(3, 1200), [1.0], "", "E934"),
@@ -220,9 +220,9 @@ TOOL = (SCENES / "two-handed-tool.yaml").read_text(encoding="utf-8")
 )
 def test_what_can_t_be_felt_is_refused(text: str, frequency: list[float], at: str, why: str) -> None:
     with pytest.raises(ApcError, match=why):
-        apc.feel(compiled(text), frequency, at=at)
+        apc.transparency(compiled(text), frequency, at=at)
     if text == BARE:
-        assert apc.feel(compiled(text), frequency, at="user[1].cube").at == "user[1].cube"
+        assert apc.transparency(compiled(text), frequency, at="user[1].cube").at == "user[1].cube"
 
 
 @pytest.mark.parametrize(
@@ -239,16 +239,19 @@ def test_what_can_t_be_felt_is_refused(text: str, frequency: list[float], at: st
 def test_the_first_device_is_held_along_its_first_direction_which_is_said(
     name: str, at: str, others: tuple[str, ...]
 ) -> None:
-    found = feel(apc.compile(SCENES / f"{name}.yaml"), [1.0], beside=())
+    found = transparency(apc.compile(TOPOLOGIES / f"{name}.yaml"), [1.0], alongside=())
     assert (found.at, tuple(map(str, found.notes))) == (at, others)
 
 
 def test_in_a_plane_a_hand_feels_along_each_axis_what_it_feels_on_a_line() -> None:
-    plane, line = apc.compile(SCENES / "planar-users.yaml"), feel(compiled(AVERAGE), [1.0, 10.0], beside=())
+    plane, line = (
+        apc.compile(TOPOLOGIES / "planar-users.yaml"),
+        transparency(compiled(AVERAGE), [1.0, 10.0], alongside=()),
+    )
     for axis in ("x[1]", "x[2]"):
-        found = feel(plane, [1.0, 10.0], at=f"user[1].device.{axis}", beside=())
-        assert (found.between, found.copy) == (f"user[2].device.{axis}", "cube")
-        for name in ("impedance", "transmitted_admittance", "error_per_force"):
+        found = transparency(plane, [1.0, 10.0], at=f"user[1].device.{axis}", alongside=())
+        assert (found.between, found.object) == (f"user[2].device.{axis}", "cube")
+        for name in ("impedance", "transmitted_admittance", "coordination_error"):
             np.testing.assert_allclose(getattr(found, name), getattr(line, name), rtol=1e-9, atol=1e-12)
 
 
@@ -262,8 +265,8 @@ def test_copies_of_another_object_are_none_of_those_that_a_copy_differs_from() -
     for pair in zip(parts.splitlines(), more.splitlines(), strict=True):
         both = replaced(both, (pair[0], "\n".join(pair)))
     both = replaced(both, ("links:", "links:\n  lan_b: {clock: network, delay: 8 ms}"))
-    apart, together = (feel(compiled(item), [1.0, 10.0], beside=("h2",)) for item in (text, both))
-    np.testing.assert_allclose(together.error_per_force, apart.error_per_force, rtol=1e-9)
+    apart, together = (transparency(compiled(item), [1.0, 10.0], alongside=("h2",)) for item in (text, both))
+    np.testing.assert_allclose(together.coordination_error, apart.coordination_error, rtol=1e-9)
     assert [item.error_m for item in together.h2] == pytest.approx([item.error_m for item in apart.h2])
 
 
@@ -274,18 +277,20 @@ def test_the_command_line_says_what_python_does(
     monkeypatch.chdir(tmp_path)
     Path("three.yaml").write_text(AVERAGE, encoding="utf-8")
 
-    def said(*words: str, code: int = 0) -> str:
-        assert run(["feel", "three.yaml", *words]) == code
+    def printed(*words: str, code: int = 0) -> str:
+        assert run(["transparency", "three.yaml", *words]) == code
         return "".join(capsys.readouterr())
 
     words = ["--between", "user[1].device:user[3].device", "--frequencies", "1 Hz, 5 Hz"]
-    document = json.loads(said(*words, "--json"))
-    found = apc.feel("three.yaml", [1.0, 5.0], between="user[3]")
+    document = json.loads(printed(*words, "--json"))
+    found = apc.transparency("three.yaml", [1.0, 5.0], between="user[3]")
     assert document["frequency_hz"] == [1.0, 5.0]
     assert complex(*document["impedance"][1]) == found.impedance[1]
     assert document["between"] == "user[3].device"
-    assert {"transmitted_admittance", "error_per_force", "alias", "bound", "hinf", "h2"} < set(document)
-    assert all(len(line) <= 80 for line in said(*words, "--out", "table.csv").splitlines())
+    assert {"transmitted_admittance", "coordination_error", "aliased_fraction", "bound", "hinf", "h2"} < set(
+        document
+    )
+    assert all(len(line) <= 80 for line in printed(*words, "--out", "table.csv").splitlines())
     rows = Path("table.csv").read_text(encoding="utf-8").splitlines()
     assert float(rows[2].split(",")[1]) == found.impedance[1].real
     for code, why, *wrong in (
@@ -297,7 +302,7 @@ def test_the_command_line_says_what_python_does(
         (2, "", "--at", "user[3]", "--between", "user[1]:user[2]"),
         (2, "", "--nyquist", "--out", "table.csv"),
     ):
-        assert why in said(*wrong, code=code)
-    assert "noise" in said("--frequencies", "1 Hz", "--set", "haptic.phase=0.3 ms").splitlines()[1]
-    lossy = feel(apc.compile(SCENES / "lossy-average.yaml"), [1.0], beside=())
+        assert why in printed(*wrong, code=code)
+    assert "noise" in printed("--frequencies", "1 Hz", "--set", "haptic.phase=0.3 ms").splitlines()[1]
+    lossy = transparency(apc.compile(TOPOLOGIES / "lossy-average.yaml"), [1.0], alongside=())
     assert "packet loss" in str(lossy).splitlines()[1]

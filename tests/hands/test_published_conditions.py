@@ -1,4 +1,4 @@
-"""Published conditions of passivity and stability: numbers, promises, and curves over a scene."""
+"""Published conditions of passivity and stability: numbers, promises, and curves over a topology."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import apc
-from apc.frame.names import ParameterRef, Range
-from apc.hands.wall_conditions import CONDITIONS
+from apc.frame.parameter_names import ParameterRef, Range
+from apc.haptics.wall_conditions import CONDITIONS
 from apc.regions.overlay import overlay_points, parse_overlay, symbol_values
 from tests.topologies import AVERAGE, compiled, told, wall
 
@@ -80,7 +80,7 @@ def test_a_curve_is_its_line_from_border_to_border(
     np.testing.assert_allclose(found, first + along[:, None] * (last - first), rtol=1e-9, atol=1e-9)
 
 
-def test_symbols_follow_the_scene_its_expressions_and_groups() -> None:
+def test_symbols_follow_the_topology_its_expressions_and_groups() -> None:
     overlay = parse_overlay(MODEL, GIL)
     assert symbol_values(MODEL, overlay) == (900.0, 5.0, 0.25, 0.001, 0.001)
     assert overlay.label == "Gil et al.: K < (b + B)/(T/2 + t_d)"
@@ -139,7 +139,11 @@ def test_a_wall_behind_an_encoder_is_held_against_published_conditions(
         "  wall: {type: VirtualWall, flange: encoder.measured, clock: haptic, x: 1 mm,"
         f" stiffness: {stiffness} N/m}}\n"
     ).replace("damping: 0.4 N*s/m}", "damping: 0.4 N*s/m, x: 1 mm}")
-    (line,) = [note for note in apc.passive_hands(compiled(text)).left_out if note.startswith("Abbott")]
+    (line,) = [
+        note for note in apc.absolute_stability(compiled(text)).limitations if note.startswith("Abbott")
+    ]
     assert ("2 c/D) holds" if holds else "2 c/D) does not hold") in line
     delayed = text.replace("clock: haptic, x", "clock: haptic, delay: 1 ms, x")
-    assert not [note for note in apc.passive_hands(compiled(delayed)).left_out if note.startswith("Abbott")]
+    assert not [
+        note for note in apc.absolute_stability(compiled(delayed)).limitations if note.startswith("Abbott")
+    ]

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 import apc
-from apc.analysis.switching import SwitchingVerdict
+from apc.analysis.arbitrary_switching import SwitchingVerdict
 from apc.compiler.compiled import Model
-from tests.topologies import SCENES, compiled, replaced, wall
+from tests.topologies import TOPOLOGIES, compiled, replaced, wall
 
 Floats = NDArray[np.float64]
 
@@ -39,7 +39,7 @@ hands:
 ARM = HELD[HELD.index("hands:") :]
 
 
-def scene(count: int, tie: float, contact: float, damping: float = 0.0) -> Model:
+def topology(count: int, tie: float, contact: float, damping: float = 0.0) -> Model:
     """Return users who hold their devices and may touch copies of 0.2 kg."""
     return compiled(
         replaced(
@@ -66,12 +66,12 @@ def frame(peers: Floats, count: int, closed: Floats, tie: float, contact: float,
 
     `closed` says of each tick which contacts push and pull.
     """
-    moved, heard, peers = step(), peers[6].copy(), peers.copy()
+    moved, received, peers = step(), peers[6].copy(), peers.copy()
     peers[6] = peers[2]
     for tick in range(8):
         depth = peers[0] - peers[2]
         push = (contact * depth + damping * (peers[1] - peers[3])) * closed[tick][:, None]
-        pull = tie * (peers[2] - (heard.sum(axis=0) - heard) / (count - 1))
+        pull = tie * (peers[2] - (received.sum(axis=0) - received) / (count - 1))
         peers[:4] = np.einsum("ij,jpm->ipm", moved, peers[:6])
         peers[4], peers[5] = push, pull  # a tick later they act
     return peers
@@ -102,7 +102,9 @@ def test_a_wall_may_be_switched_as_far_as_its_closed_form_says(
     # Position over force is 1/(s (m s + b)) behind a hold and a delay: with the drift taken out its real part
     # is least at 0 Hz, −(m/b² + (T/2 + delay)/b); times the stiffness that must stay above −1.
     most = 1 / (mass / damping**2 + (TICK / 2 + delay) / damping)
-    below, above = (apc.switching(wall(mass, damping, delay, part * most)) for part in (0.999, 1.001))
+    below, above = (
+        apc.arbitrary_switching(wall(mass, damping, delay, part * most)) for part in (0.999, 1.001)
+    )
     assert below.verdict is SwitchingVerdict.STABLE and below.stable
     assert below.reach == pytest.approx(1 / 0.999, rel=1e-9)
     assert above.reach == pytest.approx(1 / 1.001, rel=1e-9)
@@ -119,10 +121,10 @@ def test_a_wall_may_be_switched_as_far_as_its_closed_form_says(
     [(2, 200.0, 0.0), (3, 200.0, 0.5), (3, 60.0, 0.0), (3, 400.0, 0.0), (2, 25.0, 0.5)],
 )
 def test_what_is_proved_never_grows_whatever_switches(count: int, tie: float, damping: float) -> None:
-    reach = apc.switching(scene(count, tie, 100.0, damping)).reach
+    reach = apc.arbitrary_switching(topology(count, tie, 100.0, damping)).reach
     assert reach is not None
     stiffness = 0.99 * reach * 100 if not damping else 100.0
-    found = apc.switching(scene(count, tie, stiffness, damping))
+    found = apc.arbitrary_switching(topology(count, tie, stiffness, damping))
     assert found.stable and found.verdict is SwitchingVerdict.STABLE
     random = np.random.default_rng(1)
     patterns = [
@@ -152,9 +154,9 @@ def test_what_is_proved_never_grows_whatever_switches(count: int, tie: float, da
         (("delay: 8 ms}", "delay: 8 ms, graph: {edges: [[1, 2], [2, 3], [3, 1]]}}"), 100.0),
     ],
 )
-def test_another_way_to_write_a_scene_is_judged_alike(change: tuple[str, str], stiffness: float) -> None:
+def test_another_way_to_write_a_topology_is_judged_alike(change: tuple[str, str], stiffness: float) -> None:
     one, other = (
-        apc.switching(compiled(text), set={"contact.stiffness": f"{stiffness} N/m"})
+        apc.arbitrary_switching(compiled(text), params={"contact.stiffness": f"{stiffness} N/m"})
         for text in (HELD, replaced(HELD, change))
     )
     assert one.verdict == other.verdict
@@ -182,7 +184,7 @@ def test_another_way_to_write_a_scene_is_judged_alike(change: tuple[str, str], s
     ],
 )
 def test_what_is_not_decided_says_so(change: tuple[str, str], reason: str) -> None:
-    found = apc.switching(compiled(replaced(HELD, change)), set={})
+    found = apc.arbitrary_switching(compiled(replaced(HELD, change)), params={})
     assert (found.verdict, found.stable) == (SwitchingVerdict.OPEN, None) or "drift" in reason
     assert found.stable is not True and reason in found.reason
 
@@ -192,5 +194,5 @@ def test_an_unstable_mode_of_contact_rules_it_out() -> None:
         ("average", "it is not stable when on at no peer or on at right alone"),
         ("mesh", "it is not stable in any mode"),
     ):
-        found = apc.switching(SCENES / f"experiment-{name}.yaml")
+        found = apc.arbitrary_switching(TOPOLOGIES / f"experiment-{name}.yaml")
         assert (found.stable, found.reason) == (False, reason)

@@ -1,1 +1,1 @@
-"""Scenes that are hard for a computer, each with its truth."""
+"""Topologies that are hard for a computer, each with its truth."""

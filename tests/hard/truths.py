@@ -1,4 +1,4 @@
-"""The truth about every scene here, to fifty digits: `python -m tests.hard.truths` writes truths.json.
+"""The truth about every topology here, to fifty digits: `python -m tests.hard.truths` writes truths.json.
 
 All peers (equal ones by a representative and the weights of its class) are followed event by event in ball
 arithmetic, see `tests.fifty_digits`; two precisions agree on every digit written. Nothing of the analysis
@@ -13,7 +13,7 @@ from typing import Any
 
 from apc.compiler.compiled import Model
 from apc.compiler.pipeline import compile_topology
-from apc.eigen.balls import precision
+from apc.eigen.ball_arithmetic import precision
 from tests.fifty_digits.truth import RIGID, Truth, classes_of, eigenvalues, frame_matrices, spectral_truth
 
 HERE = Path(__file__).resolve().parent

@@ -34,7 +34,7 @@ def component(*equations: str, variables: str = "") -> str:
     return COMPONENT.format(clock=clock, variables=", ".join(declared), equations=lines)
 
 
-def scene(text: str, more: str = "", start: str = "0 m") -> str:
+def topology(text: str, more: str = "", start: str = "0 m") -> str:
     """Return a topology in which the component of a text acts on the mass, with more said of it."""
     clock = ", clock: tick" if "clock: clock" in text else ""
     base = ONE_MASS.replace("3 N*s/m", f"3 N*s/m, x: {start}")
@@ -42,9 +42,9 @@ def scene(text: str, more: str = "", start: str = "0 m") -> str:
 
 
 def model(folder: Path, *equations: str, variables: str = "", more: str = "") -> apc.Model:
-    """Return the compiled scene."""
+    """Return the compiled topology."""
     text = component(*equations, variables=variables)
-    return compiled(scene(text, more), library(folder, text))
+    return compiled(topology(text, more), library(folder, text))
 
 
 def force(system: apc.Model, x: float = 0.0, v: float = 0.0) -> float:

@@ -14,7 +14,7 @@ import apc
 from apc.__main__ import run
 from tests.topologies import AVERAGE, replaced
 
-FILE = Path("scene.yaml")
+FILE = Path("topology.yaml")
 Say = Callable[..., str]
 
 
@@ -28,7 +28,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def message(capsys: pytest.CaptureFixture[str]) -> Say:
     """Return what runs a command that must fail, and gives the first line of its only message."""
 
-    def said(*words: str) -> str:
+    def printed(*words: str) -> str:
         before = {path.name: path.stat().st_mtime_ns for path in Path().iterdir()}
         code = run(list(words))
         out, err = capsys.readouterr()
@@ -38,7 +38,7 @@ def message(capsys: pytest.CaptureFixture[str]) -> Say:
         assert not source or (len(source) == 2 and source[1].strip() == "^"), err
         return first
 
-    return said
+    return printed
 
 
 def stiffness(text: str) -> str:
@@ -53,7 +53,7 @@ BOMB = "x0: &b0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
     f"x{i}: &b{i} [{', '.join([f'*b{i - 1}'] * 10)}]\n" for i in range(1, 10)
 )
 DEEP = "E328 this is nested or chained more than 100 deep: give a part of it a name."
-LIST = "1:1: E203 a topology wants a mapping of keys to values, got a list. Write: topology: my-scene"
+LIST = "1:1: E203 a topology wants a mapping of keys to values, got a list. Write: topology: my-topology"
 TABBED = "a tab indents this line, and YAML allows spaces only. Write: spaces"
 NO_TEXT = "E107 a YAML file wants visible text, got "
 NO_PLACE = "E109 this line belongs to nothing above it: its indent or a closing bracket is wrong."
@@ -109,19 +109,19 @@ def test_a_file_that_is_no_topology_is_told_in_one_sentence(
 ) -> None:
     FILE.write_bytes(text if isinstance(text, bytes) else text.encode())
     place = ":" if expected[0].isdigit() else ": "
-    assert message("check", "scene.yaml").startswith(f"scene.yaml{place}{expected}")
+    assert message("check", "topology.yaml").startswith(f"topology.yaml{place}{expected}")
 
 
 @pytest.mark.parametrize("command", ["compile", "check", "analyze", "simulate", "show"])
 @pytest.mark.parametrize("text", ["500", "9**9**9**9", "\"__import__('os').system('touch pwned')\""])
 def test_every_command_says_the_same_and_writes_nothing(command: str, text: str, message: Say) -> None:
     FILE.write_text(stiffness(text), encoding="utf-8")
-    assert message(command, "scene.yaml") == message("check", "scene.yaml")
+    assert message(command, "topology.yaml") == message("check", "topology.yaml")
 
 
 def test_a_mistake_behind_carriage_returns_and_a_mark_is_told_at_its_place(message: Say) -> None:
     FILE.write_bytes(("\ufeff" + stiffness("500").replace("\n", "\r\n")).encode())
-    assert message("check", "scene.yaml").startswith("scene.yaml:13:66: E204 stiffness wants N/m")
+    assert message("check", "topology.yaml").startswith("topology.yaml:13:66: E204 stiffness wants N/m")
 
 
 @pytest.mark.parametrize("text", [AVERAGE.replace("\n", "\r\n"), "\ufeff" + AVERAGE, AVERAGE.rstrip("\n")])
@@ -143,25 +143,25 @@ def test_numbers_are_those_of_yaml_1_2(text: str, count: int) -> None:
 @pytest.mark.parametrize("word", ["on", "off", "yes", "y", "tRUE", "1", "~"])
 def test_what_yaml_1_1_would_convert_stays_a_word(word: str, message: Say) -> None:
     FILE.write_text(replaced(AVERAGE, ("shared: true", f"shared: {word}")), encoding="utf-8")
-    assert "E203 shared wants true or false, got" in message("check", "scene.yaml")
+    assert "E203 shared wants true or false, got" in message("check", "topology.yaml")
 
 
 def test_keys_that_stand_twice_are_told_together_and_mistakes_in_the_order_of_the_file(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     def told() -> list[str]:
-        assert run(["check", "scene.yaml"]) == 1
+        assert run(["check", "topology.yaml"]) == 1
         lines = capsys.readouterr().err.splitlines()
-        return [" ".join(line.split()[:2]) for line in lines if line.startswith("scene.yaml:")]
+        return [" ".join(line.split()[:2]) for line in lines if line.startswith("topology.yaml:")]
 
     FILE.write_text("a: 1\nb: {c: 1, 'c': 2}\na: 2\n", encoding="utf-8")
-    assert told() == ["scene.yaml:2:11: E111", "scene.yaml:3:1: E111"]
+    assert told() == ["topology.yaml:2:11: E111", "topology.yaml:3:1: E111"]
     wrong = [("haptic: 1 ms", "haptic: 1 kg"), ("network: 8 ms", "network: 0 s"), ("0.1 kg", "0.1")]
     wrong += [("shared: true", "shared: yes"), ("1000 N/m", "1000 N"), ("delay: 8 ms}", "delay: 8 s m}")]
     wrong += [("contact.stiffness: [0 N/m, 5000", "contact.stifness: [0 N/m, 5000")]
     FILE.write_text(replaced(AVERAGE, *wrong), encoding="utf-8")
     codes = ["4:11: E204", "5:12: E207", "9:18: E204", "10:52: E203", "12:76: E204", "15:36: E222"]
-    assert told() == [f"scene.yaml:{one}" for one in (*codes, "17:16: E206")]
+    assert told() == [f"topology.yaml:{one}" for one in (*codes, "17:16: E206")]
 
 
 def test_the_line_is_shown_with_a_caret_under_the_place_however_long_it_is(
@@ -170,10 +170,10 @@ def test_the_line_is_shown_with_a_caret_under_the_place_however_long_it_is(
     FILE.write_text(replaced(AVERAGE, ("haptic: 1 ms", "haptic: 1 kg")), encoding="utf-8")
     assert run(["check"]) == 1
     assert capsys.readouterr().err == (
-        "scene.yaml:4:11: E204 haptic wants ms, got 1 kg.\n      haptic: 1 kg\n              ^\n"
+        "topology.yaml:4:11: E204 haptic wants ms, got 1 kg.\n      haptic: 1 kg\n              ^\n"
     )
     FILE.write_text(f"a: [{'b, ' * 100}!mine 1{', d' * 100}]", encoding="utf-8")
-    assert run(["check", "scene.yaml"]) == 1
+    assert run(["check", "topology.yaml"]) == 1
     _, shown, caret = capsys.readouterr().err.splitlines()
     assert shown[caret.index("^") :].startswith("!mine")
     assert len(shown) < 110
@@ -182,12 +182,16 @@ def test_the_line_is_shown_with_a_caret_under_the_place_however_long_it_is(
 @pytest.mark.parametrize(
     ("command", "file", "expected"),
     [
-        ("compile", "scen.yaml", "scen.yaml: E101 there is no such file; did you mean 'scene.yaml'?"),
+        (
+            "compile",
+            "topolog.yaml",
+            "topolog.yaml: E101 there is no such file; did you mean 'topology.yaml'?",
+        ),
         ("compile", "zzz", "zzz: E101 there is no such file."),
         ("compile", "no/a.yaml", "no/a.yaml: E101 there is no folder "),
-        ("compile", "scene.yaml/b", "scene.yaml/b: E101 "),
+        ("compile", "topology.yaml/b", "topology.yaml/b: E101 "),
         ("compile", "x" * 5000, f"{'x' * 5000}: E10"),
-        ("compile", "scenes.yaml", "scenes.yaml: E102 this wants a YAML file, got a folder."),
+        ("compile", "topologies.yaml", "topologies.yaml: E102 this wants a YAML file, got a folder."),
         ("analyze", "model.apc", "model.apc: E602 is a folder, not a compiled model."),
         ("compile", "pipe.yaml", "pipe.yaml: E104 this wants a YAML file, got a device, pipe or socket."),
         ("compile", "/dev/zero", "/dev/zero: E104 this wants a YAML file, got a device, pipe or socket."),
@@ -197,7 +201,7 @@ def test_a_file_that_can_not_be_read_is_told_and_nobody_waits_for_it(
     command: str, file: str, expected: str, message: Say
 ) -> None:
     FILE.write_text(AVERAGE, encoding="utf-8")
-    for name in ("scenes.yaml", "model.apc"):
+    for name in ("topologies.yaml", "model.apc"):
         Path(name).mkdir()
     os.mkfifo("pipe.yaml")
     assert message(command, file).startswith(expected)
@@ -209,35 +213,40 @@ def test_what_may_not_be_read_or_written_is_told(message: Say, folder: Path) -> 
     try:
         if os.access(folder, os.W_OK):
             pytest.skip("this user may read and write everywhere")
-        assert message("compile", "scene.yaml") == "scene.apc: E601 can't be written: Permission denied."
+        assert (
+            message("compile", "topology.yaml") == "topology.apc: E601 can't be written: Permission denied."
+        )
     finally:
         folder.chmod(0o700)
     FILE.chmod(0)
-    assert message("compile", "scene.yaml") == "scene.yaml: E103 this file may not be read (no permission)."
+    assert (
+        message("compile", "topology.yaml")
+        == "topology.yaml: E103 this file may not be read (no permission)."
+    )
 
 
 def test_a_model_that_is_damaged_or_older_than_its_topology_is_refused(message: Say) -> None:
     FILE.write_text(AVERAGE, encoding="utf-8")
-    model = Path("scene.apc")
+    model = Path("topology.apc")
     apc.save(apc.compile(FILE), model)
     whole = model.read_bytes()
     origin = whole.split(b"\n", 3)[2]
     garbage = (b"", b"garbage", b"PK\x03\x04", b"PK\x05\x06" + bytes(18))
     for data in (*garbage, whole[: whole.index(origin) + len(origin) // 2], whole[:-9]):
         model.write_bytes(data)
-        assert "E604 is damaged" in message("analyze", "scene.apc")
+        assert "E604 is damaged" in message("analyze", "topology.apc")
     model.write_bytes(whole)
     assert apc.analyze(model).stable
-    assert "E614 is compiled already. Write: apc analyze" in message("compile", "scene.apc")
+    assert "E614 is compiled already. Write: apc analyze" in message("compile", "topology.apc")
     FILE.write_text(f"{AVERAGE}# more\n", encoding="utf-8")
-    assert message("analyze", "scene.apc") == (
-        "scene.apc: E605 is stale: scene.yaml has changed since it was compiled. "
-        "Write: apc compile scene.yaml"
+    assert message("analyze", "topology.apc") == (
+        "topology.apc: E605 is stale: topology.yaml has changed since it was compiled. "
+        "Write: apc compile topology.yaml"
     )
     FILE.unlink()
     assert apc.analyze(model).stable, "no topology there to be older than"
     model.write_bytes(b"garbage")
-    assert message("analyze", "scene.apc").endswith("Write: the file once more, from whoever made it")
+    assert message("analyze", "topology.apc").endswith("Write: the file once more, from whoever made it")
 
 
 EACH = "peers: {user: {count: 3, set: {device.x: [0 m, 10 mm, 0 m]}}}"
@@ -269,13 +278,13 @@ def test_a_setting_that_cannot_be_is_one_message(setting: str, expected: str, me
         assert apc.compile(FILE).groups[0].columns[0].values.tolist() == [0.0, 0.01, 0.0]
 
 
-# ---- the scene that is meant ----
+# ---- the topology that is meant ----
 
 NOTHING = "Write: apc new  (it writes a topology.yaml to start from)"
 
 
 @pytest.mark.whole
-def test_the_only_scene_of_a_folder_is_the_one_that_is_meant(
+def test_the_only_topology_of_a_folder_is_the_one_that_is_meant(
     message: Say, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("part.yaml").write_text("component: Part\n", encoding="utf-8")
@@ -292,8 +301,8 @@ def test_the_only_scene_of_a_folder_is_the_one_that_is_meant(
     assert message("compile") == f"this folder: E610 holds no topology. {NOTHING}"
     for name in ("b", "a"):
         Path(f"{name}.yaml").write_text(AVERAGE, encoding="utf-8")
-    Path("scene.apc").unlink()
-    assert message("analyze") == "this folder: E611 holds 2 scenes: a.yaml, b.yaml. Write: apc … a.yaml"
+    Path("topology.apc").unlink()
+    assert message("analyze") == "this folder: E611 holds 2 topologies: a.yaml, b.yaml. Write: apc … a.yaml"
 
 
 @pytest.mark.whole
@@ -317,7 +326,7 @@ def test_any_bytes_are_read_or_refused_and_nothing_else(data: bytes) -> None:
 )
 def test_any_text_is_a_value_or_refused_and_nothing_else(text: str) -> None:
     quoted = text.replace("'", "''")
-    scene = f"topology: t\npeers: {{u: {{count: 1}}}}\nparameters: {{a: '{quoted}'}}\n"
-    FILE.write_text(scene, encoding="utf-8")
+    topology = f"topology: t\npeers: {{u: {{count: 1}}}}\nparameters: {{a: '{quoted}'}}\n"
+    FILE.write_text(topology, encoding="utf-8")
     with pytest.raises(apc.ApcError, match="E201 the topology has no masses section"):
         apc.compile(FILE)

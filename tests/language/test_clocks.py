@@ -29,12 +29,12 @@ def filtered(folder: Path, *equations: str) -> apc.Model:
 
 def test_a_value_of_the_tick_before_is_a_memory_that_starts_as_is_said(tmp_path: Path) -> None:
     system = filtered(tmp_path, "s = 0.5*previous(s) + sample(flange.x)", "w = 2*s", "k*hold(s)")
-    [kind] = system.kinds
-    [tick] = kind.clocks
+    [peer_type] = system.peer_types
+    [tick] = peer_type.clocks
     assert (tick.outputs, tick.memories, tick.starts) == (("all.s",), (0,), ("all.s",))
     assert ticked(system, {"device.x": 0.25}, [3.0]) == {"all.s": 1.75}
-    p = [values(system)[name] for name in kind.parameters]
-    assert listed(kind.derivative([0, 0], [0.5], p, 0)) == [0, -9 * 0.5 / 2]
+    p = [values(system)[name] for name in peer_type.parameters]
+    assert listed(peer_type.derivative([0, 0], [0.5], p, 0)) == [0, -9 * 0.5 / 2]
     assert values(system)["all.s"] == 0.002
 
 
@@ -66,10 +66,10 @@ def test_a_linear_reduction_of_the_others_is_one_of_what_they_send(
     force: str, expected: float, tmp_path: Path
 ) -> None:
     system = compiled(FOUR, library(tmp_path, FOLLOWER.format(force)))
-    heard = {"mean": 0.25, "sum": 0.75, "count": 3.0}
-    receives = system.kinds[0].clocks[0].receives
+    received = {"mean": 0.25, "sum": 0.75, "count": 3.0}
+    receives = system.peer_types[0].clocks[0].receives
     assert all(one.edge is None for one in receives)
-    found = ticked(system, {"device.x": 0.5}, (), [heard[one.operator] for one in receives])
+    found = ticked(system, {"device.x": 0.5}, (), [received[one.operator] for one in receives])
     assert list(found.values()) == [pytest.approx(expected, rel=1e-14)]
 
 
@@ -77,7 +77,7 @@ def test_a_reduction_that_is_not_linear_is_taken_over_each_pair(tmp_path: Path) 
     """Three others at rest beside one who is 10 mm off pull by what max leaves, each by itself."""
     own = library(tmp_path, FOLLOWER.format("k*sum(max(sample(flange.x) - others.x, 0))"))
     system = compiled(replaced(FOUR, ("count: 4", "count: 4, set: {device.x: [10 mm, 0 m, 0 m, 0 m]}")), own)
-    [receive] = system.kinds[0].clocks[0].receives
+    [receive] = system.peer_types[0].clocks[0].receives
     assert (receive.operator, receive.link, receive.edge is None) == ("sum", "lan", False)
     run = apc.simulate(system, duration="2 ms", signals=["*.v"], jit=False)
     assert run["user[1].device.v"][1] == pytest.approx(-7 * 3 * 0.010 / 2 * 1e-3, rel=1e-2)
@@ -95,7 +95,7 @@ def test_a_pair_of_peers_does_not_know_what_all_say_together(force: str, tmp_pat
 
 # ---- an expression means in every place what a variable of its name means there ----
 
-SCENE = """\
+TOPOLOGY = """\
 topology: places
 library: ./parts
 clocks: {tick: 1 ms, slow: 4 ms, packets: 2 ms}
@@ -173,13 +173,13 @@ NAMED = {"clocked": "y", "start": "0 m", "continuous": "a.x"}
 
 
 def same(folder: Path, place: str, expression: str, name: str, **variables: str) -> bool:
-    """Return whether a scene moves alike with an expression in a place and with the name of what it is."""
+    """Return whether a topology moves alike with an expression in a place and with the name of what it is."""
     found = []
     for text in (expression, name):
         _, sends, whole = place.replace("@", text).rpartition("sent: ")
         force, sent = (PLAIN, whole) if sends else (whole, "sample(a.x)")
         own = OWN.format(force=force, sent=sent, **{**NAMED, **variables})
-        modes = apc.analyze(compiled(SCENE, library(folder, own))).modes
+        modes = apc.analyze(compiled(TOPOLOGY, library(folder, own))).modes
         sizes = [abs(mode.eigenvalue) for mode in modes for _ in range(mode.multiplicity)]
         found.append(sorted(size for size in sizes if size > 1e-2))
     return found[0] == pytest.approx(found[1], rel=1e-9)
@@ -213,4 +213,4 @@ def test_the_line_to_write_for_a_reduction_that_is_sent_works(tmp_path: Path) ->
     more = "a.x\n  - relayed = 0.5*sample(a.x, clock) + 0.5*mean(others.sent)"
     named = {**NAMED, "continuous": more}
     own = OWN.format(force="hold(K*(y - relayed))", sent="sample(hold(relayed))", **named)
-    assert 0.9 < apc.analyze(compiled(SCENE, library(tmp_path, own))).spectral_radius < 1.1
+    assert 0.9 < apc.analyze(compiled(TOPOLOGY, library(tmp_path, own))).spectral_radius < 1.1

@@ -10,11 +10,11 @@ import apc
 from tests.library.parts import values
 from tests.topologies import ONE_MASS, ROOT, compiled, library, told
 
-FILES = [path for path in sorted((ROOT / "models").rglob("*.yaml")) if path.parent.name != "scenes"]
+FILES = [path for path in sorted((ROOT / "models").rglob("*.yaml")) if path.parent.name != "topologies"]
 BALL = """\
 component: Ball
 connectors: {flange: Flange}
-parameters: {mass: {unit: g, above: 1, max: 2 kg, default: 500}}
+parameters: {mass: {unit: g, exclusive_min: 1, max: 2 kg, default: 500}}
 variables: {x: {unit: m, start: 0 m}, v: {unit: m/s, start: 0 m/s}}
 equations:
   - der(x) = v
@@ -43,7 +43,7 @@ def test_a_bare_number_of_a_declaration_is_in_the_unit_beside_it(tmp_path: Path)
     text = "topology: own\npeers: {u: {count: 1}}\nmasses: {ball: {type: Ball}}\n"
     system = compiled(text, library(tmp_path, BALL))
     [mass] = [one for one in system.parameters if one.name == "ball.mass"]
-    assert (mass.minimum, mass.open_minimum, mass.maximum, mass.value) == (0.001, True, 2.0, 0.5)
+    assert (mass.minimum, mass.exclusive_minimum, mass.maximum, mass.value) == (0.001, True, 2.0, 0.5)
     [line] = told(compiled, text.replace("type: Ball", "type: Ball, mass: 1 g"), library(tmp_path, BALL))
     assert line.endswith("E207 mass wants more than 1 g, got 1 g.")
 

@@ -18,7 +18,7 @@ from tests.topologies import AVERAGE, ONE_MASS, compiled, library, replaced
 
 
 def parameters(*texts: str, before: str = "") -> list[Fraction | float]:
-    """Return what expressions of parameters come to in a scene: a fraction where it is exact."""
+    """Return what expressions of parameters come to in a topology: a fraction where it is exact."""
     named = ", ".join(f"p{place}: '{text}'" for place, text in enumerate(texts))
     system = compiled(f"{ONE_MASS}parameters: {{{before}{named}}}\n")
     found = {one.name: one.value if one.exact is None else one.exact for one in system.parameters}
@@ -152,5 +152,5 @@ equations: ['flange.f = if side == left then pie else 2*side']
 
 @pytest.mark.parametrize(("side", "expected"), [("left", -3.0), ("right", -2.0)])
 def test_a_word_stands_for_its_number_and_pie_is_no_pi(side: str, expected: float, tmp_path: Path) -> None:
-    scene = f"{ONE_MASS}hands: {{own: {{type: Own, flange: device, side: {side}}}}}\n"
-    assert force(compiled(scene, library(tmp_path, NAMED))) == expected
+    topology = f"{ONE_MASS}hands: {{own: {{type: Own, flange: device, side: {side}}}}}\n"
+    assert force(compiled(topology, library(tmp_path, NAMED))) == expected

@@ -9,7 +9,7 @@ import pytest
 
 import apc
 from apc.__main__ import run
-from apc.analysis.needs import needs
+from apc.analysis.model_size import model_size
 from tests.topologies import AVERAGE, compiled, library, replaced, told
 
 DELAY = "delay: 8 ms}"
@@ -19,18 +19,18 @@ LONG, SHOWN = "a" * 10_000, f"{'a' * 57}..."
 def tabled(
     folder: Path, text: str | None, change: tuple[str, str] = ("count: 3", "table: users.csv")
 ) -> list[str]:
-    """Return what is told of the first scene with a change, beside a table of such a text."""
+    """Return what is told of the first topology with a change, beside a table of such a text."""
     if text is not None:
         (folder / "users.csv").write_text(text, encoding="utf-8")
-    (folder / "scene.yaml").write_text(replaced(AVERAGE, change), encoding="utf-8")
-    return [line.replace(f"{folder}/", "") for line in told(apc.compile, folder / "scene.yaml")]
+    (folder / "topology.yaml").write_text(replaced(AVERAGE, change), encoding="utf-8")
+    return [line.replace(f"{folder}/", "") for line in told(apc.compile, folder / "topology.yaml")]
 
 
 def test_a_table_is_refused_by_its_size_before_it_is_read(tmp_path: Path) -> None:
     with (tmp_path / "users.csv").open("wb") as file:
         file.truncate((64 << 20) + 1)
     assert tabled(tmp_path, None) == [
-        "scene.yaml:7:17: E701 the table users.csv is larger than 64 MiB, the most it may have."
+        "topology.yaml:7:17: E701 the table users.csv is larger than 64 MiB, the most it may have."
     ]
 
 
@@ -64,8 +64,8 @@ def test_peers_in_a_file_of_pairs_have_numbers_or_names(tmp_path: Path, key: str
     graphs = []
     for written in ("net.csv", pairs):
         changed = replaced(AVERAGE, (DELAY, f"delay: 8 ms, graph: {{{key}: {written}}}}}"))
-        (tmp_path / "scene.yaml").write_text(changed, encoding="utf-8")
-        graphs.append(apc.compile(tmp_path / "scene.yaml").links[0].graph)
+        (tmp_path / "topology.yaml").write_text(changed, encoding="utf-8")
+        graphs.append(apc.compile(tmp_path / "topology.yaml").links[0].graph)
     assert graphs[0].arcs.tolist() == graphs[1].arcs.tolist()
     assert graphs[0].weights.tolist() == graphs[1].weights.tolist()
 
@@ -90,19 +90,19 @@ def test_a_heading_without_end_is_told_in_a_few_words(tmp_path: Path) -> None:
 
 
 @pytest.mark.whole
-@pytest.mark.parametrize("asked", ["10 s", "1285.71 ms", "1001 ms"])
-def test_the_delay_that_is_proposed_for_a_force_is_taken(asked: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("requested", ["10 s", "1285.71 ms", "1001 ms"])
+def test_the_delay_that_is_proposed_for_a_force_is_taken(requested: str, tmp_path: Path) -> None:
     def late(delay: str) -> list[str]:
         return tabled(tmp_path, "", ("haptic, delay: 1 ms}", f"haptic, delay: {delay}}}"))
 
-    [message] = late(asked)
+    [message] = late(requested)
     assert "values that are computed and do not act yet; at most 1,000 can be analysed" in message
     assert late(message.split("Write: delay: ")[1].split(",")[0]) == []
-    assert not needs(apc.compile(tmp_path / "scene.yaml")).refused
+    assert not model_size(apc.compile(tmp_path / "topology.yaml")).refused
 
 
 def wrong(*pairs: tuple[str, str]) -> str:
-    """Return the only thing that is told when the first scene with changes is compiled and analysed."""
+    """Return the only thing that is told when the first topology with changes is compiled and analysed."""
     [line] = told(lambda: apc.analyze(compiled(replaced(AVERAGE, *pairs))))
     return line
 
@@ -151,10 +151,12 @@ def test_what_takes_too_long_is_judged_and_not_varied(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("scene.yaml").write_text(replaced(AVERAGE, ("network: 8 ms", "network: 504 ms")), encoding="utf-8")
+    Path("topology.yaml").write_text(
+        replaced(AVERAGE, ("network: 8 ms", "network: 504 ms")), encoding="utf-8"
+    )
     assert run(["analyze"]) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert "what moves it most: not looked for: 504 ticks in a frame take too long" in said
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "what moves it most: not looked for: 504 ticks in a frame take too long" in printed
 
 
 # ---- parts in parts ----
@@ -202,16 +204,17 @@ def test_an_array_of_composites_or_inside_one_has_a_limit(tmp_path: Path) -> Non
 def test_a_chain_of_masses_is_sorted_in_seconds_and_a_rigid_one_is_one_mass() -> None:
     """Springs between 160 masses; 60 masses joined rigidly by gears, which move as one."""
 
-    def row(count: int, kind: str) -> str:
+    def row(count: int, peer_type: str) -> str:
         masses = f"masses: {{m: {{count: {count}, mass: 0.5 kg, damping: 0.1 N*s/m}}}}\n"
         pairs = f"count: {count - 1}, a: 'm[1:{count - 1}]', b: 'm[2:{count}]'"
         return (
-            f"topology: row\npeers: {{u: {{count: 1}}}}\n{masses}couplers: {{c: {{{pairs}, type: {kind}}}}}\n"
+            f"topology: row\npeers: {{u: {{count: 1}}}}\n{masses}couplers: "
+            f"{{c: {{{pairs}, type: {peer_type}}}}}\n"
         )
 
-    assert len(compiled(row(160, "SpringDamper, stiffness: 9 N/m")).kinds[0].states) == 320
+    assert len(compiled(row(160, "SpringDamper, stiffness: 9 N/m")).peer_types[0].states) == 320
     rigid = compiled(row(60, "Gear, ratio: 1"))
-    assert len(rigid.kinds[0].states) == 2
+    assert len(rigid.peer_types[0].states) == 2
     assert apc.analyze(rigid).spectral_radius == pytest.approx(np.exp(-0.1 / 0.5), rel=1e-12)
 
 
@@ -219,7 +222,7 @@ def test_a_force_that_has_no_value_from_some_instant_on_ends_the_run_there(tmp_p
     """Where halves of an interval are integrated until they agree, what has no value never would."""
     own = "component: Own\nconnectors: {flange: Flange}\nparameters: {F: {unit: N, default: 1}, T0: {unit: s,"
     own += " default: 0.0105}}\nequations: [flange.f = F*sqrt(1 - time/T0)]\n"
-    text = "topology: scene\nclocks: {haptic: 1 ms}\npeers: {user: {count: 1}}\n"
+    text = "topology: topology\nclocks: {haptic: 1 ms}\npeers: {user: {count: 1}}\n"
     text += "masses: {device: {mass: 1 kg, damping: 1 N*s/m}}\nhands: {hand: {type: Own, flange: device}}\n"
     ran = apc.simulate(compiled(text, library(tmp_path, own)), duration="20 ms", jit=False)
     assert ran.time[-1] == pytest.approx(0.01)

@@ -1,6 +1,6 @@
 """Every mistake is told once: its place, its code, the sentence, and a line to write that is then accepted.
 
-`messages.txt` is the table. A row is a change to a scene or component, as a diff has it (`-` what stands
+`messages.txt` is the table. A row is a change to a topology or component, as a diff has it (`-` what stands
 there, `+` what a user writes), and under it what `apc check` says, a mistake a line. Where that proposes what
 to write, the line is put in its place and checked again: nothing is left to say. Where it says so in general
 words, the row shows what a user then writes (`=`).
@@ -27,7 +27,7 @@ def _split(name: str, heading: str) -> list[list[str]]:
     return [parts[place : place + 3] for place in range(0, len(parts), 3)]
 
 
-# By section its files; the first one is changed. An empty text is the first scene of the library.
+# By section its files; the first one is changed. An empty text is the first topology of the library.
 MODELS: dict[str, dict[str, str]] = {}
 for section, file, body in _split("models.txt", r"(\S+) (\S+)"):
     MODELS.setdefault(section, {})[file] = body or AVERAGE
@@ -42,7 +42,7 @@ def _lines(row: str, mark: str) -> str:
     return "\n".join(line[2:] for line in row.splitlines() if line[:2] == f"{mark} ")
 
 
-def _told(row: str) -> list[str]:
+def _reported(row: str) -> list[str]:
     return [line for line in row.splitlines() if line[:2] not in ("- ", "+ ", "= ")]
 
 
@@ -56,7 +56,7 @@ def check(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
         changed = next(iter(MODELS[section]))
         for file, body in {**MODELS[section], changed: text}.items():
             Path(file).write_text(body, encoding="utf-8")
-        code = run(["check", "scene.yaml"])
+        code = run(["check", "topology.yaml"])
         found = MISTAKE.findall(capsys.readouterr().err)
         assert code == bool(found)
         return [line.removeprefix("./").removeprefix(f"{changed}:") for line in found]
@@ -102,7 +102,7 @@ def _named(rows: list[tuple[str, str]]) -> Any:
 def test_a_mistake_is_told_once_at_its_place(section: str, row: str, check: Any) -> None:
     text = next(iter(MODELS[section].values()))
     told = check(section, replaced(text, (_lines(row, "-"), _lines(row, "+"))))
-    assert told == _told(row)
+    assert told == _reported(row)
 
 
 @pytest.mark.few(30)
@@ -111,7 +111,7 @@ def test_what_a_message_says_to_write_is_accepted(section: str, row: str, check:
     text = next(iter(MODELS[section].values()))
     old, new, instead = (_lines(row, mark) for mark in "-+=")
     wrong = replaced(text, (old, new))
-    hints = [(one, one.partition("Write: ")[2].split(", or ")) for one in _told(row) if "Write: " in one]
+    hints = [(one, one.partition("Write: ")[2].split(", or ")) for one in _reported(row) if "Write: " in one]
     if instead:
         assert check(section, replaced(text, (old, instead))) == []
         return

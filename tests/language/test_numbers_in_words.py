@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from apc.analysis.analysis import analyze
-from apc.compiler.words import known_digits, measured
-from apc.present.forms import radius_text
+from apc.compiler.wording import known_digits, measured
+from apc.output.formatting import radius_text
 from tests.topologies import OSCILLATOR, compiled
 
 

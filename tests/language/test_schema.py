@@ -15,19 +15,19 @@ import apc
 from apc.__main__ import run
 from apc.compiler.compiled import LARGEST_COUNT
 from apc.compiler.components.parts import DEFAULT_TYPES, LARGEST_ARRAY
-from apc.compiler.scene.graphs import SHAPES
-from apc.compiler.scene.groups import GROUP
-from apc.compiler.scene.links import PROBABILITIES
-from apc.compiler.scene.scene import TOPOLOGY
 from apc.compiler.source.reading import IDENTIFIER
-from tests.topologies import AVERAGE, ROOT, SCENES, replaced
+from apc.compiler.topology.graphs import SHAPES
+from apc.compiler.topology.groups import GROUP
+from apc.compiler.topology.links import PROBABILITIES
+from apc.compiler.topology.topology import TOPOLOGY
+from tests.topologies import AVERAGE, ROOT, TOPOLOGIES, replaced
 
 jsonschema = pytest.importorskip("jsonschema")
 
 FILE = ROOT / "models" / "topology.schema.json"
 SECTIONS = [
     "topology",
-    "about",
+    "description",
     "library",
     "clocks",
     "parameters",
@@ -103,8 +103,8 @@ def test_it_is_a_schema_of_draft_2020_12_with_every_section_and_component() -> N
 
 
 @pytest.mark.few(4)
-@pytest.mark.parametrize("path", sorted(SCENES.glob("*.yaml")), ids=lambda path: path.stem)
-def test_every_scene_fits_and_names_it_in_its_first_line(path: Path) -> None:
+@pytest.mark.parametrize("path", sorted(TOPOLOGIES.glob("*.yaml")), ids=lambda path: path.stem)
+def test_every_topology_fits_and_names_it_in_its_first_line(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
     assert faults(text) == []
     assert text.startswith(COMMENT)

@@ -12,7 +12,7 @@ import apc
 from apc.compiler.errors import ApcError
 from tests.topologies import compiled, library, told
 
-SCENE = """
+TOPOLOGY = """
 topology: odd
 clocks: {{tick: 1 ms}}
 peers: {{user: {{count: 1}}}}
@@ -38,9 +38,9 @@ def model(folder: Path, equations: list[str], x: str = "0 m") -> apc.Model:
     clocked = any("sample" in one for one in equations)
     lines = "\n".join(f"  - {one}" for one in equations)
     library(folder, OWN.format(clock="  clock: clock\n" if clocked else "", equations=lines))
-    scene = SCENE.format(x=x, clock=", clock: tick" if clocked else "")
-    (folder / "scene.yaml").write_text(f"library: ./{scene}", encoding="utf-8")
-    return apc.compile(folder / "scene.yaml")
+    topology = TOPOLOGY.format(x=x, clock=", clock: tick" if clocked else "")
+    (folder / "topology.yaml").write_text(f"library: ./{topology}", encoding="utf-8")
+    return apc.compile(folder / "topology.yaml")
 
 
 def sampled_spring(stiffness: float) -> float:

@@ -1,4 +1,4 @@
-"""A scene that is linearized where it starts, and is not at rest there, says what moves it."""
+"""A topology that is linearized where it starts, and is not at rest there, says what moves it."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ def _pressed(push: str = "0 N", held: str = "0 N", left: str = "device.x: -180 m
 
 def test_the_largest_force_that_nothing_balances_is_told_first_of_all() -> None:
     system = compiled(_pressed())
-    first, second = apc.analyze(system).left_out
+    first, second = apc.analyze(system).limitations
     assert first.startswith("the start is not at rest: 120 N acts on left.")
     assert "is not linear" in second
     assert str(apc.analyze(system)).splitlines()[1].strip().startswith("the start is not at rest: 120 N")
-    assert apc.analyze(system).to_dict()["left_out"] == [first, second]
+    assert apc.analyze(system).to_dict()["limitations"] == [first, second]
 
 
 def test_every_answer_that_holds_near_the_start_says_what_moves_there() -> None:
@@ -45,22 +45,22 @@ def test_every_answer_that_holds_near_the_start_says_what_moves_there() -> None:
     x, y = "contact.stiffness=500 N/m:700 N/m", "device.damping=4 N*s/m:6 N*s/m"
     found = (
         apc.critical(system, "contact.stiffness"),
-        apc.feel(system, [1.0], at="left[1].device", between="right[1].device"),
+        apc.transparency(system, [1.0], at="left[1].device", between="right[1].device"),
         apc.region(system, x=x, y=y),
         apc.analyze_many(system, {"contact.stiffness": [500.0]}),
     )
     for one in found:
-        assert one.left_out[0].startswith("the start is not at rest: 120 N acts on left.")
+        assert one.limitations[0].startswith("the start is not at rest: 120 N acts on left.")
 
 
 @pytest.mark.parametrize("moved", ["-180 mm", "-17 cm"])
 def test_of_forces_that_balance_nothing_is_said(moved: str) -> None:
     force = 600 * (0.02 - float(moved.split()[0]) * (0.001 if "mm" in moved else 0.01))
     balanced = f"device.x: {moved}, push.force: {-force} N, held.force: {force} N"
-    [left_out] = apc.analyze(compiled(_pressed(left=balanced))).left_out
-    assert "is not linear" in left_out
+    [limitations] = apc.analyze(compiled(_pressed(left=balanced))).limitations
+    assert "is not linear" in limitations
 
 
-def test_of_a_scene_whose_verdict_does_not_depend_on_the_start_nothing_is_said() -> None:
+def test_of_a_topology_whose_verdict_does_not_depend_on_the_start_nothing_is_said() -> None:
     pushed = AVERAGE.replace("device: {mass", "device: {x: 1 m, mass")
-    assert apc.analyze(compiled(pushed)).left_out == ()
+    assert apc.analyze(compiled(pushed)).limitations == ()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import apc
-from tests.language.own import component, force, model, scene
+from tests.language.own import component, force, model, topology
 from tests.library.parts import rates, ticked
 from tests.topologies import ONE_MASS, compiled, library, told
 
@@ -19,9 +19,9 @@ ROW = "  load: {mass: 5 kg, damping: 1 N*s/m"
 
 
 def only(text: str, speed: float) -> tuple[list[str], dict[str, float]]:
-    """Return the states of a scene and the rates where its only velocity is such."""
+    """Return the states of a topology and the rates where its only velocity is such."""
     system = compiled(text)
-    states = [state.name for state in system.kinds[0].states]
+    states = [state.name for state in system.peer_types[0].states]
     velocity = {name: speed for name in states if name.endswith(".v")}
     return states, rates(system, velocity)
 
@@ -31,7 +31,7 @@ def test_masses_joined_the_other_way_round_have_opposite_velocities(tmp_path: Pa
     text = f"{ONE_MASS}{ROW}}}\ncouplers: {{lever: {{type: Lever, a: device, b: load}}}}\n"
     text += "hands: {push: {type: ConstantForce, flange: device, force: 4 N}}\n"
     system = compiled(text, library(tmp_path, reversed_))
-    [position, velocity] = [state.name for state in system.kinds[0].states]
+    [position, velocity] = [state.name for state in system.peer_types[0].states]
     sign = 1 if velocity == "device.v" else -1
     found = rates(system, {velocity: 0.5})
     assert [found[position], found[velocity]] == pytest.approx([0.5, (sign * 4 - 4 * 0.5) / 7], rel=1e-14)
@@ -40,7 +40,7 @@ def test_masses_joined_the_other_way_round_have_opposite_velocities(tmp_path: Pa
 @pytest.mark.parametrize("position", ["0*L", "L", "L*sin(time/T)", "L*(time/T)^2"])
 def test_what_is_told_where_to_be_has_no_state_and_plays(position: str, tmp_path: Path) -> None:
     system = model(tmp_path, f"flange.x = {position}")
-    assert system.kinds[0].states == ()
+    assert system.peer_types[0].states == ()
     found = apc.analyze(system)
     assert (found.verdict, found.spectral_radius) == ("stable", 0)
     assert apc.simulate(system, duration="20 ms", jit=False).time[-1] == pytest.approx(0.02)
@@ -50,7 +50,7 @@ def test_a_second_derivative_takes_the_velocity_that_is_named_as_its_state(tmp_p
     system = model(
         tmp_path, "K*T^2*der(der(y)) = F - K*T*der(y)", "der(y) = v", "flange.f = 0", variables="y: v=m/s:"
     )
-    assert {one.name for one in system.kinds[0].states} == {"device.x", "device.v", "own.y", "own.v"}
+    assert {one.name for one in system.peer_types[0].states} == {"device.x", "device.v", "own.y", "own.v"}
     assert rates(system, {"own.v": 1.0})["own.v"] == pytest.approx(0.01 - 1, rel=1e-14)
 
 
@@ -97,10 +97,10 @@ def test_a_loop_that_needs_another_is_solved_after_it(tmp_path: Path) -> None:
     assert z + z**5 == pytest.approx(4.0, abs=1e-12)
 
 
-def test_a_scene_is_linearized_through_its_loops(tmp_path: Path) -> None:
+def test_a_topology_is_linearized_through_its_loops(tmp_path: Path) -> None:
     """At x = 10 is y = 2, and of its slope 1/(1 + 3·4): m s² + b s + K/13 = 0, over a second."""
     text = component("y + y^3/L^2 = flange.x", "flange.f = K*(y - 2*L)", variables="y")
-    found = apc.analyze(compiled(scene(text, start="10 m"), library(tmp_path, text)))
+    found = apc.analyze(compiled(topology(text, start="10 m"), library(tmp_path, text)))
     assert found.spectral_radius == pytest.approx(math.exp(-3 / 4), rel=1e-9)
     frequency = math.sqrt(100 / 13 / 2 - (3 / 4) ** 2)
     assert abs(np.angle(found.modes[0].eigenvalue)) == pytest.approx(frequency, rel=1e-9)
@@ -143,7 +143,7 @@ def test_a_factor_that_is_zero_whatever_the_motion_is_none(case: str, tmp_path: 
     text, _, zero = case.partition(" → ")
     equations = ["x = flange.x/L", "z = 2*x + 1", f"({text})*y = L", "flange.f = K*y"]
     own = component(*equations, variables="y")
-    lines = told(compiled, scene(own), library(tmp_path, own))
+    lines = told(compiled, topology(own), library(tmp_path, own))
     assert bool(lines) == (zero == "zero")
 
 
@@ -156,6 +156,6 @@ SINGULAR = (Path(__file__).parent / "singular.txt").read_text(encoding="utf-8").
 def test_equations_without_an_answer_are_told_by_name(case: str, tmp_path: Path) -> None:
     equations, variables, expected = map(str.strip, case.rstrip("\n").split("\n"))
     own = component(*equations.split("; "), variables=variables)
-    lines = told(compiled, scene(own), library(tmp_path, own))
+    lines = told(compiled, topology(own), library(tmp_path, own))
     assert len(lines) == 1
     assert expected in lines[0]

@@ -20,7 +20,7 @@ def _named(texts: tuple[str, ...]) -> list[Parameter]:
 
 
 def read(*texts: str) -> list[Parameter]:
-    """Return the parameters of a scene that have these values."""
+    """Return the parameters of a topology that have these values."""
     return _named(texts)
 
 
@@ -60,8 +60,8 @@ SHOWN = {
 
 def test_a_dimension_is_shown_as_the_unit_an_engineer_writes_and_reads_back() -> None:
     assert [one.unit for one in read(*(f"3 {unit}" for unit in SHOWN))] == list(SHOWN.values())
-    again = [one for one in SHOWN.values() if one != "1"]
-    assert [one.exact for one in read(*(f"3 {unit}" for unit in again))] == [3] * len(again)
+    repeated = [one for one in SHOWN.values() if one != "1"]
+    assert [one.exact for one in read(*(f"3 {unit}" for unit in repeated))] == [3] * len(repeated)
 
 
 # What a haptics engineer writes, which pint knows by these names too.

@@ -27,11 +27,11 @@ equations:
 Vector = NDArray[np.float64]
 
 
-def scene(size: int) -> str:
-    kind = {2: "Planar", 3: "Spatial"}[size]
+def topology(size: int) -> str:
+    peer_type = {2: "Planar", 3: "Spatial"}[size]
     return (
         f"topology: vectors\nclocks: {{tick: 1 ms}}\npeers: {{user: {{count: 1}}}}\n"
-        f"masses: {{device: {{type: {kind}Mass, mass: 1 kg}}}}\n"
+        f"masses: {{device: {{type: {peer_type}Mass, mass: 1 kg}}}}\n"
         "hands: {own: {type: Own, flange: device}}\n"
     )
 
@@ -43,7 +43,7 @@ def component(text: str, v: list[float]) -> str:
 
 def value(text: str, u: Vector, v: Vector, folder: Path) -> list[float]:
     """Return what a vector of u, where a mass is, and of v, a parameter, comes to: the force on 1 kg."""
-    system = compiled(scene(len(u)), library(folder, component(text, v.tolist())))
+    system = compiled(topology(len(u)), library(folder, component(text, v.tolist())))
     at = {f"device.x[{k + 1}]": float(one) for k, one in enumerate(u)}
     at |= {f"device.v[{k + 1}]": float(one) for k, one in enumerate(2 * u)}
     found = rates(system, at)
@@ -87,5 +87,5 @@ def test_what_doubles_at_each_level_is_refused_before_it_fills_the_memory(tmp_pa
     nested = "cross(u, v)"
     for _ in range(30):
         nested = f"cross({nested}, v)"
-    [line] = told(compiled, scene(3), library(tmp_path, component(nested, [1.0, 2.0, 3.0])))
+    [line] = told(compiled, topology(3), library(tmp_path, component(nested, [1.0, 2.0, 3.0])))
     assert "entry by entry this has more than 10000 terms: give a part of it a name" in line

@@ -1,4 +1,4 @@
-"""A peer's equations with the numbers of its scene: what moves it, and what its only clock computes."""
+"""A peer's equations with the numbers of its topology: what moves it, and what its only clock computes."""
 
 from __future__ import annotations
 
@@ -25,31 +25,35 @@ def values(system: apc.Model) -> dict[str, float]:
 
 def at(system: apc.Model, x: Mapping[str, float]) -> tuple[list[float], list[float], list[float]]:
     """Return the states, with 0 for those not named, zeros for what is held, and the numbers."""
-    (kind,) = system.kinds
-    states = [state.name for state in kind.states]
+    (peer_type,) = system.peer_types
+    states = [state.name for state in peer_type.states]
     assert set(x) <= set(states)
     known = values(system)
-    return [x.get(one, 0.0) for one in states], [0.0] * len(kind.holds), [known[n] for n in kind.parameters]
+    return (
+        [x.get(one, 0.0) for one in states],
+        [0.0] * len(peer_type.holds),
+        [known[n] for n in peer_type.parameters],
+    )
 
 
 def rates(system: apc.Model, x: Mapping[str, float], held: Sequence[float] = ()) -> dict[str, float]:
     """Return dx/dt by state."""
-    (kind,) = system.kinds
+    (peer_type,) = system.peer_types
     states, nothing, numbers = at(system, x)
-    found = listed(kind.derivative(states, list(held) or nothing, numbers, 0.0))
-    return dict(zip((state.name for state in kind.states), found, strict=True))
+    found = listed(peer_type.derivative(states, list(held) or nothing, numbers, 0.0))
+    return dict(zip((state.name for state in peer_type.states), found, strict=True))
 
 
 def ticked(
     system: apc.Model,
     x: Mapping[str, float],
     memory: Sequence[float] = (),
-    heard: Sequence[float] = (),
+    received: Sequence[float] = (),
 ) -> dict[str, float]:
     """Return what the only clock computes."""
-    ((clock,),) = (kind.clocks for kind in system.kinds)
+    ((clock,),) = (peer_type.clocks for peer_type in system.peer_types)
     states, nothing, numbers = at(system, x)
-    found = listed(clock.tick(states, nothing, list(memory), list(heard), numbers, 0))
+    found = listed(clock.tick(states, nothing, list(memory), list(received), numbers, 0))
     return dict(zip(clock.outputs, found, strict=True))
 
 

@@ -1,4 +1,6 @@
-"""What comes with the program, seen from an empty folder: the library, its scenes, and what may be set."""
+"""What comes with the program, seen from an empty folder: the library, its topologies, and what may be
+set.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +13,9 @@ import yaml
 
 import apc
 from apc.__main__ import run
-from tests.topologies import ROOT, SCENES
+from tests.topologies import ROOT, TOPOLOGIES
 
-LIBRARY = [path for path in (ROOT / "models").rglob("*.yaml") if path.parent != SCENES]
+LIBRARY = [path for path in (ROOT / "models").rglob("*.yaml") if path.parent != TOPOLOGIES]
 NAMES = sorted("".join(word.capitalize() for word in path.stem.split("-")) for path in LIBRARY)
 Call = Callable[..., tuple[int, str, str]]
 
@@ -49,10 +51,10 @@ def test_every_component_is_shown_with_its_parameters_and_equations(path: Path, 
     if "component" in text:
         facts = json.loads(call("library", name, "--json")[1])
         shown = " ".join(out.split())
-        assert text["about"].endswith(".") and text["source"]
-        for own, said in text.get("parameters", {}).items():
+        assert text["description"].endswith(".") and text["source"]
+        for own, printed in text.get("parameters", {}).items():
             assert own in shown
-            assert isinstance(said, str) or "about" in said or "extends" in text
+            assert isinstance(printed, str) or "description" in printed or "extends" in text
         for equation in text.get("equations", []):
             assert equation in facts["equations"]
             assert equation in out
@@ -66,7 +68,7 @@ def test_a_parameter_is_told_with_unit_default_and_limits(call: Call) -> None:
 
 def test_components_of_ones_own_folder_are_listed_and_shown(call: Call, tmp_path: Path) -> None:
     (tmp_path / "part.yaml").write_text(
-        "component: Own\nabout: Mine.\nconnectors: {a: Flange}\nequations: [a.f = 0]\n", "utf-8"
+        "component: Own\ndescription: Mine.\nconnectors: {a: Flange}\nequations: [a.f = 0]\n", "utf-8"
     )
     own = ("--folder", str(tmp_path))
     assert "  Own  Mine" in call("library", *own)[1]
@@ -74,29 +76,29 @@ def test_components_of_ones_own_folder_are_listed_and_shown(call: Call, tmp_path
     assert "--folder: E214" in call("library", *own, "--folder", "none")[2]
 
 
-def test_a_misspelt_component_or_scene_is_told_with_the_nearest(call: Call) -> None:
+def test_a_misspelt_component_or_topology_is_told_with_the_nearest(call: Call) -> None:
     assert call("library", "AveragePositon") == (
         1,
         "",
         "apc library: E206 the library has no AveragePositon. Write: apc library AveragePosition\n",
     )
     assert call("new", "--like", "three-user-average")[2] == (
-        "--like: E206 the library has no scene three-user-average. "
+        "--like: E206 the library has no topology three-user-average. "
         "Write: apc new --like three-users-average\n"
     )
 
 
 @pytest.mark.whole
-def test_every_scene_of_the_library_is_listed_and_copied_so_that_it_is_sound(call: Call) -> None:
+def test_every_topology_of_the_library_is_listed_and_copied_so_that_it_is_sound(call: Call) -> None:
     lines = call("new", "--list")[1].splitlines()
     listed = [line.split()[0] for line in lines if line.startswith("  ") and line[2] != " "]
-    assert listed == sorted(path.stem for path in SCENES.glob("*.yaml"))
+    assert listed == sorted(path.stem for path in TOPOLOGIES.glob("*.yaml"))
     for name in listed:
         assert call("new", "--like", name)[0] == 0
-        assert call("compile", f"{name}.yaml", "--until", "scene")[0] == 0
+        assert call("compile", f"{name}.yaml", "--until", "topology")[0] == 0
         assert Path(f"{name}.yaml").read_text(encoding="utf-8").count(f"topology: {name}") == 1
-    assert call("new", "--list", "--out", "scenes.html")[0] == 0
-    page = Path("scenes.html").read_text(encoding="utf-8")
+    assert call("new", "--list", "--out", "topologies.html")[0] == 0
+    page = Path("topologies.html").read_text(encoding="utf-8")
     assert page.count("data:image/svg+xml") == page.count("topology: ") == len(listed)
     assert "<pre>three-users-average: stable up to a common translation</pre>" in page
 
@@ -118,12 +120,12 @@ def test_a_copy_takes_another_name_and_brings_the_tables_it_names(call: Call) ->
     "name", ["three-users-average", "unlike-devices", "users-table", "lossy-average", "planar-users"]
 )
 def test_what_is_listed_may_be_set_within_its_limits_and_not_beyond(name: str) -> None:
-    model = apc.compile(SCENES / f"{name}.yaml")
+    model = apc.compile(TOPOLOGIES / f"{name}.yaml")
     for one in apc.parameters(model).rows:
         unit = "" if one.unit == "1" else f" {one.unit}"
         if not one.fixed:
             apc.set_parameters(model, {one.name: f"{max(one.low, one.minimum or 0.0)!r}{unit}"})
-        beyond = [one.minimum - (not one.open_minimum)] if one.minimum is not None else []
+        beyond = [one.minimum - (not one.exclusive_minimum)] if one.minimum is not None else []
         for value in [*beyond, *([one.maximum + 1.0] if one.maximum is not None else [])]:
             with pytest.raises(apc.ApcError):
                 apc.set_parameters(model, {one.name: f"{value!r}{unit}"})

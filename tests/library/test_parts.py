@@ -79,7 +79,7 @@ def test_a_gear_multiplies_displacement_and_divides_force() -> None:
     """x_a = 4 x_b: seen at a, the load is 16 times lighter, (2 + 5/16) a'' + (3 + 1/16) a' = F."""
     text = TWO + "couplers:\n  gear: {type: Gear, a: device, b: load, ratio: 4}\n"
     system = compiled(text + "hands:\n  hand: {type: ConstantForce, flange: device, force: 7 N}\n")
-    speed = next(one.name for one in system.kinds[0].states if one.name.endswith(".v"))
+    speed = next(one.name for one in system.peer_types[0].states if one.name.endswith(".v"))
     factor = 1.0 if speed == "device.v" else 0.25
     found = rates(system, {speed: 0.6 * factor})
     assert len(found) == 2
@@ -101,7 +101,7 @@ def test_a_finger_is_two_masses_of_which_one_moves_with_the_device() -> None:
 # ---- contacts ----
 
 
-def one_sided(depth: float, rate: float) -> float:
+def one_sided_peer_type(depth: float, rate: float) -> float:
     return max(0.0, 3900 * depth + 0.5 * rate) if depth > 0 else 0.0
 
 
@@ -110,7 +110,7 @@ def hunt_crossley(depth: float, rate: float) -> float:
 
 
 CONTACTS: dict[str, tuple[str, Callable[[float, float], float]]] = {
-    "OneSidedContact": ("stiffness: 3900 N/m, damping: 0.5 N*s/m, clock: tick", one_sided),
+    "OneSidedContact": ("stiffness: 3900 N/m, damping: 0.5 N*s/m, clock: tick", one_sided_peer_type),
     "HuntCrossleyContact": ("stiffness: 5e4 N/m^(3/2), damping: 1000 N*s/m^(5/2)", hunt_crossley),
     "SampledHuntCrossleyContact": (
         "stiffness: 5e4 N/m^(3/2), damping: 1000 N*s/m^(5/2), clock: tick",
@@ -160,7 +160,7 @@ def test_enclosure_walls_push_inwards_from_both_ends() -> None:
         left, right = ((900 * depth + 2 * 0.1) * (depth > 0) for depth in (-0.03 - x, x - 0.03))
         assert found["it.left.push"] == pytest.approx(left, rel=1e-11)
         assert found["it.right.push"] == pytest.approx(right, rel=1e-11)
-        acting = [found[hold.name] for hold in system.kinds[0].holds]
+        acting = [found[hold.name] for hold in system.peer_types[0].holds]
         assert pushes(system, {}, acting) == pytest.approx([left - right], rel=1e-11)
 
 
@@ -172,9 +172,9 @@ def test_encoder_quantization_rounds_down_to_whole_steps_and_passes_forces(x: fl
         "  encoder: {type: EncoderQuantization, flange: device, resolution: 0.5 mm}\n"
         f"  wall: {{{wall}, position: -1 m}}\n"
     )
-    seen = math.floor(x / 0.0005) * 0.0005
-    found = ticked(system, {"device.x": x}, [seen])
-    assert found == pytest.approx({"wall.x": seen, "wall.push": 900 * (seen + 1)}, rel=EXACT)
+    observed = math.floor(x / 0.0005) * 0.0005
+    found = ticked(system, {"device.x": x}, [observed])
+    assert found == pytest.approx({"wall.x": observed, "wall.push": 900 * (observed + 1)}, rel=EXACT)
     assert pushes(system, {}, [6.0]) == pytest.approx([-6], rel=EXACT)
     assert apc.analyze(system).linearized
 
@@ -206,7 +206,7 @@ def swings(mass: float, damping: float, stiffness: float) -> list[complex]:
 
 
 def in_a_second(system: apc.Model) -> list[complex]:
-    """Return the eigenvalues of a frame of a second, which is what a scene without clocks has."""
+    """Return the eigenvalues of a frame of a second, which is what a topology without clocks has."""
     return sorted((mode.eigenvalue for mode in apc.analyze(system).modes), key=lambda z: (z.imag, z.real))
 
 
@@ -269,7 +269,7 @@ def test_a_table_is_handed_on_to_a_part_inside(tmp_path: Path) -> None:
     )
     (tmp_path / "force.csv").write_text("time [s],force [N]\n0,2\n1,2\n", encoding="utf-8")
     library(tmp_path, tabled.replace("UNIT", "N"))
-    path = tmp_path / "scene.yaml"
+    path = tmp_path / "topology.yaml"
     hands = "library: ./\nhands:\n  it: {type: Tabled, flange: device, push: force.csv}\n"
     path.write_text(ONE_MASS + hands, encoding="utf-8")
     assert pushes(apc.compile(path), {}) == pytest.approx([2.0], rel=1e-14)

@@ -9,7 +9,7 @@ import pytest
 
 import apc
 from tests.library.parts import ticked
-from tests.topologies import SCENES, compiled, library, replaced
+from tests.topologies import TOPOLOGIES, compiled, library, replaced
 
 # What computes with the period of its clock, of the library.
 PERIODS = [
@@ -45,7 +45,7 @@ def _set(system: apc.Model, clock: str, period: str) -> apc.Model:
 
 
 def _motion(system: apc.Model) -> tuple[float, list[list[float]]]:
-    """Return the spectral radius of a scene, and the rows of its first moments."""
+    """Return the spectral radius of a topology, and the rows of its first moments."""
     run = apc.simulate(system, duration="60 ms", jit=False)
     return apc.analyze(system).spectral_radius, run.values.tolist()
 
@@ -54,7 +54,7 @@ def _motion(system: apc.Model) -> tuple[float, list[list[float]]]:
 @pytest.mark.parametrize("name", PERIODS)
 def test_a_period_that_is_set_reaches_what_computes_with_it(name: str) -> None:
     """Set without compiling again it is as written in the file: motion and spectral radius."""
-    text = (SCENES / f"{name}.yaml").read_text(encoding="utf-8")
+    text = (TOPOLOGIES / f"{name}.yaml").read_text(encoding="utf-8")
     period = "haptic: tick" if name == "finger" else "haptic: 1 ms"
     written = _motion(compiled(replaced(text, (period, "haptic: 2 ms"))))
     assert _motion(_set(compiled(text), "haptic", "2 ms")) == written

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 import apc
 from tests.library.parts import rates, ticked
-from tests.topologies import AVERAGE, SCENES, compiled, library, replaced
+from tests.topologies import AVERAGE, TOPOLOGIES, compiled, library, replaced
 
-PLANAR = (SCENES / "planar-users.yaml").read_text(encoding="utf-8").partition("\n")[2]
+PLANAR = (TOPOLOGIES / "planar-users.yaml").read_text(encoding="utf-8").partition("\n")[2]
 EXACT = 1e-13  # a few roundings
 POINT = "topology: point\nclocks: {tick: 1 ms}\npeers: {user: {count: 1}}\nmasses:\n"
 PLANE = f"{POINT}  device: {{type: PlanarMass, mass: 2 kg, damping: 3 N*s/m}}\n"
@@ -22,7 +22,7 @@ SPACE = f"{POINT}  device: {{type: SpatialMass, mass: 2 kg, damping: 3 N*s/m}}\n
 
 
 def sizes(text: str) -> np.ndarray:
-    """Return the magnitudes of all eigenvalues of a scene, each as often as it comes, largest first."""
+    """Return the magnitudes of all eigenvalues of a topology, each as often as it comes, largest first."""
     found = apc.analyze(compiled(text))
     each = [abs(one.eigenvalue) for one in found.modes for _ in range(one.multiplicity)]
     return np.sort(each)[::-1]
@@ -41,7 +41,7 @@ def pushed(system: apc.Model, *held: float) -> list[float]:
 # ---- what a plane has twice ----
 
 
-def test_the_scene_in_a_plane_has_each_eigenvalue_of_the_scene_on_a_line_twice() -> None:
+def test_the_topology_in_a_plane_has_each_eigenvalue_of_the_topology_on_a_line_twice() -> None:
     line, plane = sizes(AVERAGE), sizes(PLANAR)
     several = line > 1e-6  # smaller ones are of multiple eigenvalues at zero, whose errors are large
     assert several.sum() >= 10
@@ -125,8 +125,8 @@ def starts(text: str, folder: Path | None = None) -> list[list[float]]:
     if folder is None:
         system = compiled(text)
     else:
-        (folder / "scene.yaml").write_text(text, encoding="utf-8")
-        system = apc.compile(folder / "scene.yaml")
+        (folder / "topology.yaml").write_text(text, encoding="utf-8")
+        system = apc.compile(folder / "topology.yaml")
     run = apc.simulate(system, duration="1 ms", jit=False)
     names = [one.name for one in run.signals]
     return [
@@ -183,13 +183,13 @@ hands: {weight: {type: SpatialConstantForce, flange: centre.point, force: [0 N, 
 
 
 def hertz(text: str) -> list[float]:
-    """Return the frequencies of a scene's motions that swing."""
+    """Return the frequencies of a topology's motions that swing."""
     return sorted(one.frequency_hz for one in apc.analyze(compiled(text)).modes if one.eigenvalue.imag > 0)
 
 
 def test_what_is_held_does_the_work_that_copies_move_by() -> None:
     """Each pair of a connector does its own: ∫ f·dx + torque·dφ is the kinetic energy, without damping."""
-    text = (SCENES / "carried-beam.yaml").read_text(encoding="utf-8").partition("hands:")[0]
+    text = (TOPOLOGIES / "carried-beam.yaml").read_text(encoding="utf-8").partition("hands:")[0]
     start = "mass: 2 kg, v: [0.1 m/s, 0 m/s], rate: 0.3 rad/s"
     text = re.sub("damping: (5|0.15)", "damping: 0", re.sub(", carry.force: .*?]", "", text))
     text = replaced(
@@ -243,8 +243,8 @@ def test_a_free_symmetric_body_wobbles_at_its_rate_and_keeps_its_angular_momentu
     wobble = 2 * (0.3 - 0.2) / 0.2 * np.asarray(run.time)
     known = np.column_stack([0.4 * np.cos(wobble), 0.4 * np.sin(wobble), np.full(len(wobble), 2.0)])
     assert rate == pytest.approx(known, abs=1e-6)
-    kept = [axes(one) @ ([0.2, 0.2, 0.3] * w) for one, w in zip(turned, rate, strict=True)]
-    assert np.ptp(kept, axis=0).max() < 1e-6
+    stored = [axes(one) @ ([0.2, 0.2, 0.3] * w) for one, w in zip(turned, rate, strict=True)]
+    assert np.ptp(stored, axis=0).max() < 1e-6
 
 
 def test_what_pulls_at_a_point_of_a_turned_body_does_its_work_there() -> None:
@@ -269,13 +269,13 @@ def test_copies_are_turned_to_their_mean_as_they_are_pulled(space: bool) -> None
     """With J for m, and N*m/rad for N/m, each eigenvalue is that of a mass on a line, and so is the limit."""
     lines = AVERAGE.partition("studies:")[0].splitlines(keepends=True)
     alone = "".join(one for one in lines if not one.startswith(("  device:", "  contact:")))
-    count, kind = (6, "Spatial") if space else (3, "Planar")
+    count, peer_type = (6, "Spatial") if space else (3, "Planar")
     inertia = "[0.6 kg*m^2, 0.6 kg*m^2, 0.6 kg*m^2]" if space else "0.6 kg*m^2"
-    body = f"type: {kind}Body, inertia: {inertia}, turn_damping: 5 N*m*s/rad, mass"
+    body = f"type: {peer_type}Body, inertia: {inertia}, turn_damping: 5 N*m*s/rad, mass"
     turned = replaced(
         alone,
         ("cube:   {mass", f"cube:   {{{body}"),
-        ("AveragePosition", f"{kind}AveragePose"),
+        ("AveragePosition", f"{peer_type}AveragePose"),
         ("stiffness: 500 N/m,", "stiffness: 500 N/m, turn_stiffness: 500 N*m/rad,"),
     )
     one, many = sizes(alone), sizes(turned)
@@ -291,9 +291,9 @@ def test_copies_are_turned_to_their_mean_as_they_are_pulled(space: bool) -> None
 
 CHAIN = """\
 component: Chain
-about: Masses in a row with springs between them.
+description: Masses in a row with springs between them.
 connectors: {first: Flange, last: Flange}
-parameters: {mass: {unit: kg, above: 0}, stiffness: {unit: N/m, min: 0}}
+parameters: {mass: {unit: kg, exclusive_min: 0}, stiffness: {unit: N/m, min: 0}}
 parts:
   link: {type: Mass, count: 3, mass: mass}
   pad: {type: SpringDamper, count: 2, a: "link[1:2]", b: "link[2:3]", stiffness: stiffness}
@@ -309,7 +309,7 @@ couplers: {tie: {type: SpringDamper, a: chain.last, b: ground, stiffness: 9 N/m,
 
 def test_an_array_inside_a_component_is_the_row_that_a_topology_writes_out(tmp_path: Path) -> None:
     found = compiled(ROW, library(tmp_path, CHAIN))
-    names = [state.name for state in found.kinds[0].states]
+    names = [state.name for state in found.peer_types[0].states]
     assert sorted(names) == sorted(f"chain.link[{k}].{n}" for k in (1, 2, 3) for n in "xv")
     k = 50 * np.array([[1.0, -1, 0], [-1, 2, -1], [0, -1, 1]])
     k[2, 2] += 9

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 import apc
 from tests.schemes import ByHand, everybody, magnitudes, mean, played
-from tests.topologies import SCENES, compiled, replaced
+from tests.topologies import TOPOLOGIES, compiled, replaced
 
 Floats = NDArray[np.float64]
 Packets = dict[int, Sequence[Any]]
@@ -25,8 +25,8 @@ TICK = 1e-3
 SAME = 1e-10
 
 
-def scene(name: str) -> str:
-    return (SCENES / f"{name}.yaml").read_text(encoding="utf-8")
+def topology(name: str) -> str:
+    return (TOPOLOGIES / f"{name}.yaml").read_text(encoding="utf-8")
 
 
 def run_of(text: str, duration: str, *signals: str) -> apc.Trajectory:
@@ -55,14 +55,14 @@ def paid(debt: float, step: float, largest: float) -> float:
 
 # ---- one port ----
 
-WALL = scene("stiff-wall-passivity")
+WALL = topology("stiff-wall-passivity")
 
 
 @pytest.mark.parametrize("largest", [0.0, 2.0, 30.0])
 def test_passivity_controller_is_its_law(largest: float) -> None:
     """A device on a spring bounces in and out of the wall; at 2 N·s/m the limit is met again and again."""
 
-    def law(_: int, x: Sequence[tuple[Any, Any]], heard: Packets, memory: Sequence[Any]) -> Any:
+    def law(_: int, x: Sequence[tuple[Any, Any]], received: Packets, memory: Sequence[Any]) -> Any:
         before, energy, force = memory
         step = x[0][0] - before
         energy += force * step
@@ -83,7 +83,7 @@ def test_passivity_controller_is_its_law(largest: float) -> None:
 
 # ---- two ports ----
 
-TWO = scene("two-users-passivity")
+TWO = topology("two-users-passivity")
 COPIES = """\
 topology: two-copies
 clocks: {haptic: 1 ms, network: 8 ms}
@@ -103,19 +103,19 @@ def contact(x: Sequence[tuple[Any, Any]]) -> Any:
 @pytest.mark.few(2)
 @pytest.mark.parametrize(("delay", "largest"), [(0, 30.0), (50, 30.0), (50, 3.0), (200, 30.0)])
 def test_passivity_controlled_average_is_its_law(delay: int, largest: float) -> None:
-    def law(_: int, x: Sequence[tuple[Any, Any]], heard: Packets, memory: Sequence[Any]) -> Any:
-        before, taken, given, saved, pull, brake, *acting = memory
+    def law(_: int, x: Sequence[tuple[Any, Any]], received: Packets, memory: Sequence[Any]) -> Any:
+        before, used, given, saved, pull, brake, *acting = memory
         step = x[1][0] - before
-        taken += max(0.0, acting[0] * step)
+        used += max(0.0, acting[0] * step)
         given += max(0.0, -acting[0] * step)
         saved += acting[1] * step
-        extra = paid(given - saved - mean(heard, 2), step, largest)
-        now = 500 * (x[1][0] - mean(heard, 0))
+        extra = paid(given - saved - mean(received, 2), step, largest)
+        now = 500 * (x[1][0] - mean(received, 0))
         damped = extra * step / TICK
         push = contact(x)
         # What was computed at the tick before acts from now on.
-        kept = [x[1][0], taken, given, saved, now, damped, pull, brake]
-        return [-push, push - now - damped], kept, [taken]
+        stored = [x[1][0], used, given, saved, now, damped, pull, brake]
+        return [-push, push - now - damped], stored, [used]
 
     text = replaced(
         TWO,
@@ -150,25 +150,25 @@ def test_set_position_modulation_gives_no_energy(delay: int, energy: float) -> N
     )
     run = run_of(text, "3 s", "*")
     x, v = np.array(of_all(run, "cube.x")), np.array(of_all(run, "cube.v"))
-    goal, kept, spare, heard = (
+    goal, stored, spare, received = (
         np.array(of_all(run, f"it.{one}")) for one in ("goal", "energy", "spare", "heard")
     )
     # What is told at a row is that of the tick before: as it stands there, after that tick.
     x, v = x[:, :-1], v[:, :-1]
-    goal, kept, spare, heard = goal[:, 1:], kept[:, 1:], spare[:, 1:], heard[:, 1:]
-    total = (v**2 / 2 + 250 * (x - goal) ** 2 + kept + spare - heard[::-1]).sum(axis=0)
+    goal, stored, spare, received = goal[:, 1:], stored[:, 1:], spare[:, 1:], received[:, 1:]
+    total = (v**2 / 2 + 250 * (x - goal) ** 2 + stored + spare - received[::-1]).sum(axis=0)
     assert total[0] <= 2 * energy + 1e-12
     assert np.diff(total).max() <= 1e-15 + 1e-13 * total[0]
     assert np.ptp(x) > 1e-3
-    assert (kept >= 0).all()
+    assert (stored >= 0).all()
     assert (np.diff(spare) >= 0).all()
 
 
 def test_set_position_modulation_with_energy_enough_is_a_spring_and_damper() -> None:
     """A million joules are never used up: then the goal is what is heard, and the law is linear."""
 
-    def law(_: int, x: Sequence[tuple[Any, Any]], heard: Packets, memory: Sequence[Any]) -> Any:
-        return [500 * mean(heard, 0)], memory, []
+    def law(_: int, x: Sequence[tuple[Any, Any]], received: Packets, memory: Sequence[Any]) -> Any:
+        return [500 * mean(received, 0)], memory, []
 
     text = replaced(
         COPIES.replace("haptic, link", "haptic, damping: 6 N*s/m, link"),
@@ -182,7 +182,7 @@ def test_set_position_modulation_with_energy_enough_is_a_spring_and_damper() -> 
 
 # ---- send on change ----
 
-RECKONED = scene("two-users-dead-reckoning")
+RECKONED = topology("two-users-dead-reckoning")
 
 
 @pytest.mark.few(3)
@@ -191,14 +191,14 @@ RECKONED = scene("two-users-dead-reckoning")
 def test_dead_reckoning_is_its_law(delay: int, threshold: float) -> None:
     """The hearer knows when a packet was sent: it goes on from there by its age at each tick."""
 
-    def law(_: int, x: Sequence[tuple[Any, Any]], heard: Packets, memory: Sequence[Any]) -> Any:
+    def law(_: int, x: Sequence[tuple[Any, Any]], received: Packets, memory: Sequence[Any]) -> Any:
         course, told, packets = memory
         by_then = course + TICK * told
         if packets and abs(x[1][0] - by_then) < threshold:
             course = by_then
         else:
             course, told, packets = *x[1], packets + 1
-        ((_, _, line, speed, age),) = heard.values()
+        ((_, _, line, speed, age),) = received.values()
         ahead = line + age * speed
         pull = 200 * (x[1][0] - ahead) + 5 * (x[1][1] - speed)
         push = contact(x)
@@ -218,7 +218,7 @@ def test_dead_reckoning_is_its_law(delay: int, threshold: float) -> None:
 
 # ---- god-object ----
 
-ROUGH, PLACE = scene("god-object"), "table.stuck"
+ROUGH, LOCATION = topology("god-object"), "table.stuck"
 
 
 @pytest.mark.parametrize("sideways", [0.0, 0.8, -0.99, 1.3, -2.0])
@@ -229,7 +229,9 @@ def test_a_god_object_sticks_within_its_cone_and_slides_beyond(sideways: float) 
     """
     text = replaced(ROUGH, ("force: [0.8 N, -2 N]", f"force: [{sideways} N, -2 N]"))
     run = run_of(text, "2 s", "*")
-    x, y, v, stuck = (run[f"user[1].{one}"] for one in ("device.x[1]", "device.x[2]", "device.v[1]", PLACE))
+    x, y, v, stuck = (
+        run[f"user[1].{one}"] for one in ("device.x[1]", "device.x[2]", "device.v[1]", LOCATION)
+    )
     assert y[-1] == pytest.approx(-2 / 1000, abs=1e-9)
     if abs(sideways) < 0.5 * 2:
         assert x[-1] - stuck[-1] == pytest.approx(sideways / 1000, abs=1e-9)
@@ -241,7 +243,7 @@ def test_a_god_object_sticks_within_its_cone_and_slides_beyond(sideways: float) 
 
 # ---- a motor's limit ----
 
-LIMITED = replaced(scene("limited-motor"), ("type: RampForce", "type: ConstantForce"), (", rise: 1 s", ""))
+LIMITED = replaced(topology("limited-motor"), ("type: RampForce", "type: ConstantForce"), (", rise: 1 s", ""))
 
 
 @pytest.mark.whole

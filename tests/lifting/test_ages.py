@@ -28,7 +28,7 @@ Motion = Sequence[tuple[Any, Any]]
 
 PART = """\
 component: Aged
-about: A force between copies that knows how old what it heard is.
+description: A force between copies that knows how old what it heard is.
 connectors: {object: Flange}
 sends: {x: sample(object.x), v: sample(der(object.x))}
 parameters:
@@ -44,7 +44,7 @@ equations:
 """
 
 
-SCENE = """\
+TOPOLOGY = """\
 topology: aged
 clocks: {haptic: 1 ms, network: 4 ms}
 peers:
@@ -59,24 +59,24 @@ links: {lan: {clock: network, delay: DELAY}}
 Law = Callable[[Motion, Packets], Any]
 
 
-def dead(x: Motion, heard: Packets) -> Any:
+def dead(x: Motion, received: Packets) -> Any:
     """Return the force to where the others are by now."""
-    return 300 * (x[0][0] - sum(one[0] + one[2] * one[1] for one in heard.values()) / len(heard))
+    return 300 * (x[0][0] - sum(one[0] + one[2] * one[1] for one in received.values()) / len(received))
 
 
-def each(x: Motion, heard: Packets) -> Any:
+def each(x: Motion, received: Packets) -> Any:
     """Return the force of springs to each other one, stiffer the older what is known of it is."""
-    return sum(300 * (x[0][0] - one[0]) * (1 + one[2] / 0.02) for one in heard.values())
+    return sum(300 * (x[0][0] - one[0]) * (1 + one[2] / 0.02) for one in received.values())
 
 
-def gain(x: Motion, heard: Packets) -> Any:
+def gain(x: Motion, received: Packets) -> Any:
     """Return the force of a spring that is softer the older what is heard is."""
-    return 300 / (1 + mean(heard, 2) / 0.02) * (x[0][0] - mean(heard, 0))
+    return 300 / (1 + mean(received, 2) / 0.02) * (x[0][0] - mean(received, 0))
 
 
-def total(x: Motion, heard: Packets) -> Any:
+def total(x: Motion, received: Packets) -> Any:
     """Return the force of a spring stiffer by the sum of ages."""
-    return 300 * sum(one[2] for one in heard.values()) / 0.02 * (x[0][0] - mean(heard, 0))
+    return 300 * sum(one[2] for one in received.values()) / 0.02 * (x[0][0] - mean(received, 0))
 
 
 LAWS: dict[str, Law] = {
@@ -91,13 +91,13 @@ LAWS: dict[str, Law] = {
 }
 
 
-def scene(force: str, delay: str, folder: Path, text: str = SCENE) -> Model:
+def topology(force: str, delay: str, folder: Path, text: str = TOPOLOGY) -> Model:
     return compiled(text.replace("DELAY", delay), library(folder, PART.replace("FORCE", force)))
 
 
 def by_hand(law: Law, late: int) -> ByHand:
-    def forces(_: int, x: Motion, heard: Packets, memory: Sequence[Any]) -> Any:
-        return [-law(x, heard)], memory, []
+    def forces(_: int, x: Motion, received: Packets, memory: Sequence[Any]) -> Any:
+        return [-law(x, received)], memory, []
 
     return ByHand([[(0.2, 5.0, 0.0)]] * 3, everybody(3), forces, told=0, ratio=4, late=late)
 
@@ -115,7 +115,7 @@ def same(system: Model, hand: ByHand, method: str = "auto") -> None:
 @pytest.mark.parametrize("late", [0, 1, 3, 4, 10])
 @pytest.mark.parametrize("force", LAWS)
 def test_a_coefficient_of_age_is_its_law_in_every_tick(force: str, late: int, tmp_path: Path) -> None:
-    same(scene(force, f"{late} ms", tmp_path), by_hand(LAWS[force], late))
+    same(topology(force, f"{late} ms", tmp_path), by_hand(LAWS[force], late))
 
 
 def positions(system: Model, *, jit: bool = False) -> Any:
@@ -128,14 +128,14 @@ def positions(system: Model, *, jit: bool = False) -> Any:
 @pytest.mark.parametrize("force", LAWS)
 def test_a_simulation_is_the_law_played(force: str, late: int, tmp_path: Path) -> None:
     """Before the first packet is there start values are heard, sent at time 0: at rest, so are all."""
-    found = positions(scene(force, f"{late} ms", tmp_path))
+    found = positions(topology(force, f"{late} ms", tmp_path))
     law, ticks = LAWS[force], 0
 
-    def forces(i: int, x: Motion, heard: Packets, memory: Sequence[Any]) -> Any:
+    def forces(i: int, x: Motion, received: Packets, memory: Sequence[Any]) -> Any:
         # By hand, what was there before time 0 has ages of its own: of what was never sent it is the time.
         nonlocal ticks
         now, ticks = ticks // 3 * 1e-3, ticks + 1
-        return [-law(x, {j: [*one[:-1], min(one[-1], now)] for j, one in heard.items()})], memory, []
+        return [-law(x, {j: [*one[:-1], min(one[-1], now)] for j, one in received.items()})], memory, []
 
     hand = ByHand([[(0.2, 5.0, 0.0)]] * 3, everybody(3), forces, told=0, ratio=4, late=late)
     expected = played(hand, [[(0.001, 0.0)], [(-0.001, 0.0)], [(-0.001, 0.0)]], [[], [], []], len(found))
@@ -154,8 +154,8 @@ BEFORE = {
 @pytest.mark.parametrize("late", [0, 1, 3, 10])
 @pytest.mark.parametrize("force", BEFORE)
 def test_what_was_heard_before_is_its_law(force: str, late: int, tmp_path: Path) -> None:
-    def law(i: int, x: Motion, heard: Packets, memory: Sequence[Any]) -> Any:
-        now, others = x[0][0], [one[0] for one in heard.values()]
+    def law(i: int, x: Motion, received: Packets, memory: Sequence[Any]) -> Any:
+        now, others = x[0][0], [one[0] for one in received.values()]
         if BEFORE[force] is None:
             pull = 2 * now - sum(2 * old - new for old, new in zip(memory, others, strict=True))
         else:
@@ -163,7 +163,7 @@ def test_what_was_heard_before_is_its_law(force: str, late: int, tmp_path: Path)
         return [-300 * pull], others, []
 
     hand = ByHand([[(0.2, 5.0, 0.0)]] * 3, everybody(3), law, told=0, memory=2, ratio=4, late=late)
-    system = scene(force, f"{late} ms", tmp_path)
+    system = topology(force, f"{late} ms", tmp_path)
     same(system, hand)
     starts = [0.001, -0.001, -0.001]
     memories = [[starts[j] for j in others] for others in everybody(3)]
@@ -188,7 +188,7 @@ def test_a_constant_velocity_is_predicted_whatever_the_network_does(
     network: str, jit: bool, tmp_path: Path
 ) -> None:
     """x + v a is where a sender is by now, for packets of any age a and the start values of time 0."""
-    text = SCENE.replace("delay: DELAY", f"delay: 10 ms, {network}").replace(
+    text = TOPOLOGY.replace("delay: DELAY", f"delay: 10 ms, {network}").replace(
         "damping: 5 N*s/m", "damping: 0 N*s/m"
     )
     text = text.replace("cube.x: 1 mm", "cube.v: 0.3 m/s").replace("cube.x: -1 mm", "cube.v: -0.2 m/s")
@@ -211,12 +211,12 @@ experiment: {duration: 50 ms}
 
 
 def test_ages_that_differ_from_sender_to_sender_are_played_and_not_analysed(tmp_path: Path) -> None:
-    text = SCENE.replace("delay: DELAY", "delay: 3 ms, delays: {left: {right: 7 ms}}")
-    system = scene("k*(y - mean(others.x + age(others.x)*others.v))", "", tmp_path, text)
+    text = TOPOLOGY.replace("delay: DELAY", "delay: 3 ms, delays: {left: {right: 7 ms}}")
+    system = topology("k*(y - mean(others.x + age(others.x)*others.v))", "", tmp_path, text)
     with pytest.raises(ApcError) as refused:
         apc.analyze(system)
     assert str(refused.value).splitlines()[0] == (
-        "scene.yaml: E811 the age of what peers of left and right hear over lan differs from sender to "
+        "topology.yaml: E811 the age of what peers of left and right hear over lan differs from sender to "
         "sender (lan.delay, lan.delays.left.right): that is not analysed; a simulation plays it. "
         "Write: apc simulate"
     )
@@ -239,9 +239,9 @@ def test_a_file_whose_ages_differ_compiles_and_is_simulated(
 
 def test_another_order_of_events_has_its_own_ages(tmp_path: Path) -> None:
     """A tick that misses the packet that arrives with it hears one a period older, as if it were later."""
-    found = apc.conventions(scene(next(iter(LAWS)), "4 ms", tmp_path))
+    found = apc.event_order(topology(next(iter(LAWS)), "4 ms", tmp_path))
     late = by_hand(dead, 4)
     default, missed = (one.spectral_radius for one in found.outcomes[:2])
     assert default == pytest.approx(magnitudes(late)[1], abs=1e-9)
-    slightly_later = apc.analyze(scene(next(iter(LAWS)), "4.001 ms", tmp_path))
+    slightly_later = apc.analyze(topology(next(iter(LAWS)), "4.001 ms", tmp_path))
     assert missed == pytest.approx(slightly_later.spectral_radius, abs=1e-9)

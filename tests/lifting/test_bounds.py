@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from apc.frame.radius import FLOATS, RADII, radius_of, value_of, with_radius
+from apc.frame.interval_arithmetic import FLOATS, MIDPOINT_RADIUS, error_radius, value_of, with_error_radius
 
 
 def _fractions(matrix: Any) -> Any:
@@ -27,7 +27,7 @@ def _wild(random: np.random.Generator, *shape: int) -> Any:
 
 def _within(found: Any, true: Any) -> bool:
     off = np.abs(_fractions(value_of(found)) - true)
-    return bool((off <= _fractions(radius_of(found))).all())
+    return bool((off <= _fractions(error_radius(found))).all())
 
 
 OPERATIONS: dict[str, Callable[[Any], tuple[Any, Any]]] = {
@@ -41,14 +41,14 @@ OPERATIONS: dict[str, Callable[[Any], tuple[Any, Any]]] = {
 @pytest.mark.parametrize("seed", range(8))
 def test_the_true_one_of_all_that_lie_within_the_radii_lies_within(name: str, seed: int) -> None:
     random = np.random.default_rng(seed)
-    computed, (n, m, k) = OPERATIONS[name](RADII)
+    computed, (n, m, k) = OPERATIONS[name](MIDPOINT_RADIUS)
     exactly = np.dot if name == "product" else OPERATIONS[name](FLOATS)[0]
     a, b = _wild(random, n, m), _wild(random, m, k) if k else _wild(random, n, m)
-    off_a, off_b = (np.abs(one) * random.choice([0.0, 1e-15, 1e-3]) for one in (a, b))
-    found = computed(with_radius(a, off_a), with_radius(b, off_b))
+    error_bound_a, error_bound_b = (np.abs(one) * random.choice([0.0, 1e-15, 1e-3]) for one in (a, b))
+    found = computed(with_error_radius(a, error_bound_a), with_error_radius(b, error_bound_b))
     for corner in ((0, 0), (1, 1), (-1, 1), (1, -1)):
         moved = [
             _fractions(one) + sign * _fractions(off)
-            for one, off, sign in zip((a, b), (off_a, off_b), corner, strict=True)
+            for one, off, sign in zip((a, b), (error_bound_a, error_bound_b), corner, strict=True)
         ]
         assert _within(found, exactly(*moved))

@@ -10,8 +10,8 @@ import casadi
 import numpy as np
 import pytest
 
-from apc.compiler import plain
-from apc.frame.exact import ROWS, evaluate_exact
+from apc.compiler import expression_data
+from apc.frame.exact_arithmetic import ROWS, evaluate_exact
 
 PAIRS = {
     *("add", "sub", "mul", "div", "pow", "constpow", "fmin", "fmax", "atan2"),
@@ -24,25 +24,25 @@ def _function(build: Any, size: int = 2) -> casadi.Function:
     return casadi.Function("f", [x], [build(x)])
 
 
-@pytest.mark.parametrize("word", sorted(plain._CODES))
+@pytest.mark.parametrize("word", sorted(expression_data._CODES))
 def test_every_operation_is_the_same_in_every_kind_of_number(word: str) -> None:
     """In rationals, and in rows with a complex step, what CasADi gives and differentiates."""
     symbols = casadi.vertsplit(casadi.SX.sym("x", 2 if word in PAIRS else 1))
-    value = plain.symbolic(word)(*symbols)
+    value = expression_data.symbolic(word)(*symbols)
     slope = casadi.jtimes(value, casadi.vertcat(*symbols), casadi.SX([1.0, -2.0][: len(symbols)]))
     f = casadi.Function("f", [casadi.vertcat(*symbols)], [value, slope])
     for point in ([0.75, 0.125], [0.25, 0.5], [0.5, 0.5], [0.0, 0.25]):
         given = point[: len(symbols)]
-        wanted, derivative = (float(one) for one in f(given))
-        if math.isfinite(wanted):
+        requested, derivative = (float(one) for one in f(given))
+        if math.isfinite(requested):
             direct = casadi.Function("f", symbols, [value])
             [[exact]] = evaluate_exact(direct, [[Fraction(one)] for one in given])
-            assert float(exact) == pytest.approx(wanted, rel=1e-15)
+            assert float(exact) == pytest.approx(requested, rel=1e-15)
         steps = [np.array([one + 1e-60j * along]) for one, along in zip(given, (1, -2), strict=False)]
         with np.errstate(all="ignore"):
             found = ROWS[word](*steps)
-        if math.isfinite(wanted):
-            assert np.real(found)[0] == pytest.approx(wanted, rel=1e-15)
+        if math.isfinite(requested):
+            assert np.real(found)[0] == pytest.approx(requested, rel=1e-15)
         else:
             assert not np.isfinite(found)[0]
         corner = (word in ("fmin", "fmax") and given[0] == given[1]) or (word == "fabs" and given[0] == 0)

@@ -11,18 +11,20 @@ import pytest
 from apc.benchmark.truth import spectral_truth as of_balls
 from apc.compiler.compiled import Model
 from apc.compiler.pipeline import compile_topology
-from apc.eigen.balls import precision
-from tests.bench.random_scenes import run
-from tests.bruteforce import Scene, as_ball, frame_matrix
+from apc.eigen.ball_arithmetic import precision
+from tests.bench.random_topologies import run
+from tests.bruteforce import TopologySource, as_ball, frame_matrix
 from tests.fifty_digits.truth import Truth, spectral_truth
 from tests.sites import MS, paper
-from tests.topologies import SCENES
+from tests.topologies import TOPOLOGIES
 
 
-def _radius(scene: Scene, rigid: int) -> flint.arb:
-    """Return the radius by the brute force of the tests, which knows the scene and no compiled function."""
+def _radius(topology: TopologySource, rigid: int) -> flint.arb:
+    """Return the radius by the brute force of the tests, which knows the topology and no compiled
+    function.
+    """
     with precision(600):
-        rows = frame_matrix(scene, number=as_ball, exp=lambda value: value.exp())
+        rows = frame_matrix(topology, number=as_ball, exp=lambda value: value.exp())
         values = flint.acb_mat([[flint.acb(e.mid()) for e in row] for row in rows]).eig(algorithm="approx")
         values.sort(key=lambda value: float(abs(value - 1).mid()))
         return max(abs(value).mid() for value in values[rigid:])
@@ -31,7 +33,7 @@ def _radius(scene: Scene, rigid: int) -> flint.arb:
 @pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["ring-of-eight", "star-lecture", "mixed-clocks", "experiment-mesh"][::-1])
 def test_what_bench_compares_with_is_the_truth_of_the_independent_engine(name: str) -> None:
-    system = compile_topology(SCENES / f"{name}.yaml")
+    system = compile_topology(TOPOLOGIES / f"{name}.yaml")
     found = of_balls(system)
     assert found.digits[:45] == _truth(system).digits[:45]
 
@@ -55,11 +57,11 @@ def _truth(system: Model) -> Truth:
     ],
 )
 def test_fifty_digits_are_those_of_the_brute_force(values: dict[str, Any]) -> None:
-    scene = {"kt": 300.0, **values}
-    found = _truth(paper(**scene))
+    topology = {"kt": 300.0, **values}
+    found = _truth(paper(**topology))
     assert found.rigid == 1
     with precision(600):
-        assert float(abs(found.radius - _radius(Scene(**scene), 1))) < 1e-50
+        assert float(abs(found.radius - _radius(TopologySource(**topology), 1))) < 1e-50
 
 
 @pytest.mark.few(1)
@@ -67,5 +69,5 @@ def test_fifty_digits_are_those_of_the_brute_force(values: dict[str, Any]) -> No
 def test_no_bound_fails_and_no_verdict_is_wrong(seed: int) -> None:
     tally = run(4, seed=seed, draws=4)
     assert tally.wrong == []
-    assert tally.scenes + tally.refused == 4
+    assert tally.topologies + tally.refused == 4
     assert tally.tightest <= 1

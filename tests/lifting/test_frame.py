@@ -1,7 +1,8 @@
-"""One frame as a map, of any scene: the text, compiled and lifted, against N full peers stepped one by one.
+"""One frame as a map, of any topology: the text, compiled and lifted, against N full peers stepped one by
+one.
 
 `bruteforce` propagates the peers event by event with none of the code that is judged. What an instant means
-(section 3 of the design) is among the examples. `python -m tests.fuzz --scenes 1000` tries more of them.
+(section 3 of the design) is among the examples. `python -m tests.fuzz --topologies 1000` tries more of them.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from hypothesis import strategies as st
 from apc.analysis.analysis import analyze, lifted_groups
 from apc.compiler.errors import ApcError
 from apc.eigen.modes import dense, split
-from tests.bruteforce import Scene, common_period, frame_matrix
+from tests.bruteforce import TopologySource, common_period, frame_matrix
 from tests.sites import MS, alone, paper
 from tests.topologies import compiled
 from tests.truths import text_of
@@ -25,8 +26,8 @@ MOST_TICKS = 24  # a frame, so that stepping stays quick
 
 
 @st.composite
-def scenes(draw: st.DrawFn) -> Scene:
-    """Draw a scene whose frame holds at most `MOST_TICKS` ticks: users, gains, periods, phases, delays."""
+def topologies(draw: st.DrawFn) -> TopologySource:
+    """Draw a topology whose frame holds at most `MOST_TICKS` ticks: users, gains, periods, phases, delays."""
     periods = st.builds(Fraction, st.integers(1, 6), st.sampled_from([1, 1, 1, 2, 3]))
     haptic = draw(periods)
     network = draw(
@@ -37,7 +38,7 @@ def scenes(draw: st.DrawFn) -> Scene:
     delays = st.sampled_from([Fraction(tenths, 10) for tenths in (0, 4, 10, 10, 15, 20)])
     masses = draw(st.lists(st.sampled_from([0.1, 0.2, 0.15]), min_size=2, max_size=5))
     stiffness = draw(st.integers(0, 20)) * 100.0
-    return Scene(
+    return TopologySource(
         draw(st.sampled_from(["mean", "sum"])),
         len(masses),
         draw(st.integers(0, 10)) * 50.0,
@@ -55,10 +56,10 @@ def scenes(draw: st.DrawFn) -> Scene:
     )
 
 
-def at(comp: float, comm: float, phase: float = 0, first: float = 0, own: bool = False) -> Scene:
-    """Return a scene of the convention: delays and phases in ms, ticks of 2 ms, packets of 8 ms."""
+def at(comp: float, comm: float, phase: float = 0, first: float = 0, own: bool = False) -> TopologySource:
+    """Return a topology of the convention: delays and phases in ms, ticks of 2 ms, packets of 8 ms."""
     times = [Fraction(str(one)) * MS for one in (comp, comm, phase, first)]
-    return Scene(
+    return TopologySource(
         "mean",
         2,
         700.0,
@@ -72,22 +73,22 @@ def at(comp: float, comm: float, phase: float = 0, first: float = 0, own: bool =
     )
 
 
-def check(scene: Scene) -> None:
-    """Compare the split and the dense spectrum of a scene's text with that of peers stepped one by one."""
-    groups, exchange = lifted_groups(compiled(text_of(scene)))
+def check(topology: TopologySource) -> None:
+    """Compare the split and the dense spectrum of a topology's text with that of peers stepped one by one."""
+    groups, exchange = lifted_groups(compiled(text_of(topology)))
     systems = split(groups, exchange)
     modes = np.concatenate([np.repeat(np.linalg.eigvals(one.matrix), one.multiplicity) for one in systems])
     whole = np.linalg.eigvals(dense(groups, exchange).matrix)
-    expected = np.linalg.eigvals(np.array(frame_matrix(scene)))
+    expected = np.linalg.eigvals(np.array(frame_matrix(topology)))
     largest = max(1.0, float(np.abs(expected).max()))
     for found in (modes, whole):
         # The sums of their powers are smooth where eigenvalues scatter.
         for power in range(1, 7):
             one, other = ((values / largest) ** power for values in (found, expected))
             bound = 1e-9 * max(1.0, float(np.abs(other).sum()))
-            assert abs(one.sum() - other.sum()) < bound, f"trace of power {power}: {scene}"
+            assert abs(one.sum() - other.sum()) < bound, f"trace of power {power}: {topology}"
         apart = abs(np.abs(found).max() - np.abs(expected).max())
-        assert apart < 1e-6 * largest, f"the largest differ by {apart}: {scene}"
+        assert apart < 1e-6 * largest, f"the largest differ by {apart}: {topology}"
 
 
 QUIET = [HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.data_too_large]
@@ -96,7 +97,7 @@ QUIET = [HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.data_too
 # Everything at once; a packet that arrives exactly at a tick, just after, between two; delays within a tick's
 # interval, two of one force, of several periods; phases.
 @settings(max_examples=25, derandomize=True, suppress_health_check=QUIET)
-@given(scenes())
+@given(topologies())
 @example(at(0, 0))
 @example(at(2, 8))
 @example(at(0, 4))
@@ -108,12 +109,12 @@ QUIET = [HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.data_too
 @example(at(1, 5, 0.5, 3))
 @example(at(1, 9.5, 0.5, 3, own=True))
 @example(at(0.375, 2.625, 0.125, 0.625))
-def test_any_scene_has_the_spectrum_of_its_peers_stepped_one_by_one(scene: Scene) -> None:
-    check(scene)
+def test_any_topology_has_the_spectrum_of_its_peers_stepped_one_by_one(topology: TopologySource) -> None:
+    check(topology)
 
 
-def check_scenes(count: int) -> None:
-    """Check that many random scenes; raises AssertionError with the smallest one that differs."""
+def check_topologies(count: int) -> None:
+    """Check that many random topologies; raises AssertionError with the smallest one that differs."""
 
     @settings(
         max_examples=count,
@@ -122,9 +123,9 @@ def check_scenes(count: int) -> None:
         suppress_health_check=QUIET,
         phases=[Phase.generate, Phase.shrink],
     )
-    @given(scenes())
-    def run(scene: Scene) -> None:
-        check(scene)
+    @given(topologies())
+    def run(topology: TopologySource) -> None:
+        check(topology)
 
     run()
 

@@ -15,7 +15,7 @@ from apc.eigen.modes import split
 from apc.eigen.spectrum import angles_in_frame
 from tests.language import own
 from tests.sites import paper
-from tests.topologies import OSCILLATOR, SCENES, compiled, library
+from tests.topologies import OSCILLATOR, TOPOLOGIES, compiled, library
 
 
 def numbers(hertz: float, ratio: float) -> dict[str, str]:
@@ -66,7 +66,7 @@ def test_what_is_computed_from_itself_alone_turns_from_tick_to_tick(tmp_path: Pa
     """It is −0.9 times what it was at each of ten ticks of a frame: five turns."""
     law = own.component("s = -0.9*previous(s)", "flange.f = hold(s + 0*K*sample(flange.x))", variables="s=N:")
     slow = "  slow: {type: SampledSpringDamper, a: device, b: ground, stiffness: 1 N/m, clock: late}\n"
-    text = own.scene(law).replace("clocks: {", f"couplers:\n{slow}clocks: {{late: 10 ms, ")
+    text = own.topology(law).replace("clocks: {", f"couplers:\n{slow}clocks: {{late: 10 ms, ")
     flips = next(one for one in analyze(compiled(text, library(tmp_path, law))).modes if one.magnitude < 0.5)
     assert flips.magnitude == pytest.approx(0.9**10, rel=1e-9)
     assert flips.frequency_hz == pytest.approx(500, rel=1e-9)
@@ -75,7 +75,7 @@ def test_what_is_computed_from_itself_alone_turns_from_tick_to_tick(tmp_path: Pa
 @pytest.mark.parametrize(("name", "count"), [("three-users-mesh", 3), ("planar-users", 2)])
 def test_a_certified_real_negative_eigenvalue_keeps_its_frequency_and_damping(name: str, count: int) -> None:
     """λ = −|λ| is e^{sT} with Im s T = π: half a turn in a frame of 8 ms, 62.5 Hz. In a plane λ is double."""
-    modes = analyze(apc.compile(SCENES / f"{name}.yaml"), certify=True).modes
+    modes = analyze(apc.compile(TOPOLOGIES / f"{name}.yaml"), certify=True).modes
     negative = [mode for mode in modes if abs(mode.eigenvalue.imag) < 1e-99 and mode.eigenvalue.real < -1e-6]
     assert len(negative) == count
     for mode in negative:
@@ -85,7 +85,7 @@ def test_a_certified_real_negative_eigenvalue_keeps_its_frequency_and_damping(na
 
 
 def test_what_a_mode_turns_hangs_on_no_phase_of_its_vector() -> None:
-    for system in split(*lifted_groups(apc.compile(SCENES / "two-users-reported.yaml"))):
+    for system in split(*lifted_groups(apc.compile(TOPOLOGIES / "two-users-reported.yaml"))):
         values, vectors = np.linalg.eig(system.matrix.astype(complex))
         values.imag[np.abs(values.imag) < 1e-12] = 0.0
         shares = np.abs(vectors * np.linalg.pinv(vectors).T)

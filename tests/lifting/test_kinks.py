@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import apc
-from apc.analysis.sides import sides
+from apc.analysis.one_sided_slopes import sides
 from apc.compiler.errors import ApcError
-from apc.frame.instance import prepare
+from apc.frame.numeric_model import prepare
 from tests.language.own import component
 from tests.topologies import compiled, library, told
 
@@ -133,7 +133,7 @@ def test_passive_hands_meet_the_whole_wall() -> None:
             f"couplers: {{it: {{type: VirtualWall, flange: device, damping: {damping} N*s/m, clock: tick,"
             " stiffness: 0 N/m}}\n"
         )
-        assert apc.passive_hands(compiled(text)).stable is passive
+        assert apc.absolute_stability(compiled(text)).stable is passive
 
 
 def test_a_force_that_jumps_has_no_linearization(tmp_path: Path) -> None:
@@ -141,8 +141,8 @@ def test_a_force_that_jumps_has_no_linearization(tmp_path: Path) -> None:
         (line,) = told(apc.analyze, model(tmp_path, force))
         assert "E808" in line
         assert "jumps" in line
-        beside = apc.analyze(model(tmp_path, force, x="1 mm"))
-        assert beside.spectral_radius == pytest.approx(radius(0), abs=1e-12)
+        alongside = apc.analyze(model(tmp_path, force, x="1 mm"))
+        assert alongside.spectral_radius == pytest.approx(radius(0), abs=1e-12)
 
 
 def test_many_kinks_are_combined_or_refused_by_name(tmp_path: Path) -> None:
@@ -277,7 +277,7 @@ def test_where_a_path_crosses_the_kink_no_mean_slope_is_used(tmp_path: Path) -> 
 
 def test_what_has_no_side_is_refused_elsewhere(tmp_path: Path) -> None:
     with pytest.raises(ApcError, match="E808"):
-        apc.feel(model(tmp_path, f"max(0, K*{X})", ", K: 100 N/m"), [5.0])
+        apc.transparency(model(tmp_path, f"max(0, K*{X})", ", K: 100 N/m"), [5.0])
 
 
 def test_a_kink_inside_a_nonlinear_loop_is_refused_and_beside_it_is_not(tmp_path: Path) -> None:
@@ -354,10 +354,10 @@ def test_a_critical_delay_is_that_of_the_worse_side() -> None:
         motion = np.eye(2)
         for length, force in ((late, 5), (PERIOD - late, 4)):  # of tick k − 3, then of tick k − 2
             e = math.exp(-damping / mass * length)
-            way = (1 - e) * mass / damping
-            part = np.array([[1.0, way], [0.0, e]])
+            coupling_term = (1 - e) * mass / damping
+            part = np.array([[1.0, coupling_term], [0.0, e]])
             step[:2] = part @ step[:2]
-            step[:2, force] -= np.array([(length - way) / damping, (1 - e) / damping])
+            step[:2, force] -= np.array([(length - coupling_term) / damping, (1 - e) / damping])
             motion = part @ motion
         step[:2, :2] = motion
         return float(abs(np.linalg.eigvals(step)).max())

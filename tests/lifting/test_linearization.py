@@ -1,4 +1,4 @@
-"""Where a scene is not linear it is linearized where it starts, pair by pair, and says so."""
+"""Where a topology is not linear it is linearized where it starts, pair by pair, and says so."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from apc.analysis.analysis import analyze, lifted_groups
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.eigen.modes import dense, split
-from tests.bruteforce import Scene, frame_matrix
+from tests.bruteforce import TopologySource, frame_matrix
 from tests.pairing import apart, arcs_of
 from tests.sites import edged, paper
 
@@ -34,8 +34,8 @@ def _cubic_pairs(starts: list[float], cubic: float) -> dict[tuple[int, int], flo
 def test_an_edge_function_is_linearized_pair_by_pair(operator: str, graph: str, starts: list[float]) -> None:
     arcs = None if graph == "complete" else {(i, j): weight for i, j, weight in arcs_of(graph, 4)}
     system = edged(operator, starts, cubic=2e5, weights=arcs, **GAINS)
-    scene = Scene(operator, 4, weights=arcs, pairs=_cubic_pairs(starts, 2e5), **GAINS)
-    expected = np.linalg.eigvals(np.array(frame_matrix(scene)))
+    topology = TopologySource(operator, 4, weights=arcs, pairs=_cubic_pairs(starts, 2e5), **GAINS)
+    expected = np.linalg.eigvals(np.array(frame_matrix(topology)))
     assert apart(_split(system), expected) < 1e-11
     whole = np.linalg.eigvals(dense(*lifted_groups(system)).matrix)
     assert apart(whole, expected) < 1e-11

@@ -14,16 +14,16 @@ from apc.__main__ import run
 from apc.compiler.compiled import Model, counts_peers
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
-from apc.frame.names import ParameterRef, find, is_named
 from apc.frame.overrides import Override, apply, parse_override
+from apc.frame.parameter_names import ParameterRef, find, is_named
 from apc.frame.parameters import resolve
-from apc.vary.many import analyze_many
-from apc.vary.margins import margins
-from tests.topologies import AVERAGE, MESH, SCENES, compiled, library, replaced
+from apc.parameter_studies.batch_analysis import analyze_many
+from apc.parameter_studies.margins import margins
+from tests.topologies import AVERAGE, MESH, TOPOLOGIES, compiled, library, replaced
 
 
 def _value(system: Model, name: str, group: int = 0) -> float:
-    return float(resolve(system).parameters[group][0, system.kinds[0].parameters.index(name)])
+    return float(resolve(system).parameters[group][0, system.peer_types[0].parameters.index(name)])
 
 
 def _column(system: Model, name: str) -> list[float]:
@@ -31,7 +31,7 @@ def _column(system: Model, name: str) -> list[float]:
     numbers = resolve(system)
     return [
         float(value)
-        for value in numbers.parameters[0][numbers.rows[0], system.kinds[0].parameters.index(name)]
+        for value in numbers.parameters[0][numbers.rows[0], system.peer_types[0].parameters.index(name)]
     ]
 
 
@@ -56,8 +56,8 @@ def test_an_override_replaces_a_column(name: str) -> None:
     system = compiled(replaced(AVERAGE, ("{count: 3}", "{set: {device.mass: [0.1 kg, 0.2 kg, 0.1 kg]}}")))
     changed = apply(system, [parse_override(system, f"{name}=0.5 kg")])
     assert _column(changed, "device.mass") == [0.5, 0.5, 0.5]
-    kept = apply(system, [parse_override(system, "contact.stiffness=5 N/m")])
-    assert _column(kept, "device.mass") == [0.1, 0.2, 0.1]
+    stored = apply(system, [parse_override(system, "contact.stiffness=5 N/m")])
+    assert _column(stored, "device.mass") == [0.1, 0.2, 0.1]
 
 
 THIRDS = """\
@@ -84,9 +84,9 @@ def test_a_time_that_depends_on_a_third_stays_the_very_tick(setting: str) -> Non
 
 
 @pytest.mark.few(4)
-@pytest.mark.parametrize("scene", sorted(path.name for path in SCENES.glob("*.yaml")))
-def test_setting_a_number_to_what_it_is_changes_nothing(scene: str) -> None:
-    system = compile_topology(SCENES / scene)
+@pytest.mark.parametrize("topology", sorted(path.name for path in TOPOLOGIES.glob("*.yaml")))
+def test_setting_a_number_to_what_it_is_changes_nothing(topology: str) -> None:
+    system = compile_topology(TOPOLOGIES / topology)
     before = resolve(system)
     for row in apc.parameters(system).rows:
         if row.follows or row.fixed or row.low != row.high or math.isnan(row.low):
@@ -134,11 +134,13 @@ def test_what_a_group_sets_of_a_part_reaches_the_parts_inside(
     system = compiled(NESTED, library(tmp_path, OUTER))
     changed = apply(system, [parse_override(system, text) for text in settings])
     numbers = resolve(changed)
-    kinds = [changed.kinds[group.kind] for group in changed.groups]
-    rows = zip(kinds, numbers.parameters, strict=True)
-    assert [row[0, kind.parameters.index("o.inner.stiffness")] for kind, row in rows] == list(stiffness)
-    assert [numbers.timings[kind.holds[0].delay] * 1000 for kind in kinds] == list(delays)
-    assert [kind.holds[0].clock for kind in kinds] == ["haptic", "slow"]
+    peer_types = [changed.peer_types[group.peer_type] for group in changed.groups]
+    rows = zip(peer_types, numbers.parameters, strict=True)
+    assert [row[0, peer_type.parameters.index("o.inner.stiffness")] for peer_type, row in rows] == list(
+        stiffness
+    )
+    assert [numbers.timings[peer_type.holds[0].delay] * 1000 for peer_type in peer_types] == list(delays)
+    assert [peer_type.holds[0].clock for peer_type in peer_types] == ["haptic", "slow"]
 
 
 def test_what_depends_on_a_column_is_worked_out_peer_by_peer(tmp_path: Path) -> None:
@@ -158,11 +160,12 @@ def test_what_depends_on_a_column_is_worked_out_peer_by_peer(tmp_path: Path) -> 
 def test_what_is_set_for_all_groups_says_what_each_of_them_has(capsys: pytest.CaptureFixture[str]) -> None:
     """The star's teacher holds on with 400 N/m of its own, its students with the part's 100 N/m."""
     told = (
-        "arm.stiffness is one value for all groups here; the scene has 400 N/m at teacher, 100 N/m at student"
+        "arm.stiffness is one value for all groups here; the topology has 400 N/m at teacher, 100 N/m "
+        "at student"
     )
-    star = compile_topology(SCENES / "star-lecture.yaml")
-    assert told in analyze_many(star, {"arm.stiffness": [100.0, 400.0]}).left_out
-    assert run(["analyze", str(SCENES / "star-lecture.yaml"), "--set", "arm.stiffness=100 N/m"]) == 0
+    star = compile_topology(TOPOLOGIES / "star-lecture.yaml")
+    assert told in analyze_many(star, {"arm.stiffness": [100.0, 400.0]}).limitations
+    assert run(["analyze", str(TOPOLOGIES / "star-lecture.yaml"), "--set", "arm.stiffness=100 N/m"]) == 0
     assert capsys.readouterr().err == f"note: {told}\n"
 
 

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from apc.analysis.paper import analyze_paper, paper_route
+from apc.analysis.paper_method import analyze_paper, paper_method
 from tests.sites import paper
 from tests.topologies import AVERAGE, MESH, compiled, replaced, told
 
 
 def test_the_shapes_are_the_papers() -> None:
     for text in (AVERAGE, MESH):
-        route = paper_route(compiled(text))
+        route = paper_method(compiled(text))
         assert (route.a.shape, route.b.shape, route.c.shape) == ((12, 12), (12, 9), (18, 12))
         assert (route.a_d.shape, route.b_d.shape) == ((96, 96), (96, 51))
         assert (route.c_d.shape, route.d_d.shape, route.f_d.shape) == ((102, 96), (102, 51), (51, 102))
@@ -28,7 +28,7 @@ def test_the_shapes_are_the_papers() -> None:
 
 
 def test_rows_and_columns_are_named() -> None:
-    route = paper_route(compiled(AVERAGE))
+    route = paper_method(compiled(AVERAGE))
     assert route.b.columns == (
         *(f"user[{i}].{part}" for i in (1, 2, 3) for part in ("contact.f", "coordination.f own")),
         *(f"user[{i}].coordination.f received" for i in (1, 2, 3)),
@@ -48,7 +48,7 @@ def test_the_feedback_is_eqs_3_10_and_11_with_b_t_in_its_place() -> None:
         ("stiffness: 1000 N/m", "stiffness: 1000 N/m, damping: 3 N*s/m"),
         ("stiffness: 500 N/m", "stiffness: 500 N/m, damping: 2 N*s/m"),
     )
-    f = paper_route(compiled(damped)).f_d.values
+    f = paper_method(compiled(damped)).f_d.values
     for tick in range(8):
         first = f[6 * tick : 6 * tick + 2, 12 * tick : 12 * tick + 4]
         assert first.tolist() == [[1000.0, 3.0, -1000.0, -3.0], [0.0, 0.0, 500.0, 2.0]]
@@ -75,14 +75,14 @@ def test_at_the_boundary_it_says_that_its_matrix_is_not_proved() -> None:
         ("count: 3", "count: 90", "more than 1,800 rows"),
     ],
 )
-def test_a_scene_of_another_form_is_told_what_is_missing(old: str, new: str, missing: str) -> None:
-    [message] = told(paper_route, compiled(AVERAGE.replace(old, new)))
+def test_a_topology_of_another_form_is_told_what_is_missing(old: str, new: str, missing: str) -> None:
+    [message] = told(paper_method, compiled(AVERAGE.replace(old, new)))
     assert missing in message
 
 
 def test_the_stacked_matrices_do_what_the_ticks_of_a_frame_do_one_by_one() -> None:
     """Whatever the state and the forces, A_D x + B_D u holds the states after each tick in order."""
-    route = paper_route(compiled(AVERAGE))
+    route = paper_method(compiled(AVERAGE))
     step = expm(np.block([[route.a.values, route.b.values], [np.zeros((9, 21))]]) * 0.001)[:12]
     generator = np.random.default_rng(3)
     x, fast, slow = generator.normal(size=12), generator.normal(size=(8, 6)), generator.normal(size=3)

@@ -37,10 +37,10 @@ def test_a_wall_behind_an_encoder_is_the_wall_without_it() -> None:
     plain, behind = wall(), wall(ENCODER)
     assert apc.analyze(behind).spectral_radius == pytest.approx(apc.analyze(plain).spectral_radius, abs=1e-14)
     for stiffness, passive in (("990 N/m", True), ("1010 N/m", False)):  # b > K T/2, b = 0.5, T = 1 ms
-        found = apc.passive_hands(wall(ENCODER, stiffness=stiffness))
+        found = apc.absolute_stability(wall(ENCODER, stiffness=stiffness))
         assert found.stable is passive
         assert found.linearized
-    (line,) = [text for text in apc.analyze(behind).left_out if "encoder" in text]
+    (line,) = [text for text in apc.analyze(behind).limitations if "encoder" in text]
     assert "measured.x = flange.x" in line
     assert "apc simulate" in line
 
@@ -52,8 +52,8 @@ def test_dry_friction_is_no_viscous_damping() -> None:
     assert apc.analyze(rubbing).spectral_radius == pytest.approx(
         apc.analyze(damped).spectral_radius, abs=1e-14
     )
-    assert apc.passive_hands(wall(FRICTION, stiffness="1590 N/m")).stable is True  # 2 b/T, b = 0.8 N·s/m
-    assert apc.passive_hands(wall(FRICTION, stiffness="1610 N/m")).stable is False
+    assert apc.absolute_stability(wall(FRICTION, stiffness="1590 N/m")).stable is True  # 2 b/T, b = 0.8 N·s/m
+    assert apc.absolute_stability(wall(FRICTION, stiffness="1610 N/m")).stable is False
 
 
 @pytest.mark.parametrize("hands", ["clamped", "held", "StylusArmForward"])
@@ -106,4 +106,4 @@ def test_an_equation_that_is_flat_and_has_no_replacement_is_named(tmp_path: Path
         more="\n  own: {type: Own, flange: device, clock: haptic}",
     )
     found = apc.analyze(compiled(topology, library(tmp_path, text)))
-    assert any("own.f is constant between jumps" in line for line in found.left_out)
+    assert any("own.f is constant between jumps" in line for line in found.limitations)

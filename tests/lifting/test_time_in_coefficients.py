@@ -1,4 +1,4 @@
-"""Scenes whose coefficients change with time are refused by name; forces that do move no eigenvalue."""
+"""Topologies whose coefficients change with time are refused by name; forces that do move no eigenvalue."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from apc import analyze, critical
 from apc.compiler.errors import ApcError
 from tests.topologies import compiled, library
 
-SCENE = """\
+TOPOLOGY = """\
 topology: timed
 clocks: {haptic: 1 ms}
 peers: {user: {count: 2}}
@@ -22,7 +22,7 @@ links: {lan: {clock: haptic, delay: 2 ms}}
 
 PART = """\
 component: Timed
-about: A spring of one's own making.
+description: A spring of one's own making.
 connectors: {{object: Flange}}
 sends: {{x: sample(object.x), v: sample(der(object.x)), t: time}}
 parameters:
@@ -74,10 +74,10 @@ def _text(changes: dict[str, str]) -> str:
 
 @pytest.mark.parametrize("place", VARYING)
 def test_a_coefficient_that_changes_with_time_is_refused_by_name(place: str, tmp_path: Path) -> None:
-    system = compiled(SCENE, library(tmp_path, _text(VARYING[place])))
-    for asked in (analyze, lambda scene: critical(scene, "w.k")):
-        with pytest.raises(ApcError, match=r"scene\.yaml: E810 the equation of .* changes with time"):
-            asked(system)
+    system = compiled(TOPOLOGY, library(tmp_path, _text(VARYING[place])))
+    for requested in (analyze, lambda topology: critical(topology, "w.k")):
+        with pytest.raises(ApcError, match=r"topology\.yaml: E810 the equation of .* changes with time"):
+            requested(system)
 
 
 @pytest.mark.parametrize("place", CONSTANT)
@@ -85,8 +85,8 @@ def test_a_force_that_changes_with_time_moves_no_eigenvalue(place: str, tmp_path
     plain, pushed = tmp_path / "plain", tmp_path / "pushed"
     plain.mkdir()
     pushed.mkdir()
-    own = analyze(compiled(SCENE, library(plain, _text({"f": "k*y*3/2"} if place == "a setting" else {}))))
-    found = analyze(compiled(SCENE, library(pushed, _text(CONSTANT[place]))))
+    own = analyze(compiled(TOPOLOGY, library(plain, _text({"f": "k*y*3/2"} if place == "a setting" else {}))))
+    found = analyze(compiled(TOPOLOGY, library(pushed, _text(CONSTANT[place]))))
     assert not found.linearized
     assert abs(found.spectral_radius - own.spectral_radius) <= (
         found.spectral_radius_error + own.spectral_radius_error
@@ -95,17 +95,17 @@ def test_a_force_that_changes_with_time_moves_no_eigenvalue(place: str, tmp_path
 
 def test_a_contact_that_a_push_decides_about_is_linearized_and_says_so(tmp_path: Path) -> None:
     changes = {"f": "max(k*y + k*L*sin(time/T), 0*k*L)"}
-    found = analyze(compiled(SCENE, library(tmp_path, _text(changes))))
+    found = analyze(compiled(TOPOLOGY, library(tmp_path, _text(changes))))
     assert found.linearized
     first, second, _, third, *_ = str(found).splitlines()
     assert first == f"timed: {found.verdict}, linearized at its start"
     assert second == "  the start is not at rest: 0.1 N acts on device; what happens is played: apc"
-    assert third.startswith("  left out: the scene is not linear, and this holds near its start values only:")
+    assert third.startswith("  left out: the topology is not linear, and this holds near its start values")
 
 
 def test_a_proof_of_a_linearization_says_of_what(tmp_path: Path) -> None:
     changes = {"f": "k*y + k*y*y*y/L/L"}
-    found = analyze(compiled(SCENE, library(tmp_path, _text(changes))), certify=True)
+    found = analyze(compiled(TOPOLOGY, library(tmp_path, _text(changes))), certify=True)
     assert str(found.proof).endswith(" bits, of the linearization")
 
 
@@ -121,4 +121,4 @@ JUMPING = {
 
 @pytest.mark.parametrize("place", JUMPING)
 def test_a_force_that_jumps_is_linearized_though_its_slopes_are_the_same(place: str, tmp_path: Path) -> None:
-    assert analyze(compiled(SCENE, library(tmp_path, _text(JUMPING[place])))).linearized
+    assert analyze(compiled(TOPOLOGY, library(tmp_path, _text(JUMPING[place])))).linearized

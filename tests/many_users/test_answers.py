@@ -13,9 +13,9 @@ import apc
 from apc.__main__ import run
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
-from apc.eigen.balls import precision
-from tests.bench.random_scenes import check, truth
-from tests.topologies import AVERAGE, MESH, SCENES, compiled, library, replaced
+from apc.eigen.ball_arithmetic import precision
+from tests.bench.random_topologies import check, truth
+from tests.topologies import AVERAGE, MESH, TOPOLOGIES, compiled, library, replaced
 
 
 def test_the_answer_is_plain_data() -> None:
@@ -23,7 +23,7 @@ def test_the_answer_is_plain_data() -> None:
     assert list(found) == [
         *("topology", "peers", "frame_s", "states_per_peer", "method", "verdict", "stable"),
         *("spectral_radius", "spectral_radius_error", "rigid_modes", "modes", "linearized", "notes", "proof"),
-        *("left_out", "translations", "rotations", "unfelt", "beyond", "sides"),
+        *("limitations", "translations", "rotations", "unobservable", "radius_excess", "sides"),
     ]
     assert (found["peers"], found["frame_s"], found["states_per_peer"]) == (3, 0.008, 8)
     first = found["modes"][0]
@@ -40,7 +40,7 @@ def test_peers_that_differ_only_at_the_start_are_equal_however_many() -> None:
 
 
 @pytest.fixture
-def said(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+def printed(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
     """Return what runs `apc analyze` and returns what it prints."""
 
     def analyze(path: Path, *words: str) -> str:
@@ -50,22 +50,22 @@ def said(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
     return analyze
 
 
-PAPER = SCENES / "three-users-average.yaml"
+PAPER = TOPOLOGIES / "three-users-average.yaml"
 
 
-def test_a_box_and_a_proof_stand_beside_the_answer(said: Callable[..., str]) -> None:
-    words = ("--certify", "--box", "contact.stiffness=±1%", "--conventions", "--json")
-    found = json.loads(said(PAPER, *words))
-    assert found["proof"].startswith("proved stable") and {"conventions", "box"} <= found.keys()
+def test_a_box_and_a_proof_stand_beside_the_answer(printed: Callable[..., str]) -> None:
+    words = ("--certify", "--box", "contact.stiffness=±1%", "--event-order", "--json")
+    found = json.loads(printed(PAPER, *words))
+    assert found["proof"].startswith("proved stable") and {"event_order", "box"} <= found.keys()
 
 
 def test_a_delay_of_a_thousand_frames_has_its_verdict_and_says_what_it_has_not(
-    said: Callable[..., str],
+    printed: Callable[..., str],
 ) -> None:
-    text = said(PAPER, "--set", "lan.delay=8 s")
-    assert apc.analyze(PAPER, set={"lan.delay": "8 s"}).verdict in text
+    text = printed(PAPER, "--set", "lan.delay=8 s")
+    assert apc.analyze(PAPER, params={"lan.delay": "8 s"}).verdict in text
     assert "what moves it most: not looked for: 3 peers make one system of 2,006" in text
-    assert "margins none: the scene is not stable as it is" in text
+    assert "margins none: the topology is not stable as it is" in text
     assert all(len(line) <= 80 for line in text.splitlines())
 
 
@@ -85,12 +85,12 @@ def test_a_delay_of_a_thousand_frames_has_its_verdict_and_says_what_it_has_not(
     ids=str,
 )
 def test_a_table_that_is_empty_says_why(
-    name: str, settings: dict[str, str], said: Callable[..., str]
+    name: str, settings: dict[str, str], printed: Callable[..., str]
 ) -> None:
-    path = SCENES / f"{name}.yaml"
+    path = TOPOLOGIES / f"{name}.yaml"
     known = {row.name for row in apc.parameters(path).rows}
     words = [word for one, value in settings.items() if one in known for word in ("--set", f"{one}={value}")]
-    found = json.loads(said(path, *words, "--json"))
+    found = json.loads(printed(path, *words, "--json"))
     for one in (found, found["network"]):
         if one:
             assert one["sensitivities"]["derivatives"] or one["sensitivities"]["note"]
@@ -101,7 +101,7 @@ def test_a_table_that_is_empty_says_why(
 
 
 def weighted(edges: str, text: str = MESH) -> str:
-    """Return a scene of three users who hear one another over weighted edges or arcs."""
+    """Return a topology of three users who hear one another over weighted edges or arcs."""
     return replaced(text, ("delay: 8 ms}", f"delay: 8 ms, graph: {{{edges}}}}}"))
 
 
@@ -126,7 +126,7 @@ def test_peers_that_weigh_one_another_move_together_freely(seed: int) -> None:
 def test_rows_of_weights_that_add_up_to_one_as_decimals_are_a_mean(tmp_path: Path) -> None:
     part = """\
 component: WeightedMean
-about: Pulls a copy to what the weights make of the others.
+description: Pulls a copy to what the weights make of the others.
 connectors: {object: Flange}
 sends: {x: sample(object.x)}
 parameters: {stiffness: {unit: N/m}, clock: clock, link: link}
@@ -171,7 +171,7 @@ def test_what_no_mean_can_be_of_is_refused(text: str, message: str) -> None:
 
 WHEEL = """\
 component: Wheel
-about: A mass that turns as well, its angle coupled to the others'.
+description: A mass that turns as well, its angle coupled to the others'.
 connectors: {a: Flange}
 parameters:
   mass: {unit: kg}
@@ -209,7 +209,7 @@ links: {lan: {clock: network, delay: 4 ms}}
 # What is kept follows what the others keep, and pulls nothing.
 KEPT = """\
 component: Kept
-about: Keeps what the others keep.
+description: Keeps what the others keep.
 connectors: {object: Flange}
 parameters: {lag: {unit: s, default: 1 s}, clock: clock, link: link}
 sends: {s: sample(s)}
@@ -227,10 +227,10 @@ def test_what_turns_freely_is_a_rotation_and_what_shifts_freely_a_translation(
 ) -> None:
     wheels: Model = compiled(WHEELS, library(tmp_path, WHEEL.replace("ANGLE", angle)))
     free = apc.analyze(wheels)
-    assert (free.translations, free.rotations, free.unfelt) == (2, 1, ())
+    assert (free.translations, free.rotations, free.unobservable) == (2, 1, ())
     assert "2 translations and 1 rotation left out" in str(free)
     assert "2 translations and 1 rotation are held back by nothing" in str(free)
-    held = apc.analyze(wheels, set={"wheel.stiffness": "300 N/m"})
+    held = apc.analyze(wheels, params={"wheel.stiffness": "300 N/m"})
     assert (held.verdict, held.translations, held.rotations) == ("stable up to a common rotation", 0, 1)
     assert "turned together" in str(held)
 
@@ -238,6 +238,6 @@ def test_what_turns_freely_is_a_rotation_and_what_shifts_freely_a_translation(
 def test_what_is_left_out_though_some_of_it_moves_in_modes_is_a_common_shift(tmp_path: Path) -> None:
     text = AVERAGE.replace("links:", "  kept: {type: Kept, object: cube, clock: haptic, link: lan}\nlinks:")
     found = apc.analyze(compiled(text, library(tmp_path, KEPT)))
-    assert found.unfelt == ("the common shift of kept.s, kept.s sent",)
+    assert found.unobservable == ("the common shift of kept.s, kept.s sent",)
     assert any(share[0].startswith("kept.s") for mode in found.modes for share in mode.participation)
     assert "the common shift of kept.s" in str(found)

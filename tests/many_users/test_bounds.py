@@ -16,7 +16,7 @@ from scipy.optimize import brentq
 
 import apc
 from apc.analysis.analysis import Analysis
-from tests.bruteforce import Scene, as_ball, frame_matrix
+from tests.bruteforce import TopologySource, as_ball, frame_matrix
 from tests.topologies import compiled
 from tests.truths import text_of
 
@@ -26,22 +26,22 @@ MS = Fraction(1, 1000)
 SCATTERED = 1e-30
 
 
-def analyze(scene: Scene, **asked: Any) -> Analysis:
-    return apc.analyze(compiled(text_of(scene)), **asked)
+def analyze(topology: TopologySource, **requested: Any) -> Analysis:
+    return apc.analyze(compiled(text_of(topology)), **requested)
 
 
-def truth_of(scene: Scene) -> list[flint.acb]:
+def truth_of(topology: TopologySource) -> list[flint.acb]:
     """Return the eigenvalues of the full map at 120 digits, of which four equal ones keep 30."""
     before, flint.ctx.dps = flint.ctx.dps, 120
     try:
-        rows = frame_matrix(scene, number=as_ball, exp=lambda value: value.exp())
+        rows = frame_matrix(topology, number=as_ball, exp=lambda value: value.exp())
         return flint.acb_mat([[flint.acb(e.mid()) for e in row] for row in rows]).eig(algorithm="approx")
     finally:
         flint.ctx.dps = before
 
 
 @st.composite
-def scenes(draw: st.DrawFn) -> dict[str, Any]:
+def topologies(draw: st.DrawFn) -> dict[str, Any]:
     """Draw gains and delays of two users, each of them exactly zero now and then."""
 
     def gain(largest: float) -> st.SearchStrategy[float]:
@@ -57,8 +57,8 @@ def scenes(draw: st.DrawFn) -> dict[str, Any]:
 
 def check(values: dict[str, Any]) -> Analysis:
     """Assert that truth is within every bound, and that no verdict contradicts it; return the analysis."""
-    scene = Scene(peers=2, **values)
-    found, truth = analyze(scene), truth_of(scene)
+    topology = TopologySource(peers=2, **values)
+    found, truth = analyze(topology), truth_of(topology)
     for mode in found.modes:
         place = flint.acb(mode.eigenvalue.real, mode.eigenvalue.imag)
         assert min(float(abs(place - value).mid()) for value in truth) <= mode.error + SCATTERED
@@ -77,7 +77,7 @@ QUEUE = {"operator": "mean", "kt": 0.05, "kc": 1.0, "bc": 2.0, "network": MS, "c
 
 @pytest.mark.whole
 @settings(max_examples=4, derandomize=True)
-@given(scenes())
+@given(topologies())
 @example({**QUEUE, "comm": 11 * MS})
 @example({"operator": "mean", "kt": 0.0, "kc": 1000.0, "bc": 2.0, "comm": 80 * MS})
 def test_the_truth_at_120_digits_is_within_the_bound_of_every_mode(values: dict[str, Any]) -> None:
@@ -87,10 +87,10 @@ def test_the_truth_at_120_digits_is_within_the_bound_of_every_mode(values: dict[
 @pytest.mark.parametrize("bt", [0.0, 1.0])
 def test_next_to_the_boundary_every_verdict_is_decided_and_right(bt: float) -> None:
     values = {"bt": bt, "bc": 2.0, "kc": 500.0, "comp": MS, "comm": 8 * MS}
-    system = compiled(text_of(Scene(peers=2, kt=1.0, **values)))  # type: ignore[arg-type] # numbers and times
+    system = compiled(text_of(TopologySource(peers=2, kt=1.0, **values)))  # type: ignore[arg-type] # numbers and times
 
     def beyond(kt: float) -> float:
-        return apc.analyze(system, set={"coordination.stiffness": f"{kt!r} N/m"}).spectral_radius - 1
+        return apc.analyze(system, params={"coordination.stiffness": f"{kt!r} N/m"}).spectral_radius - 1
 
     crossing = brentq(beyond, 1.0, 20000.0, xtol=1e-12)
     steps = (-1e-9, -1e-13, 0.0, 1e-13, 1e-9)
@@ -100,10 +100,10 @@ def test_next_to_the_boundary_every_verdict_is_decided_and_right(bt: float) -> N
 
 def test_as_many_digits_are_taken_as_decide() -> None:
     """At the last float below a boundary, 1 − ρ is 1e-16 or less: too near for floats, not for a proof."""
-    system = compiled(text_of(Scene()))
+    system = compiled(text_of(TopologySource()))
 
     def at(kt: float) -> Analysis:
-        return apc.analyze(system, set={"coordination.stiffness": f"{kt!r} N/m"})
+        return apc.analyze(system, params={"coordination.stiffness": f"{kt!r} N/m"})
 
     low, high = 1096.0, 1097.0
     while np.nextafter(low, high) < high:
@@ -119,13 +119,13 @@ def test_as_many_digits_are_taken_as_decide() -> None:
 @pytest.mark.parametrize(("operator", "viscosity"), [("mean", 2.3), ("sum", 4.6)])
 def test_a_slow_late_network_brakes_like_a_damper(operator: str, viscosity: float, comp: Fraction) -> None:
     """K_eff ((T_n − T_c)/2 + T_d) at low frequency: a copy so heavy that v decays as e^(−B t/m)."""
-    scene = Scene(operator, kt=200.0, kc=0.0, cube=1e5, cube_damping=0.0, comp=comp)
-    slow = next(mode for mode in analyze(scene).modes if mode.shape == "common")
+    topology = TopologySource(operator, kt=200.0, kc=0.0, cube=1e5, cube_damping=0.0, comp=comp)
+    slow = next(mode for mode in analyze(topology).modes if mode.family == "common")
     assert -1e5 * math.log(slow.magnitude) / 0.008 == pytest.approx(viscosity, rel=1e-4)
 
 
 def test_conjugates_of_a_real_matrix_are_exact_and_the_upper_one_is_first() -> None:
-    found = analyze(Scene(kt=800.0, bt=2.0, kc=1500.0, bc=2.0))
+    found = analyze(TopologySource(kt=800.0, bt=2.0, kc=1500.0, bc=2.0))
     pairs = [mode.eigenvalue for mode in found.modes if mode.eigenvalue.imag]
     assert pairs
     for upper, lower in zip(pairs[::2], pairs[1::2], strict=True):
@@ -134,7 +134,7 @@ def test_conjugates_of_a_real_matrix_are_exact_and_the_upper_one_is_first() -> N
 
 # ---- what nothing holds back ----
 
-LOOSE = Scene(device_damping=0.0, cube_damping=0.0)
+LOOSE = TopologySource(device_damping=0.0, cube_damping=0.0)
 
 
 @pytest.mark.few(5)
@@ -151,14 +151,14 @@ LOOSE = Scene(device_damping=0.0, cube_damping=0.0)
     ],
 )
 @pytest.mark.parametrize("operator", ["mean", "sum"])
-@pytest.mark.parametrize("alike", [True, False])
+@pytest.mark.parametrize("interchangeable", [True, False])
 def test_a_stiffness_of_exactly_zero_frees_what_it_held(
-    values: dict[str, float], rigid: int, operator: str, alike: bool
+    values: dict[str, float], rigid: int, operator: str, interchangeable: bool
 ) -> None:
-    users = () if alike else tuple({"device": mass} for mass in (0.1, 0.2, 0.15))
-    scene = Scene(operator, users=users, **values)  # type: ignore[arg-type] # numbers
-    methods = ["auto", "dense"] if alike or 1e-300 in values.values() else ["auto", "determinant"]
-    assert {analyze(scene, method=method).rigid_modes for method in methods} == {rigid}
+    users = () if interchangeable else tuple({"device": mass} for mass in (0.1, 0.2, 0.15))
+    topology = TopologySource(operator, users=users, **values)  # type: ignore[arg-type] # numbers
+    methods = ["auto", "dense"] if interchangeable or 1e-300 in values.values() else ["auto", "determinant"]
+    assert {analyze(topology, method=method).rigid_modes for method in methods} == {rigid}
 
 
 @pytest.mark.parametrize(
@@ -175,8 +175,8 @@ def test_a_stiffness_of_exactly_zero_frees_what_it_held(
 def test_undamped_peers_drift_as_far_as_nothing_brakes_them(
     values: dict[str, Any], verdict: str, rigid: int
 ) -> None:
-    for asked in ({}, {"certify": True}):
-        found = analyze(replace(LOOSE, **values), **asked)
+    for requested in ({}, {"certify": True}):
+        found = analyze(replace(LOOSE, **values), **requested)
         assert (found.verdict, found.rigid_modes) == (verdict, rigid)
     beginning = {"d": "proved to drift", "s": "proved stable", "u": "proved"}[verdict[0]]
     assert str(found.proof).startswith(beginning)

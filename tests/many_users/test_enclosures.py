@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from apc.eigen.balls import precision
-from apc.eigen.certify import root_discs
+from apc.eigen.ball_arithmetic import precision
+from apc.eigen.certification import root_discs
 from apc.eigen.enclosure import enclose_eigenvalues, enclose_stack, least_radius
 
 Floats = NDArray[Any]
@@ -30,8 +30,8 @@ def _enclosed(matrix: Floats, error: Floats) -> Told:
 
 def _stacked(matrix: Floats, error: Floats) -> Told:
     n = len(matrix)
-    beside = np.stack([matrix, np.diag(np.arange(n, dtype=np.float64))])
-    pairs, found = enclose_stack(beside, np.stack([error, np.zeros((n, n))]))
+    alongside = np.stack([matrix, np.diag(np.arange(n, dtype=np.float64))])
+    pairs, found = enclose_stack(alongside, np.stack([error, np.zeros((n, n))]))
     return pairs.values[0], found.errors[0], float(found.low[0]), float(found.high[0])
 
 
@@ -108,15 +108,17 @@ def _matrices(seed: int) -> list[tuple[str, Floats, Floats, list[Floats]]]:
 @pytest.mark.parametrize(
     "seed", [*range(3), *(pytest.param(k, marks=pytest.mark.whole) for k in range(3, 15))]
 )
-@pytest.mark.parametrize("way", WAYS)
-def test_every_matrix_within_the_error_has_its_eigenvalues_within_the_bounds(way: str, seed: int) -> None:
+@pytest.mark.parametrize("coupling_term", WAYS)
+def test_every_matrix_within_the_error_has_its_eigenvalues_within_the_bounds(
+    coupling_term: str, seed: int
+) -> None:
     told = 0
     for name, matrix, error, truths in _matrices(seed):
-        said = WAYS[way](matrix, error)
-        if said is None:
+        printed = WAYS[coupling_term](matrix, error)
+        if printed is None:
             continue
         told += 1
-        values, errors, low, high = said
+        values, errors, low, high = printed
         for true in truths:
             size = np.abs(true).max()
             assert low * (1 - 1e-15) <= size + 1e-11 * (name == "block"), name
@@ -157,11 +159,11 @@ def test_the_exact_eigenvalues_of_small_rational_matrices_are_within_every_bound
     roots = np.array([complex(root) / 64 for root, times in polynomial.complex_roots() for _ in range(times)])
     matrix = np.array(rows) / 64
     radius = np.abs(roots).max()
-    for name, way in WAYS.items():
-        said = way(matrix, np.zeros_like(matrix))
-        if said is None:
+    for name, coupling_term in WAYS.items():
+        printed = coupling_term(matrix, np.zeros_like(matrix))
+        if printed is None:
             continue
-        values, errors, low, high = said
+        values, errors, low, high = printed
         assert low * (1 - 1e-14) - 1e-20 <= radius <= high * (1 + 1e-14) + 1e-20, name
         for value, bound in zip(values, errors, strict=True):
             assert np.abs(roots - value).min() <= bound + 1e-14 * abs(value) + 1e-20, name
@@ -194,8 +196,8 @@ def test_what_stands_alone_is_as_sure_as_first_order_has_it(masses: int, count: 
 def test_two_that_hardly_differ_keep_their_common_disc() -> None:
     """Nothing tells a pair apart that the error mixes: each may be anywhere the pair may."""
     pair, mixed = np.diag([0.9, 0.9 + 1e-9, 0.5]), np.full((3, 3), 1e-9)
-    said = _enclosed(pair, mixed)
-    assert said is not None and said[1][:2].min() >= 1e-9
+    printed = _enclosed(pair, mixed)
+    assert printed is not None and printed[1][:2].min() >= 1e-9
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 import apc
 from apc.analysis.analysis import Analysis
 from apc.compiler.errors import ApcError
-from tests.bruteforce import Scene, frame_matrices, frame_matrix
+from tests.bruteforce import TopologySource, frame_matrices, frame_matrix
 from tests.pairing import apart, arcs_of
 from tests.topologies import AVERAGE, compiled, replaced
 from tests.truths import text_of
@@ -37,10 +37,10 @@ def pairs(first: dict[tuple[int, int], int]) -> dict[tuple[int, int], Fraction]:
     }
 
 
-def on(name: str, operator: str) -> Scene:
+def on(name: str, operator: str) -> TopologySource:
     """Return four equal peers on a graph; a sum is over the differences to those who are heard."""
     springs = {(i, j): 800.0 for i in range(4) for j in range(4)} if operator == "sum" else {}
-    return Scene(operator, 4, weights=weights(name, 4), pairs=springs, **GAINS)
+    return TopologySource(operator, 4, weights=weights(name, 4), pairs=springs, **GAINS)
 
 
 def listed(found: Analysis) -> NDArray[np.complex128]:
@@ -49,11 +49,11 @@ def listed(found: Analysis) -> NDArray[np.complex128]:
     return np.concatenate([*values, np.ones(found.rigid_modes)])
 
 
-# Scenes, how they are taken apart, and how far eigenvalues may be off: a defective one scatters by the root
-# of its rounding, four peers deep.
-SCENES: dict[str, tuple[Scene, str, float]] = {
-    **{f"mean of {n}": (Scene(peers=n, **GAINS), "modes", 1e-11) for n in (2, 3, 12)},
-    "sum of 8": (Scene("sum", 8, **{**GAINS, "kt": 100.0, "bt": 0.25}), "modes", 1e-11),
+# Topologies, how they are taken apart, and how far eigenvalues may be off: a defective one scatters by the
+# root of its rounding, four peers deep.
+TOPOLOGIES: dict[str, tuple[TopologySource, str, float]] = {
+    **{f"mean of {n}": (TopologySource(peers=n, **GAINS), "modes", 1e-11) for n in (2, 3, 12)},
+    "sum of 8": (TopologySource("sum", 8, **{**GAINS, "kt": 100.0, "bt": 0.25}), "modes", 1e-11),
     **{
         f"{operator} on {name}": (on(name, operator), "modes", 1e-10)
         for name, operator in (
@@ -63,50 +63,53 @@ SCENES: dict[str, tuple[Scene, str, float]] = {
     },
     # Nilpotent: no full set of eigenvectors.
     "one way": (on("one way", "sum"), "dense", 2e-3),
-    "all different": (Scene(users=masses(0.1, 0.2, 0.15), **GAINS), "modes", 1e-11),
+    "all different": (TopologySource(users=masses(0.1, 0.2, 0.15), **GAINS), "modes", 1e-11),
     "different on a ring": (
-        Scene(peers=4, weights=weights("ring", 4), users=masses(0.1, 0.2, 0.15, 0.3), **GAINS),
+        TopologySource(peers=4, weights=weights("ring", 4), users=masses(0.1, 0.2, 0.15, 0.3), **GAINS),
         *("dense", 1e-11),
     ),
     # Who hear the same two may change places.
     "two alike on a ring": (
-        Scene(peers=4, weights=weights("ring", 4), users=masses(0.1, 0.2, 0.1, 0.3), **GAINS),
+        TopologySource(peers=4, weights=weights("ring", 4), users=masses(0.1, 0.2, 0.1, 0.3), **GAINS),
         *("modes", 1e-11),
     ),
-    "two kinds of five": (Scene(peers=5, users=masses(0.1, 0.2, 0.1, 0.1, 0.2), **GAINS), *("modes", 1e-11)),
+    "two kinds of five": (
+        TopologySource(peers=5, users=masses(0.1, 0.2, 0.1, 0.1, 0.2), **GAINS),
+        *("modes", 1e-11),
+    ),
     "a star of which the middle differs": (
-        Scene(peers=6, weights=weights("star", 6), users=masses(0.25, *[0.1] * 5), **SOFT),
+        TopologySource(peers=6, weights=weights("star", 6), users=masses(0.25, *[0.1] * 5), **SOFT),
         *("modes", 1e-9),
     ),
     "forks at both ends of a path": (
-        Scene(
+        TopologySource(
             peers=6,
             weights={p: 1.0 for a, b in ((0, 2), (1, 2), (2, 3), (3, 4), (3, 5)) for p in ((a, b), (b, a))},
             **SOFT,
         ),
         *("modes", 1e-9),
     ),
-    "pairs of delays": (Scene(peers=4, late=pairs({(0, 1): 12, (1, 0): 3}), **SOFT), "modes", 1e-11),
+    "pairs of delays": (TopologySource(peers=4, late=pairs({(0, 1): 12, (1, 0): 3}), **SOFT), "modes", 1e-11),
     "pairs of delays in a sum": (
-        Scene("sum", 4, late=pairs({(0, 0): 0, (0, 1): 4}), **{**SOFT, "kt": 60.0}),
+        TopologySource("sum", 4, late=pairs({(0, 0): 0, (0, 1): 4}), **{**SOFT, "kt": 60.0}),
         *("modes", 1e-11),
     ),
     "pairs of delays on a ring": (
-        Scene(peers=4, late=pairs({(0, 1): 12, (1, 0): 3}), weights=weights("ring", 4), **SOFT),
+        TopologySource(peers=4, late=pairs({(0, 1): 12, (1, 0): 3}), weights=weights("ring", 4), **SOFT),
         *("dense", 1e-11),
     ),
 }
 
 
 @pytest.mark.few(10)
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", TOPOLOGIES)
 def test_the_modes_are_the_whole_spectrum_of_all_peers(name: str) -> None:
-    scene, method, off = SCENES[name]
-    expected = np.linalg.eigvals(np.array(frame_matrix(scene)))
-    found = apc.analyze(compiled(text_of(scene)))
+    topology, method, off = TOPOLOGIES[name]
+    expected = np.linalg.eigvals(np.array(frame_matrix(topology)))
+    found = apc.analyze(compiled(text_of(topology)))
     assert found.method == method
     assert apart(listed(found), expected) < off
-    assert apart(listed(apc.analyze(compiled(text_of(scene)), method="dense")), expected) < max(off, 1e-10)
+    assert apart(listed(apc.analyze(compiled(text_of(topology)), method="dense")), expected) < max(off, 1e-10)
 
 
 def test_groups_that_differ_in_nothing_that_moves_are_one() -> None:
@@ -114,30 +117,30 @@ def test_groups_that_differ_in_nothing_that_moves_are_one() -> None:
         AVERAGE, ("  user: {count: 3}", "  left: {count: 2, set: {device.x: 1 mm}}\n  right: {count: 1}")
     )
     one, other = apc.analyze(compiled(text)), apc.analyze(compiled(AVERAGE))
-    assert {mode.shape for mode in one.modes} == {"common", "difference"}
+    assert {mode.family for mode in one.modes} == {"common", "difference"}
     assert [mode.eigenvalue for mode in one.modes] == [mode.eigenvalue for mode in other.modes]
     column = replaced(AVERAGE, ("{count: 3}", "{set: {contact.damping: [0 N*s/m, -0 N*s/m, 1 N*s/m]}}"))
     assert {mode.multiplicity for mode in apc.analyze(compiled(column)).modes} == {1}
-    assert len({mode.shape for mode in apc.analyze(compiled(column)).modes}) == 2
+    assert len({mode.family for mode in apc.analyze(compiled(column)).modes}) == 2
 
 
 # ---- very many ----
 
 
-def radius_by_hand(heard: NDArray[np.float64], **values: Any) -> float:
+def radius_by_hand(received: NDArray[np.float64], **values: Any) -> float:
     """Return the largest eigenvalue but that of the common shift, of peers who hear so many times themselves.
 
     In a pair each hears the other: what one's own state and what the other's makes of one's next state.
     """
-    whole = frame_matrices(Scene(peers=2, **values), 1)[0]
+    whole = frame_matrices(TopologySource(peers=2, **values), 1)[0]
     n = len(whole) // 2
     own, other = whole[:n, :n], whole[:n, n:]
-    sizes = np.abs(np.linalg.eigvals(own + heard[:, None, None] * other))
+    sizes = np.abs(np.linalg.eigvals(own + received[:, None, None] * other))
     return float(np.sort(sizes[sizes < 1 - 1e-12] if sizes.max() < 1 + 1e-9 else sizes.ravel())[-1])
 
 
 def on_graph(peers: int, graph: str, **values: Any) -> str:
-    text = text_of(Scene(peers=peers, **values))
+    text = text_of(TopologySource(peers=peers, **values))
     return replaced(text, ("clock: network, delay", f"graph: {graph}, clock: network, delay"))
 
 
@@ -157,9 +160,11 @@ def test_very_many_alike_have_the_radius_of_all_their_modes(
 ) -> None:
     """Each hears the mean of its neighbours: cos(2πk/N) of itself; of all others: 1, or −1/(N − 1)."""
     angles = 2 * np.pi * np.arange(peers // 2 + 1 if graph == "ring" else 1) / peers
-    heard = np.cos(angles) if graph == "ring" else np.array([1.0, -1 / (peers - 1)])
+    received = np.cos(angles) if graph == "ring" else np.array([1.0, -1 / (peers - 1)])
     found = apc.analyze(compiled(on_graph(peers, graph, **values)))
-    assert abs(found.spectral_radius - radius_by_hand(heard, **values)) <= 1e-11 + found.spectral_radius_error
+    assert (
+        abs(found.spectral_radius - radius_by_hand(received, **values)) <= 1e-11 + found.spectral_radius_error
+    )
     assert found.rigid_modes == 1 and found.stable == (found.spectral_radius < 1)
     assert found.spectral_radius_error < 1e-11
 
@@ -208,12 +213,12 @@ def test_determinants_of_many_who_differ_have_the_modes_of_the_whole_matrix(text
 @pytest.mark.parametrize(
     ("text", "method"),
     [
-        (text_of(Scene(peers=1_000_000)), "modes"),
+        (text_of(TopologySource(peers=1_000_000)), "modes"),
         (different(3), "modes"),
         (different(60), "determinant"),
         (on_graph(1000, "ring"), "modes"),
-        (text_of(Scene(comm=8000 * MS)), "determinant"),
-        (text_of(Scene(comm=80 * MS)), "modes"),
+        (text_of(TopologySource(comm=8000 * MS)), "determinant"),
+        (text_of(TopologySource(comm=80 * MS)), "modes"),
     ],
     ids=["a million", "three", "sixty", "a ring", "8 s late", "80 ms late"],
 )
@@ -225,11 +230,15 @@ def test_the_method_is_chosen_by_what_differs(text: str, method: str) -> None:
     ("text", "method", "message"),
     [
         (
-            text_of(Scene(peers=200)),
+            text_of(TopologySource(peers=200)),
             "dense",
             "E804 200 peers make one system of 1,600 states; the matrix of one",
         ),
-        (different(3, "ring"), "modes", "E850 method modes can't serve this scene: all peers as one system"),
+        (
+            different(3, "ring"),
+            "modes",
+            "E850 method modes can't serve this topology: all peers as one system",
+        ),
         (different(60, "ring"), "determinant", "E850 method determinant .* hear all others over lan"),
     ],
 )

@@ -35,14 +35,14 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=40.0, help="of unchanged tests a mutant")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--reach", type=Path, help="file of who runs what: read, or written if missing")
-    asked = parser.parse_args()
-    drawn = draw(ROOT, asked.count, asked.seed, asked.within)
-    words = ["--whole"] if asked.whole else []
+    requested = parser.parse_args()
+    drawn = draw(ROOT, requested.count, requested.seed, requested.within)
+    words = ["--whole"] if requested.whole else []
     with tempfile.TemporaryDirectory() as folder:
         copies: queue.Queue[Path] = queue.Queue()
-        for place in range(asked.jobs):
+        for place in range(requested.jobs):
             copies.put(_copy(Path(folder) / str(place)))
-        reach = asked.reach or Path(folder) / "reach.json"
+        reach = requested.reach or Path(folder) / "reach.json"
         if not reach.exists():
             copy = copies.get()
             _run(copy, ["watched", str(copy), str(reach.resolve()), *words], limit=None)
@@ -50,7 +50,7 @@ def main() -> None:
         known = json.loads(reach.read_text(encoding="utf-8"))
 
         def tried(mutant: Mutant) -> str:
-            names, cost = _concerned(mutant, known, asked.seconds)
+            names, cost = _concerned(mutant, known, requested.seconds)
             if not names:
                 return "not reached"
             copy = copies.get()
@@ -59,7 +59,7 @@ def main() -> None:
             finally:
                 copies.put(copy)
 
-        with concurrent.futures.ThreadPoolExecutor(asked.jobs) as pool:
+        with concurrent.futures.ThreadPoolExecutor(requested.jobs) as pool:
             fates = []
             for mutant, fate in zip(drawn, pool.map(tried, drawn), strict=True):
                 fates.append(fate)
@@ -117,9 +117,9 @@ def _concerned(mutant: Mutant, known: dict[str, object], seconds: float) -> tupl
     there = lines.get(mutant.path, {})
     reached = set(there.get(str(mutant.line), ()))
     files = {tests[place].partition("::")[0] for place in reached}
-    beside = {place for place, name in enumerate(tests) if name.partition("::")[0] in files} - reached
+    alongside = {place for place, name in enumerate(tests) if name.partition("::")[0] in files} - reached
     names, cost = [], 0.0
-    for group in (reached, beside):
+    for group in (reached, alongside):
         for place in sorted(group, key=lambda place: durations[place]):
             if names and cost + durations[place] > seconds:
                 return names, cost

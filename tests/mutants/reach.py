@@ -72,8 +72,8 @@ def watched(root: Path, out: Path, words: list[str]) -> int:
             line: [number[name] for name in sorted(contexts) if name in number]
             for line, contexts in by_line.items()
         }
-    kept = {"tests": names, "durations": [watch.durations[name] for name in names], "lines": lines}
-    out.write_text(json.dumps(kept), encoding="utf-8")
+    stored = {"tests": names, "durations": [watch.durations[name] for name in names], "lines": lines}
+    out.write_text(json.dumps(stored), encoding="utf-8")
     return int(code)
 
 

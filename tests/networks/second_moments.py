@@ -1,6 +1,6 @@
-"""Second moments over a lossy network by brute force over all patterns of luck: none of `apc.moments`.
+"""Second moments over a lossy network by brute force over all patterns of luck: none of `apc.mean_square`.
 
-Takes: a scene of `bruteforce`, and how its packets get lost.
+Takes: a topology of `bruteforce`, and how its packets get lost.
 Gives: `Law`, `second_moment_radius`, `rms_error`.
 Guarantees: frames are stepped event by event for each pattern of packets; no symmetry is used, no jitter.
 
@@ -20,7 +20,7 @@ import scipy.linalg
 import scipy.sparse.linalg
 from numpy.typing import NDArray
 
-from tests.bruteforce import Luck, Scene, common_period, lossy_frame, ways_of
+from tests.bruteforce import Luck, TopologySource, common_period, lossy_frame, ways_of
 
 Floats = NDArray[np.float64]
 State = tuple[bool, bool]  # of a way: whether it is bad, and whether its last packet is missed
@@ -67,9 +67,9 @@ class Law:
         return [one for one in ((True, chance), (False, 1 - chance)) if one[1]]
 
 
-def arrivals_of(scene: Scene) -> int:
+def arrivals_of(topology: TopologySource) -> int:
     """Return how many packets of a way arrive in a frame."""
-    return int(common_period(scene.haptic, scene.network) / scene.network)
+    return int(common_period(topology.haptic, topology.network) / topology.network)
 
 
 class Lossy:
@@ -80,12 +80,12 @@ class Lossy:
     those are left out that no body follows from in that state of luck, and of motions what stands still.
     """
 
-    def __init__(self, scene: Scene, law: Law) -> None:
-        ways = ways_of(scene)
+    def __init__(self, topology: TopologySource, law: Law) -> None:
+        coupling_terms = ways_of(topology)
         states: dict[tuple[State, ...], int] = {}
         happens: dict[tuple[int, tuple[bool, ...], tuple[tuple[bool, ...], ...]], int] = {}
         moves = []
-        for joint in itertools.product([*law.moves(arrivals_of(scene))], repeat=len(ways)):
+        for joint in itertools.product([*law.moves(arrivals_of(topology))], repeat=len(coupling_terms)):
             before, after, chances, there = zip(*joint, strict=True)
             first, last = (states.setdefault(one, len(states)) for one in (before, after))
             key = (first, tuple(missed for _, missed in before), there)
@@ -97,20 +97,22 @@ class Lossy:
         made = {}
         for _, missed, there in happens:
             if (missed, there) not in made:
-                gone = [way for way, one in zip(ways, missed, strict=True) if one]
-                luck = Luck(dict(zip(ways, there, strict=True)), gone, law.zero)
-                made[missed, there] = lossy_frame(scene, luck)
+                gone = [
+                    coupling_term for coupling_term, one in zip(coupling_terms, missed, strict=True) if one
+                ]
+                noise = Luck(dict(zip(coupling_terms, there, strict=True)), gone, law.zero)
+                made[missed, there] = lossy_frame(topology, noise)
         moved = np.array([made[missed, there][0] for _, missed, there in happens])
         place = np.arange(moved.shape[1])
-        size = (len(place) - 2 * len(ways)) // scene.peers
-        bodies = (place % size < 4) & (place < scene.peers * size)
+        size = (len(place) - 2 * len(coupling_terms)) // topology.peers
+        bodies = (place % size < 4) & (place < topology.peers * size)
         reads = np.tile(bodies, (len(states), 1))
         for _ in place:
             for k, first in enumerate(self.before):
                 reads[first] |= moved[k][reads[self.shares[:, k] > 0].any(axis=0)].any(axis=0)
         read = place[reads.any(axis=0)]
         self.reads = reads[:, read, None] & reads[:, None, read]
-        self.cubes = np.searchsorted(read, size * np.arange(scene.peers) + 2)
+        self.cubes = np.searchsorted(read, size * np.arange(topology.peers) + 2)
         moved = moved[:, read][:, :, read]
         unit = np.eye(len(read))
         standing = scipy.linalg.null_space((moved - unit).reshape(-1, len(unit)), rcond=STANDING)
@@ -132,9 +134,9 @@ class Lossy:
         return np.asarray(np.tensordot(weighted, after, 1) * self.reads)
 
 
-def second_moment_radius(scene: Scene, law: Law) -> float:
+def second_moment_radius(topology: TopologySource, law: Law) -> float:
     """Return what second moments grow by in a frame, without motions that no luck moves."""
-    lossy = Lossy(scene, law)
+    lossy = Lossy(topology, law)
     shape = (len(lossy.shares), *lossy.apart.shape)
     start = np.broadcast_to(lossy.apart @ lossy.apart.T, shape)
 
@@ -148,14 +150,16 @@ def second_moment_radius(scene: Scene, law: Law) -> float:
     return float(np.abs(values).max())
 
 
-def rms_error(scene: Scene, law: Law) -> float:
+def rms_error(topology: TopologySource, law: Law) -> float:
     """Return the largest root mean square distance (m) of a cube from the mean of others as frames begin.
 
     Each device is pushed by a force of variance 1 N², drawn anew at every tick.
     """
-    lossy = Lossy(scene, law)
-    forms = np.zeros((scene.peers, len(lossy.apart)))
-    forms[:, lossy.cubes] = np.eye(scene.peers) * scene.peers / (scene.peers - 1) - 1 / (scene.peers - 1)
+    lossy = Lossy(topology, law)
+    forms = np.zeros((topology.peers, len(lossy.apart)))
+    forms[:, lossy.cubes] = np.eye(topology.peers) * topology.peers / (topology.peers - 1) - 1 / (
+        topology.peers - 1
+    )
     driven = lossy.driven()
     moments, before, found = driven, 0.0, 1.0
     while abs(found - before) > 1e-13 * found:

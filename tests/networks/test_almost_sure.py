@@ -7,16 +7,16 @@ import re
 
 import pytest
 
-from apc.frame.instance import prepare
-from apc.moments.almost_sure import TopLyapunovExponent, almost_sure
-from apc.unserved import NotSupportedError
-from tests.held_scenes import scene, system_of
-from tests.networks.test_loss import judged
+from apc.frame.numeric_model import prepare
+from apc.mean_square.lyapunov_exponent import TopLyapunovExponent, top_lyapunov_exponent
+from apc.not_supported import NotSupportedError
+from tests.held_topologies import system_of, topology
+from tests.networks.test_loss import decided
 
 
 def estimate(text: str) -> TopLyapunovExponent:
     system = system_of(text)
-    return almost_sure(system, prepare(system))
+    return top_lyapunov_exponent(system, prepare(system))
 
 
 # Of an independent program, for the paper's users at 10 % loss: peers, stiffness, exponent per frame and half
@@ -36,14 +36,14 @@ def estimate(text: str) -> TopLyapunovExponent:
 def test_exponents_are_those_of_the_reference(
     peers: int, stiffness: float, known: float, half: float
 ) -> None:
-    found = estimate(scene(peers, stiffness))
+    found = estimate(topology(peers, stiffness))
     low, high = found.interval
     assert low < found.exponent < high < low + 1e-4
     assert low - half <= known <= high + half
 
 
 def test_what_grows_in_mean_square_is_told_almost_surely_too() -> None:
-    found = judged(scene(3, 1300.0))
+    found = decided(topology(3, 1300.0))
     assert found.verdict == "unstable in mean square" and found.almost_sure is not None
     low, high = found.almost_sure.interval
     assert 0 < low < found.almost_sure.exponent < high < math.log(found.mean_square_radius or 0.0) / 2
@@ -52,13 +52,13 @@ def test_what_grows_in_mean_square_is_told_almost_surely_too() -> None:
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        (scene(3, 500.0, more=", jitter: 2 ms"), "lan has jitter"),
-        (scene(3, 500.0, more=", on_loss: zero"), "lan takes no difference where a packet is missed"),
-        (scene(1000, 500.0), "1,000 peers and their channels have 1,005,000 states"),
-        (scene(20, 500.0), "20 peers and their channels have 500 states, and 180 are the most"),
+        (topology(3, 500.0, more=", jitter: 2 ms"), "lan has jitter"),
+        (topology(3, 500.0, more=", on_loss: zero"), "lan takes no difference where a packet is missed"),
+        (topology(1000, 500.0), "1,000 peers and their channels have 1,005,000 states"),
+        (topology(20, 500.0), "20 peers and their channels have 500 states, and 180 are the most"),
     ],
 )
 def test_what_is_not_estimated_is_named(text: str, why: str) -> None:
     system = system_of(text)
     with pytest.raises(NotSupportedError, match=f"^{re.escape(why)}"):
-        almost_sure(system, prepare(system))
+        top_lyapunov_exponent(system, prepare(system))

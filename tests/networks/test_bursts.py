@@ -10,8 +10,8 @@ import re
 import pytest
 
 import apc
-from tests.held_scenes import scene, system_of
-from tests.networks.test_loss import STIFFNESS, judged, radius
+from tests.held_topologies import system_of, topology
+from tests.networks.test_loss import STIFFNESS, decided, radius
 from tests.topologies import replaced
 
 # Two peers: stiffness, share lost, packets a burst, radius under hold and zero.
@@ -40,7 +40,7 @@ def test_the_growth_of_second_moments_is_that_of_the_references(
     stiffness: float, share: float, packets: int, hold: float, zero: float
 ) -> None:
     for more, expected in (("", hold), (", on_loss: zero", zero)):
-        found = radius(scene(2, stiffness, loss=burst(share, packets), more=more))
+        found = radius(topology(2, stiffness, loss=burst(share, packets), more=more))
         # The references say 1e-8: two of their programs differ by 3e-10, of zero nothing is said.
         assert found == pytest.approx(expected, abs=1e-9)
 
@@ -57,7 +57,7 @@ def test_the_growth_of_second_moments_is_that_of_the_references(
 def test_of_many_peers_it_is_an_estimate_that_says_so(
     stiffness: float, packets: int, two: float, three: float
 ) -> None:
-    found = judged(scene(5, stiffness, loss=burst(0.01, packets)))
+    found = decided(topology(5, stiffness, loss=burst(0.01, packets)))
     assert not found.exact and found.error is not None
     assert found.verdict == f"probably {'un' if three > 1 else ''}stable in mean square"
     told = re.search(r"estimate: moments of at most 3 .* with 2 the radius is ([\d.]+)", found.notes[0])
@@ -75,20 +75,22 @@ def test_of_many_peers_it_is_an_estimate_that_says_so(
     ],
 )
 def test_a_crossing_claims_no_more_than_its_moments_do(loss: str, proof: str) -> None:
-    found = apc.critical(system_of(scene(2, 500.0, loss=loss)), STIFFNESS, lower="1100 N/m", upper="1500 N/m")
+    found = apc.critical(
+        system_of(topology(2, 500.0, loss=loss)), STIFFNESS, lower="1100 N/m", upper="1500 N/m"
+    )
     assert [str(one.proof) for one in found.crossings] == [proof]
 
 
 @pytest.mark.whole
 def test_how_soon_bursts_end_is_scanned_from_where_they_end() -> None:
-    found = apc.critical(system_of(scene(2, 500.0, loss="{p: 1 %, r: 10 %}")), "lan.loss.r")
+    found = apc.critical(system_of(topology(2, 500.0, loss="{p: 1 %, r: 10 %}")), "lan.loss.r")
     assert found.verdict is not None and found.verdict.stable and found.crossings == ()
 
 
 def over_two_links(loss: str, other: str) -> str:
     """Return two users who hear each other over a second link too, at other instants."""
     coupler = "{type: AveragePosition, object: cube, stiffness: 100 N/m, clock: haptic, link: wan}"
-    text = scene(2, 500.0, loss=loss)
+    text = topology(2, 500.0, loss=loss)
     text = replaced(text, ("  coordination:\n", f"  other: {coupler}\n  coordination:\n"))
     return f"{text}  wan: {{clock: network, delay: 12 ms, loss: {other}}}\n"
 
@@ -97,6 +99,6 @@ def test_links_whose_packets_are_due_at_different_instants_are_judged_together()
     """Bursts that end at once are losses one by one, which are judged in another way."""
     nearly = radius(over_two_links("{p: 10 %, r: 89.999999 %}", "5 %"))
     assert nearly == pytest.approx(radius(over_two_links("10 %", "5 %")), rel=1e-8)
-    found = judged(over_two_links("10 %, on_loss: zero", "5 %"))
+    found = decided(over_two_links("10 %, on_loss: zero", "5 %"))
     assert found.verdict == "not judged"
     assert "values that stand in beside packets of another link or delay" in found.notes[0]

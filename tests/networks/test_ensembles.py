@@ -1,4 +1,6 @@
-"""Many runs of one scene, each by a luck of its own: they are the runs they say, and what is told of them."""
+"""Many runs of one topology, each by a luck of its own: they are the runs they say, and what is told of
+them.
+"""
 
 from __future__ import annotations
 
@@ -13,14 +15,14 @@ import pytest
 import apc
 from apc.__main__ import run
 from apc.compiler.errors import ApcError
-from apc.simulation import ensemble
-from apc.simulation.ensemble import Ensemble, play_many, share_interval
-from apc.simulation.native import compiler
+from apc.simulation import monte_carlo
+from apc.simulation.c_compiler import compiler
+from apc.simulation.monte_carlo import Ensemble, share_interval, simulate_many
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare
-from apc.simulation.trajectory import play
+from apc.simulation.trajectory import run_simulation
 from tests.lossy import apart
-from tests.topologies import AVERAGE, SCENES, compiled, replaced
+from tests.topologies import AVERAGE, TOPOLOGIES, compiled, replaced
 
 SHAKY = apart(AVERAGE, "loss: {p: 10 %, r: 20 %}, jitter: 8 ms")
 
@@ -28,10 +30,10 @@ machine_code = pytest.mark.skipif(compiler() is None, reason="there is no C comp
 
 
 def runs(text: str, count: int = 6, seconds: str = "3", *, jit: bool = True, jobs: int = 1) -> Ensemble:
-    return play_many(compiled(text), Settings(Fraction(seconds), seed=3, jit=jit), runs=count, jobs=jobs)
+    return simulate_many(compiled(text), Settings(Fraction(seconds), seed=3, jit=jit), runs=count, jobs=jobs)
 
 
-def said(found: Ensemble) -> str:
+def printed(found: Ensemble) -> str:
     assert max(map(len, str(found).splitlines())) <= 80
     return " ".join(str(found).split())
 
@@ -54,7 +56,7 @@ ALL = apart(
 def test_a_run_does_not_depend_on_how_many_there_are_or_who_plays_it(
     text: str, part: int, jit: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ensemble, "PART", part)
+    monkeypatch.setattr(monte_carlo, "PART", part)
     few = runs(text, 4, "1/2", jit=jit).runs
     together = runs(text, 2 * part, "1/2", jit=jit, jobs=1 if jit else 2)
     shared = together.runs
@@ -67,7 +69,7 @@ def test_a_run_does_not_depend_on_how_many_there_are_or_who_plays_it(
     assert (of_all.low, of_all.high) == (min(settled), max(settled))
     assert of_all.mean == pytest.approx(np.mean(settled))
     assert of_all.standard_error == pytest.approx(np.std(settled, ddof=1) / math.sqrt(len(settled)))
-    alone, _ = play(prepare(compiled(text), Settings(Fraction(1, 2), seed=3, jit=jit)), [])
+    alone, _ = run_simulation(prepare(compiled(text), Settings(Fraction(1, 2), seed=3, jit=jit)), [])
     assert alone.largest_force is not None
     told = (few[0].verdict, few[0].settled, few[0].largest_force)
     assert told == (alone.verdict, alone.settled, alone.largest_force[1])
@@ -91,32 +93,32 @@ def test_runs_agree_with_the_judgedin_mean_square_and_take_the_time_of_its_growt
         assert found.mean_square is not None
         assert found.mean_square.verdict == verdict and found.agrees
     assert stable.calm == 6
-    assert "stable in mean square, and 6 of 6 runs decay or are at rest: they agree" in said(stable)
+    assert "stable in mean square, and 6 of 6 runs decay or are at rest: they agree" in printed(stable)
     told = stable.mean_square
     assert told is not None and told.settles_in is not None
     # After this time the root of a mean square is a twentieth of what it was.
-    judged = apc.judge_network(compiled(moved(1000)))
-    assert judged is not None and judged.mean_square_radius is not None
-    assert judged.mean_square_radius ** (told.settles_in / 0.008 / 2) == pytest.approx(0.05, rel=1e-9)
+    decided = apc.mean_square_stability(compiled(moved(1000)))
+    assert decided is not None and decided.mean_square_radius is not None
+    assert decided.mean_square_radius ** (told.settles_in / 0.008 / 2) == pytest.approx(0.05, rel=1e-9)
 
 
 @pytest.mark.whole
 def test_runs_that_are_about_something_else_than_a_verdict_say_so() -> None:
     short = runs(moved(1200), 2, "0.3")
-    assert short.agrees is False and "and the runs show how it begins" in said(short)
+    assert short.agrees is False and "and the runs show how it begins" in printed(short)
     hand = "hands:\n  hand: {type: SineForce, flange: device, force: 1 N, frequency: 3 Hz}\n"
     driven = runs(moved(500) + hand, 2, "1")
-    assert driven.agrees is False and "what moves the others is a force that goes on" in said(driven)
-    text = (SCENES / "experiment-average.yaml").read_text(encoding="utf-8")
+    assert driven.agrees is False and "what moves the others is a force that goes on" in printed(driven)
+    text = (TOPOLOGIES / "experiment-average.yaml").read_text(encoding="utf-8")
     pressed = runs(replaced(text, ("delay: 8 ms}", "delay: 8 ms, loss: 5 %}")), 2)
     assert pressed.mean_square is not None and pressed.mean_square.linearized and pressed.agrees is None
-    assert "that verdict is of small motions about the start" in said(pressed)
+    assert "that verdict is of small motions about the start" in printed(pressed)
     unjudged = runs(SHAKY, 2, "0.1")
     assert unjudged.agrees is None
-    assert "in mean square: not judged: jitter and bursts of lan together" in said(unjudged)
+    assert "in mean square: not judged: jitter and bursts of lan together" in printed(unjudged)
 
 
-def test_a_scene_without_chance_is_not_played_many_times() -> None:
+def test_a_topology_without_chance_is_not_played_many_times() -> None:
     with pytest.raises(ApcError, match="E894 nothing in three-users-average is left to chance"):
         runs(AVERAGE)
 
@@ -126,7 +128,7 @@ def test_the_command_prints_it_and_keeps_no_rows(
 ) -> None:
     """The seed is the experiment's, if none is given."""
     monkeypatch.chdir(tmp_path)
-    Path("scene.yaml").write_text(SHAKY + "experiment: {duration: 200 ms, seed: 5}\n", encoding="utf-8")
+    Path("topology.yaml").write_text(SHAKY + "experiment: {duration: 200 ms, seed: 5}\n", encoding="utf-8")
     assert run(["simulate", "--runs", "3", "--no-jit"]) == 0
     assert capsys.readouterr().out.startswith("three-users-average: 3 runs of 0.2 s, seed 5\n")
     assert run(["simulate", "--runs", "3", "--seed", "4", "--no-jit", "--json"]) == 0

@@ -6,12 +6,12 @@ import pytest
 
 import apc
 from apc.compiler.errors import ApcError
-from tests.held_scenes import scene, system_of
+from tests.held_topologies import system_of, topology
 from tests.networks.test_loss import radius
 
 
 def late(peers: int, stiffness: float, jitter: str, delay: str = "8 ms") -> str:
-    return scene(peers, stiffness, loss="0 %", more=f", jitter: {jitter}", delay=delay)
+    return topology(peers, stiffness, loss="0 %", more=f", jitter: {jitter}", delay=delay)
 
 
 @pytest.mark.few(3)
@@ -38,7 +38,7 @@ def test_within_a_tick_nobody_hears_the_difference() -> None:
 def test_a_jitter_is_no_range_of_a_box_and_another_number_is() -> None:
     system = system_of(late(3, 500.0, "2 ms"))
     with pytest.raises(ApcError, match=r"E831 lan\.jitter is a time"):
-        apc.prove_box(system, {"lan.jitter": "±1%"})
-    assert apc.prove_box(system, {"contact.stiffness": "±0.01%"}).stable
+        apc.robust_stability(system, {"lan.jitter": "±1%"})
+    assert apc.robust_stability(system, {"contact.stiffness": "±0.01%"}).stable
     with pytest.raises(ApcError, match=r"E625 lan\.jitter wants a time of 0 s or more"):
         apc.set_parameters(system, {"lan.jitter": "-1 ms"})

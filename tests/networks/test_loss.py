@@ -17,8 +17,8 @@ import apc
 from apc.__main__ import run
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
-from apc.moments.network_verdict import MeanSquareStability
-from tests.held_scenes import scene, system_of
+from apc.mean_square.mean_square_stability import MeanSquareStability
+from tests.held_topologies import system_of, topology
 from tests.lossy import unreliable
 from tests.topologies import AVERAGE, compiled, replaced
 
@@ -63,14 +63,14 @@ CRITICAL = (
 STIFFNESS = "coordination.stiffness"
 
 
-def judged(text: str, **asked: bool) -> MeanSquareStability:
-    found = apc.judge_network(system_of(text), **asked)
+def decided(text: str, **requested: bool) -> MeanSquareStability:
+    found = apc.mean_square_stability(system_of(text), **requested)
     assert found is not None
     return found
 
 
 def radius(text: str) -> float:
-    found = judged(text)
+    found = decided(text)
     assert found.mean_square_radius is not None and found.error is not None, found.notes
     assert found.exact and found.error < 1e-7
     assert found.stable is (found.mean_square_radius < 1)
@@ -78,12 +78,12 @@ def radius(text: str) -> float:
 
 
 @pytest.mark.few(3)
-@pytest.mark.parametrize(("peers", "kind", "stiffness", "hold", "zero", "digits"), INDEPENDENT)
+@pytest.mark.parametrize(("peers", "peer_type", "stiffness", "hold", "zero", "digits"), INDEPENDENT)
 def test_the_growth_of_second_moments_is_that_of_the_references(
-    peers: int, kind: str, stiffness: float, hold: float, zero: float, digits: float
+    peers: int, peer_type: str, stiffness: float, hold: float, zero: float, digits: float
 ) -> None:
     for more, expected in (("", hold), (ZERO, zero)):
-        found = radius(scene(peers, stiffness, coupler=kind, more=more))
+        found = radius(topology(peers, stiffness, coupler=peer_type, more=more))
         assert found == pytest.approx(expected, abs=max(digits, 1e-12))
 
 
@@ -92,8 +92,8 @@ def test_the_growth_of_second_moments_is_that_of_the_references(
 def test_where_a_reference_is_critical_the_radius_is_1(
     peers: int, mass: float, loss: float, on_loss: str, stiffness: float
 ) -> None:
-    text = scene(peers, stiffness, loss=f"{100 * loss!r} %", more=f", on_loss: {on_loss}")
-    found = judged(replaced(text, ("mass: 0.6 kg", f"mass: {mass * peers!r} kg")))
+    text = topology(peers, stiffness, loss=f"{100 * loss!r} %", more=f", on_loss: {on_loss}")
+    found = decided(replaced(text, ("mass: 0.6 kg", f"mass: {mass * peers!r} kg")))
     # d log radius/d stiffness is some 1e-4 m/N, and the reference is right to 1e-9 N/m or so.
     assert found.mean_square_radius == pytest.approx(1, abs=1e-11)
     assert found.error is not None and found.error < 1e-7
@@ -101,19 +101,19 @@ def test_where_a_reference_is_critical_the_radius_is_1(
 
 def by_critical(system: Model, near: float) -> tuple[float, float]:
     found = apc.critical(system, STIFFNESS, lower="900 N/m", upper="1600 N/m")
-    assert (found.criterion, found.left_out, found.stable_side) == ("mean-square", (), "below")
+    assert (found.criterion, found.limitations, found.stable_side) == ("mean-square", (), "below")
     assert found.value is not None and found.error is not None
     return found.value, found.error
 
 
 def by_margins(system: Model, near: float) -> tuple[float, float]:
-    from apc.frame.instance import prepare
-    from apc.vary.margins import Margins, network_margins
+    from apc.frame.numeric_model import prepare
+    from apc.parameter_studies.margins import Margins, network_margins
 
     found = network_margins(system, prepare(system), Margins((), ""))
     row = next(row for row in found.rows if row.parameter == STIFFNESS)
     assert row.value is not None and row.error is not None
-    assert row.factor == row.value / 500
+    assert row.gain_margin == row.value / 500
     return row.value, row.error
 
 
@@ -125,7 +125,7 @@ def by_sweep(system: Model, near: float) -> tuple[float, float]:
 
 def by_box(system: Model, near: float) -> tuple[float, float]:
     below, above = (
-        apc.prove_box(system, {STIFFNESS: f"{low!r} N/m:{high!r} N/m"})
+        apc.robust_stability(system, {STIFFNESS: f"{low!r} N/m:{high!r} N/m"})
         for low, high in ((near - 1, near - 0.01), (near - 1, near + 0.01))
     )
     assert (below.verdict, above.verdict) == ("stable in mean square", "unstable in mean square")
@@ -137,7 +137,7 @@ HOLD_10, ZERO_20 = ("loss: 10 %", 1143.224858916119), ("loss: 20 %, on_loss: zer
 
 @pytest.mark.few(2)
 @pytest.mark.parametrize(
-    ("way", "more", "stiffness"),
+    ("coupling_term", "more", "stiffness"),
     [
         (by_critical, *HOLD_10),
         (by_critical, *ZERO_20),
@@ -147,9 +147,9 @@ HOLD_10, ZERO_20 = ("loss: 10 %", 1143.224858916119), ("loss: 20 %, on_loss: zer
     ],
 )
 def test_every_way_to_ask_finds_the_stiffness_at_which_a_reference_is_critical(
-    way: Callable[[Model, float], tuple[float, float]], more: str, stiffness: float
+    coupling_term: Callable[[Model, float], tuple[float, float]], more: str, stiffness: float
 ) -> None:
-    value, error = way(compiled(unreliable(more)), stiffness)
+    value, error = coupling_term(compiled(unreliable(more)), stiffness)
     # The references' radii are known to 3e-10 and change by some 1.6e-4 a N/m.
     assert abs(value - stiffness) <= 2e-6 + error
     assert error < 0.011
@@ -163,13 +163,13 @@ def test_a_region_over_loss_ends_where_the_references_do() -> None:
     ends = dict(sorted(map(tuple, curve.points[[0, -1]].tolist())))
     # The references: 1096.4 N/m without losses, 1384 N/m at 40 %.
     assert [*ends.values()] == pytest.approx([1096.4108683656323, 1383.5619], rel=1e-6)
-    assert (found.criterion, curve.mode, found.left_out) == ("mean-square", "mean-square", ())
+    assert (found.criterion, curve.mode, found.limitations) == ("mean-square", "mean-square", ())
     assert found.contains(0.3, 1200.0) and not found.contains(0.05, 1200.0)
     assert str(found).splitlines()[1] == "  judged in mean square, over the network as it is"
 
 
 def test_loss_is_a_parameter_like_others() -> None:
-    """What is just stable at 10 % needs 10 %: losses let this scene be stiffer."""
+    """What is just stable at 10 % needs 10 %: losses let this topology be stiffer."""
     text = unreliable("loss: 5 %").replace("stiffness: 500 N/m", "stiffness: 1143.224858916119 N/m")
     found = apc.critical(compiled(text), "lan.loss", lower="2 %", upper="20 %")
     assert found.value == pytest.approx(0.1, abs=1e-8)
@@ -185,8 +185,8 @@ def test_loss_is_a_parameter_like_others() -> None:
 )
 def test_next_to_no_loss_gives_the_square_of_the_nominal_radius(peers: int, nominal: float) -> None:
     for more in ("", ZERO):
-        assert radius(scene(peers, 500.0, loss="1e-12 %", more=more)) == pytest.approx(nominal, rel=1e-11)
-    assert apc.judge_network(system_of(scene(peers, 500.0, loss="0 %"))) is None
+        assert radius(topology(peers, 500.0, loss="1e-12 %", more=more)) == pytest.approx(nominal, rel=1e-11)
+    assert apc.mean_square_stability(system_of(topology(peers, 500.0, loss="0 %"))) is None
 
 
 @pytest.mark.few(1)
@@ -202,10 +202,10 @@ def test_next_to_no_loss_gives_the_square_of_the_nominal_radius(peers: int, nomi
 def test_a_proof_is_told_where_it_is_asked_for_and_there_is_one(
     loss: str, stiffness: float, proved: str
 ) -> None:
-    text = scene(3, stiffness, loss=loss)
-    found = judged(text, certify=True)
+    text = topology(3, stiffness, loss=loss)
+    found = decided(text, certify=True)
     how = f"proved {proved} in mean square, by floats whose every rounding is bounded" if proved else ""
-    assert (str(found.proof), str(judged(text).proof)) == (how, "")
+    assert (str(found.proof), str(decided(text).proof)) == (how, "")
     assert any(text.startswith("not proved") for text in found.notes) == (not proved)
 
 
@@ -222,13 +222,13 @@ def test_a_proof_is_told_where_it_is_asked_for_and_there_is_one(
 )
 def test_what_is_not_served_is_not_judged_and_says_why(more: str, why: str) -> None:
     system = compiled(unreliable(more))
-    found = apc.judge_network(system)
+    found = apc.mean_square_stability(system)
     assert found is not None
     assert (found.verdict, found.stable, found.mean_square_radius) == ("not judged", None, None)
     assert why in found.notes[0]
-    with pytest.raises(ApcError, match="E898 the scene can't be judged in mean square") as error:
+    with pytest.raises(ApcError, match="E898 the topology can't be judged in mean square") as error:
         apc.critical(system, STIFFNESS)
-    assert error.value.mistakes[0].hint == "--in nominal"
+    assert error.value.mistakes[0].hint == "--criterion nominal"
 
 
 def test_what_cannot_be_varied_is_refused_with_what_can() -> None:

@@ -15,9 +15,9 @@ import pytest
 import apc
 from apc.__main__ import run
 from apc.compiler.errors import ApcError
-from apc.frame.instance import prepare
-from apc.moments.worst import ConsecutiveLosses, worst_case
-from tests.held_scenes import frames, growth, scene, system_of
+from apc.frame.numeric_model import prepare
+from apc.mean_square.dropout_bounds import ConsecutiveLosses, worst_case
+from tests.held_topologies import frames, growth, system_of, topology
 from tests.topologies import replaced
 
 
@@ -39,7 +39,7 @@ def longest(pattern: tuple[bool, ...]) -> int:
 def test_certified_losses_and_patterns_that_shake_are_those_of_the_reference(
     peers: int, stiffness: float, certified: int, unstable: int | None
 ) -> None:
-    found = losses(scene(peers, stiffness))
+    found = losses(topology(peers, stiffness))
     assert found.certified == certified
     if found.unstable_pattern is None:
         assert unstable is None
@@ -49,20 +49,22 @@ def test_certified_losses_and_patterns_that_shake_are_those_of_the_reference(
         unstable is None and len(found.unstable_pattern) > 5
     )
     own = frames(peers, stiffness)
-    heard = [np.full(len(own.pairs), 0.0 if lost else 1.0) for lost in found.unstable_pattern]
-    assert found.growth == pytest.approx(growth([own.matrix(one) for one in heard]), abs=1e-9)
+    received = [np.full(len(own.pairs), 0.0 if lost else 1.0) for lost in found.unstable_pattern]
+    assert found.growth == pytest.approx(growth([own.matrix(one) for one in received]), abs=1e-9)
     assert found.growth > 1
 
 
 def test_who_shakes_or_drifts_anyhow_is_told_so() -> None:
-    found = losses(scene(3, 1100.0))
+    found = losses(topology(3, 1100.0))
     assert (found.certified, found.unstable_pattern) == (None, (False,))
     assert found.growth == pytest.approx(math.sqrt(1.0005576554441589), abs=1e-10)
     # Copies that nothing holds, one of them moving on for ever: no loss makes it grow, and none is harmless.
-    text = scene(2, 0.0).replace("1000 N/m", "0 N/m").replace("0.6 kg, damping: 5", "0.6 kg, damping: 0")
+    text = topology(2, 0.0).replace("1000 N/m", "0 N/m").replace("0.6 kg, damping: 5", "0.6 kg, damping: 0")
     found = losses(text)
     assert (found.certified, found.unstable_pattern) == (None, None)
-    assert found.note.startswith("the scene is not proved to settle with no packet lost; no periodic pattern")
+    assert found.note.startswith(
+        "the topology is not proved to settle with no packet lost; no periodic pattern"
+    )
 
 
 @pytest.mark.few(1)
@@ -79,12 +81,12 @@ def test_every_pattern_of_certified_losses_settles(
     peers: int, stiffness: float, damping: float, coupler: str, operator: str, known: int
 ) -> None:
     """Every channel by itself, at random, with as many losses in a row as are certified."""
-    certified = losses(scene(peers, stiffness, damping=damping, coupler=coupler)).certified
+    certified = losses(topology(peers, stiffness, damping=damping, coupler=coupler)).certified
     own = frames(peers, stiffness, damping, operator)
     assert certified == known
-    luck, listed, run_ = np.random.default_rng(7), [], np.zeros(len(own.pairs), np.intp)
+    noise, listed, run_ = np.random.default_rng(7), [], np.zeros(len(own.pairs), np.intp)
     for frame in range(200):
-        lost = (run_ < certified) & (luck.random(len(run_)) < 0.7) & (frame > 0)
+        lost = (run_ < certified) & (noise.random(len(run_)) < 0.7) & (frame > 0)
         run_ = np.where(lost, run_ + 1, 0)
         listed.append(own.matrix(1.0 - lost))
     assert growth(listed) < 1
@@ -94,20 +96,20 @@ def test_every_pattern_of_certified_losses_settles(
 def test_groups_rings_and_stars_are_what_is_written_peer_by_peer_and_edge_by_edge() -> None:
     heavy = "  left: {count: 1, set: {device.mass: 0.2 kg}}\n"
     groups, single = (
-        replaced(scene(4, 300.0), ("  user: {count: 4}", heavy + rest))
+        replaced(topology(4, 300.0), ("  user: {count: 4}", heavy + rest))
         for rest in ("  right: {count: 3}", "  one: {count: 1}\n  two: {count: 1}\n  three: {count: 1}")
     )
     edges = "graph: {edges: [[1, 2], [1, 3], [1, 4], [2, 3], [2, 4], [3, 4]]}"
     dense = groups.replace("delay: 8 ms, loss", f"delay: 8 ms, {edges}, loss")
     ring, star = (
-        [scene(6, 200.0, more=f", graph: {shape}") for shape in (name, f"{{edges: {listed}}}")]
+        [topology(6, 200.0, more=f", graph: {shape}") for shape in (name, f"{{edges: {listed}}}")]
         for name, listed in (
             ("ring", "[[1, 2], [2, 3], [3, 4], [4, 5], [5, 6], [6, 1]]"),
             ("star", "[[1, 2], [1, 3], [1, 4], [1, 5], [1, 6]]"),
         )
     )
-    for alike in ([groups, single, dense], ring, star):
-        known, *others = map(losses, alike)
+    for interchangeable in ([groups, single, dense], ring, star):
+        known, *others = map(losses, interchangeable)
         for found in others:
             assert (found.certified, found.unstable_pattern) == (known.certified, known.unstable_pattern)
             assert (found.growth or 0.0) == pytest.approx(known.growth or 0.0, rel=1e-12)
@@ -116,11 +118,11 @@ def test_groups_rings_and_stars_are_what_is_written_peer_by_peer_and_edge_by_edg
 @pytest.mark.parametrize("stiffness", [0.0, 1e-3])
 def test_who_feels_nothing_of_the_others_bears_any_losses(stiffness: float) -> None:
     note = "1,000 losses in a row are harmless, where counting ends"
-    assert losses(scene(3, stiffness)) == ConsecutiveLosses(1000, None, None, note)
+    assert losses(topology(3, stiffness)) == ConsecutiveLosses(1000, None, None, note)
 
 
 TWICE = (
-    replaced(scene(3, 500.0), ("network: 8 ms", "network: 8 ms, slow: 16 ms"), ("  coordination:\n", "  other: {type: AveragePosition, object: cube, stiffness: 1 N/m, clock: haptic, link: wan}\n  coordination:\n"))  # noqa: E501
+    replaced(topology(3, 500.0), ("network: 8 ms", "network: 8 ms, slow: 16 ms"), ("  coordination:\n", "  other: {type: AveragePosition, object: cube, stiffness: 1 N/m, clock: haptic, link: wan}\n  coordination:\n"))  # noqa: E501
     + "  wan: {clock: slow, delay: 16 ms}\n"
 )  # fmt: skip
 
@@ -128,12 +130,18 @@ TWICE = (
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        (scene(3, 500.0, more=", on_loss: zero"), "lan takes no difference where a packet is missed"),
-        (scene(3, 500.0, more=", jitter: 2 ms"), "lan has jitter"),
+        (topology(3, 500.0, more=", on_loss: zero"), "lan takes no difference where a packet is missed"),
+        (topology(3, 500.0, more=", jitter: 2 ms"), "lan has jitter"),
         (TWICE, "lan sends more than one packet in a frame of 0.016 s"),
         # Of two packets between ticks of the forces one is heard only where the other is lost.
-        (scene(3, 500.0, delay="9 ms").replace("haptic: 1 ms", "haptic: 16 ms"), "lan sends more than one"),
-        (scene(200, 500.0, more=", graph: ring"), "200 peers on a graph that is not complete are too many"),
+        (
+            topology(3, 500.0, delay="9 ms").replace("haptic: 1 ms", "haptic: 16 ms"),
+            "lan sends more than one",
+        ),
+        (
+            topology(200, 500.0, more=", graph: ring"),
+            "200 peers on a graph that is not complete are too many",
+        ),
     ],
 )
 def test_what_is_not_served_is_left_open_and_named(text: str, why: str) -> None:
@@ -149,9 +157,9 @@ def test_what_is_not_served_is_left_open_and_named(text: str, why: str) -> None:
 )
 def test_the_pattern_is_played_and_grows_as_it_says(delay: str, clock: str) -> None:
     apart = "  left: {count: 1, set: {device.x: 1 mm}}\n  right: {count: 1}"
-    text = scene(2, 900.0, delay=delay).replace("  user: {count: 2}", apart)
+    text = topology(2, 900.0, delay=delay).replace("  user: {count: 2}", apart)
     system = system_of(text.replace("network: 8 ms", f"network: {clock}"))
-    found = apc.judge_network(system)
+    found = apc.mean_square_stability(system)
     assert found is not None and found.losses_in_a_row is not None
     pattern, grown = found.losses_in_a_row.unstable_pattern, found.losses_in_a_row.growth
     assert pattern is not None and grown is not None
@@ -168,12 +176,12 @@ def test_the_command_plays_the_pattern_or_says_why_not(
 ) -> None:
     path = tmp_path / "lossy.yaml"
     words = ["simulate", str(path), "--trace-of", "worst", "--duration", "0.1 s", "--json", "--no-jit"]
-    path.write_text(scene(2, 900.0), encoding="utf-8")
+    path.write_text(topology(2, 900.0), encoding="utf-8")
     assert run(words) == 0
     assert json.loads(capsys.readouterr().out)["topology"] == "lossy"
-    path.write_text(scene(2, 50.0), encoding="utf-8")
+    path.write_text(topology(2, 50.0), encoding="utf-8")
     assert run(words) == 1
     message = "E897 --trace-of worst has nothing to play: no periodic pattern tried, of fewer than 40 losses"
     assert message in capsys.readouterr().err
     with pytest.raises(ApcError, match=r"E897 --trace-of worst has nothing to play: .* lan has jitter"):
-        apc.simulate(system_of(scene(3, 300.0, more=", jitter: 1 ms")), trace_of="worst")
+        apc.simulate(system_of(topology(3, 300.0, more=", jitter: 1 ms")), trace_of="worst")

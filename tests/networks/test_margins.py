@@ -9,11 +9,11 @@ import pytest
 import apc
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
-from apc.frame.instance import prepare
-from apc.vary.margins import Margins, network_margins
-from apc.vary.sensitivity import network_sensitivities
-from tests.bruteforce import Scene
-from tests.held_scenes import scene, system_of
+from apc.frame.numeric_model import prepare
+from apc.parameter_studies.margins import Margins, network_margins
+from apc.parameter_studies.sensitivity import network_sensitivities
+from tests.bruteforce import TopologySource
+from tests.held_topologies import system_of, topology
 from tests.networks.second_moments import Law, second_moment_radius
 from tests.networks.test_loss import STIFFNESS
 from tests.topologies import AVERAGE, compiled, replaced
@@ -26,7 +26,7 @@ def grown(system: Model) -> Margins:
 @pytest.mark.whole
 def test_over_another_network_a_margin_is_another() -> None:
     """Of three users, brute force over all patterns: 1384 N/m at a loss of 40 %, to 0.5 N/m."""
-    system = system_of(scene(3, 500.0, loss="40 %"))
+    system = system_of(topology(3, 500.0, loss="40 %"))
     nominal, found = (
         {row.parameter: row.value for row in one.rows} for one in (apc.margins(system), grown(system))
     )
@@ -35,11 +35,11 @@ def test_over_another_network_a_margin_is_another() -> None:
 
 
 def test_derivatives_are_those_of_moments_followed_event_by_event() -> None:
-    system = system_of(scene(2, 900.0))
+    system = system_of(topology(2, 900.0))
     found = {row.parameter: row for row in network_sensitivities(system, prepare(system)).rows}
 
     def radius(stiffness: float = 900.0, loss: float = 0.1) -> float:
-        return second_moment_radius(Scene(peers=2, kt=stiffness, cube=0.3), Law(loss, 1 - loss))
+        return second_moment_radius(TopologySource(peers=2, kt=stiffness, cube=0.3), Law(loss, 1 - loss))
 
     for name, step, up, down in (
         (STIFFNESS, 1.0, radius(901.0), radius(899.0)),
@@ -53,7 +53,7 @@ def test_derivatives_are_those_of_moments_followed_event_by_event() -> None:
 @pytest.mark.whole
 @pytest.mark.parametrize("loss", ["{p: 1.1 %, r: 10 %}", "100 %"])
 def test_where_one_value_takes_long_or_is_not_judged_margins_say_so(loss: str) -> None:
-    system = system_of(scene(3, 500.0, loss=loss))
+    system = system_of(topology(3, 500.0, loss=loss))
     told = grown(system)
     assert not told.rows and told.note.startswith("not looked for: over th")
     why = network_sensitivities(system, prepare(system)).note
@@ -79,22 +79,25 @@ def test_where_one_value_takes_long_or_is_not_judged_margins_say_so(loss: str) -
 def test_a_box_in_mean_square_is_decided_as_references_say(
     stiffness: float, more: str, box: dict[str, str], *, stable: bool
 ) -> None:
-    found = apc.prove_box(system_of(scene(3, stiffness, more=more and f", graph: {more}")), box)
+    found = apc.robust_stability(system_of(topology(3, stiffness, more=more and f", graph: {more}")), box)
     assert found.stable is stable
     assert found.verdict == ("stable in mean square" if stable else "unstable in mean square")
-    assert not stable or (found.open_share == 0 and found.cells < 100)
+    assert not stable or (found.undecided_fraction == 0 and found.cells < 100)
 
 
 def test_what_is_left_open_of_a_box_is_said() -> None:
-    found = apc.prove_box(system_of(scene(3, 500.0)), {STIFFNESS: "1000 N/m:1143.2 N/m"}, cells=20)
+    found = apc.robust_stability(system_of(topology(3, 500.0)), {STIFFNESS: "1000 N/m:1143.2 N/m"}, cells=20)
     assert (found.stable, found.cells) == (None, 20)
-    assert 0 < found.open_share <= 1 and 1000 < found.point[0] < 1143.2
+    assert 0 < found.undecided_fraction <= 1 and 1000 < found.counterexample[0] < 1143.2
 
 
 def test_of_an_ideal_link_a_box_is_nominal_until_it_may_lose_packets() -> None:
-    system = system_of(scene(3, 500.0, loss="0 %"))
-    assert apc.prove_box(system, {"contact.stiffness": "±1%"}).verdict == "stable up to a common translation"
-    assert apc.prove_box(system, {"lan.loss": "0 %:2 %"}).verdict == "stable in mean square"
+    system = system_of(topology(3, 500.0, loss="0 %"))
+    assert (
+        apc.robust_stability(system, {"contact.stiffness": "±1%"}).verdict
+        == "stable up to a common translation"
+    )
+    assert apc.robust_stability(system, {"lan.loss": "0 %:2 %"}).verdict == "stable in mean square"
 
 
 @pytest.mark.parametrize(
@@ -108,9 +111,9 @@ def test_of_an_ideal_link_a_box_is_nominal_until_it_may_lose_packets() -> None:
 )
 def test_a_box_that_is_not_served_is_refused_by_name(loss: str, box: str, why: str) -> None:
     with pytest.raises(ApcError, match="E898 no box is proved") as error:
-        apc.prove_box(system_of(scene(3, 500.0, loss=loss)), {box: "±1%"})
+        apc.robust_stability(system_of(topology(3, 500.0, loss=loss)), {box: "±1%"})
     assert why in str(error.value)
-    assert error.value.mistakes[0].hint == f"apc critical {box} --in mean-square"
+    assert error.value.mistakes[0].hint == f"apc critical {box} --criterion mean-square"
 
 
 def test_a_frame_that_grows_by_many_decades_is_unstable_and_what_lies_beyond_is_looked_past() -> None:
@@ -124,6 +127,6 @@ def test_a_frame_that_grows_by_many_decades_is_unstable_and_what_lies_beyond_is_
     model = compiled(replaced(AVERAGE, *changes, *more))
     for damping in (1000.0, 1e4):
         with pytest.raises(ApcError, match="E806") if damping > 1e3 else nullcontext():
-            verdict = apc.judge_network(model, set={"inside.damping": damping})
+            verdict = apc.mean_square_stability(model, params={"inside.damping": damping})
             assert verdict is not None and verdict.stable is False
     assert apc.critical(model, "inside.damping").value is not None

@@ -33,11 +33,11 @@ def in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 def test_a_nominal_question_about_lost_or_late_packets_is_refused_by_name(
     words: list[str], name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run([*words, "--in", "nominal"]) == 1
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert f"E896 {name} can't be varied: this verdict is of the nominal network" in said.err
-    assert "Write: --in mean-square" in said.err
+    assert run([*words, "--criterion", "nominal"]) == 1
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert f"E896 {name} can't be varied: this verdict is of the nominal network" in printed.err
+    assert "Write: --criterion mean-square" in printed.err
 
 
 @pytest.mark.parametrize(
@@ -51,10 +51,10 @@ def test_a_nominal_question_about_lost_or_late_packets_is_refused_by_name(
 def test_other_questions_say_in_their_second_line_what_is_left_out(
     words: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run([*words, "--in", "nominal"]) == 0
+    assert run([*words, "--criterion", "nominal"]) == 0
     assert capsys.readouterr().out.splitlines()[1].startswith(f"  {LEFT_OUT[:55]}")
-    assert run([*words, "--in", "nominal", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["left_out"] == [LEFT_OUT]
+    assert run([*words, "--criterion", "nominal", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["limitations"] == [LEFT_OUT]
 
 
 RANGE = AVERAGE.replace("delay: 8 ms}", "delay: [8 ms, 20 ms]}")
@@ -64,7 +64,7 @@ MIDDLE = "left out: lan.delay from 8 ms to 20 ms but for its middle, 14 ms"
 @pytest.mark.parametrize(
     ("words", "places"),
     [
-        ("feel", [1]),
+        ("transparency", [1]),
         ("critical contact.stiffness", [1]),
         ("region --cells 4", [1]),
         ("region --x lan.delay=0ms:20ms --cells 4", []),
@@ -81,7 +81,7 @@ def test_an_answer_for_the_middle_of_a_delay_that_is_a_range_says_so(
 
 
 @pytest.mark.parametrize("words", ["simulate --duration 1s", "export --out s.mat"])
-def test_a_scene_is_played_and_written_out_with_one_delay(
+def test_a_topology_is_played_and_written_out_with_one_delay(
     words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("s.yaml").write_text(RANGE, encoding="utf-8")

@@ -15,9 +15,9 @@ import pytest
 
 import apc
 from apc.compiler.errors import ApcError
-from apc.moments.packet_memory import arrives
+from apc.mean_square.receiver_memory import arrives
 from apc.network.channel import PARETO_MOST, ChannelLaw, PacketSource, channel_law, deviates
-from apc.network.timetable import Listener
+from apc.network.packet_schedule import Listener
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare
 from tests.lossy import BURSTS, RELIABLE, delays, effective, recorded, unreliable
@@ -27,7 +27,7 @@ from tests.topologies import compiled, replaced
 # ---- luck ----
 
 
-def luck(seed: int, run: int, sender: int, receiver: int, blocks: int) -> list[list[float]]:
+def noise(seed: int, run: int, sender: int, receiver: int, blocks: int) -> list[list[float]]:
     """Return the blocks of a way's stream over "lan", whose CRC-32 is 0x6860FDEF, in whole numbers.
 
     Philox-4x64-10 as Salmon et al. (SC '11) write it: ten rounds of two products, the key going up between.
@@ -48,7 +48,7 @@ def luck(seed: int, run: int, sender: int, receiver: int, blocks: int) -> list[l
 def test_each_packet_follows_from_its_own_luck_for_ever(p: float, r: float) -> None:
     law = replace(RELIABLE, jitter=0.008, p=p, r=r)
     found = PacketSource(law, "lan", [(4, 1)], seed=7, run=3).take(40)[0]
-    first, *rest = luck(7, 3, 4, 1, 41)
+    first, *rest = noise(7, 3, 4, 1, 41)
     bad = first[0] < law.bad
     for packet, (turn, _, late, _) in zip(found, rest, strict=True):
         expected = math.inf if bad else 0.008 + 0.008 * (2 * late - 1)
@@ -159,13 +159,13 @@ def test_ticks_see_what_looking_at_every_packet_finds_however_time_is_cut(
     for pieces in (1, 7, 450):
         # The way that is looked at is one of three that are heard together.
         ear = listener(law, (3, 1), (0, 1), (0, 2), newest=newest)
-        parts = [ear.hear(part) for part in np.array_split(ticks, pieces)]
+        parts = [ear.receive(part) for part in np.array_split(ticks, pieces)]
         packets, missing = (
             np.concatenate([getattr(part, name)[:, 1] for part in parts]).tolist()
             for name in ("packets", "missing")
         )
         assert [*zip(packets, missing, strict=True)] == expected
-        assert ear.remembered < 60  # and does not grow with time
+        assert ear.stored < 60  # and does not grow with time
     assert any(np.diff(packets) < 0) != newest, "an older packet overwrites a newer one only if all count"
 
 

@@ -1,4 +1,4 @@
-"""What unreliable links do to a scene that is played: each packet looked at again by hand at each tick."""
+"""What unreliable links do to a topology that is played: each packet looked at again by hand at each tick."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import pytest
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import Model, PeerColumn
-from apc.simulation.rows_in_time import blocks
+from apc.simulation.output_blocks import blocks
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
 from tests.lossy import apart
 from tests.sites import MS
-from tests.topologies import AVERAGE, SCENES, compiled, replaced
+from tests.topologies import AVERAGE, TOPOLOGIES, compiled, replaced
 
 
 def rows_of(simulation: Simulation, run: int = 0) -> NDArray[np.float64]:
@@ -31,10 +31,10 @@ def scattered(system: Model) -> Model:
     random = np.random.default_rng(1)
     groups = []
     for group in system.groups:
-        starts = [one.start for one in system.kinds[group.kind].states if one.unit == "m"]
+        starts = [one.start for one in system.peer_types[group.peer_type].states if one.unit == "m"]
         columns = tuple(PeerColumn(name, random.uniform(-0.01, 0.01, group.count)) for name in starts)
-        kept = tuple(value for value in group.values if value.name not in starts)
-        groups.append(replace(group, values=kept, columns=columns))
+        stored = tuple(value for value in group.values if value.name not in starts)
+        groups.append(replace(group, values=stored, columns=columns))
     return replace(system, groups=tuple(groups))
 
 
@@ -73,7 +73,7 @@ def test_a_perfect_channel_plays_as_a_reliable_link_whatever_graph_clocks_and_de
     elif name.endswith(" ms"):
         text = AVERAGE.replace("delay: 8 ms}", f"delay: {name}}}")
     else:
-        text = (SCENES / f"{name}.yaml").read_text(encoding="utf-8")
+        text = (TOPOLOGIES / f"{name}.yaml").read_text(encoding="utf-8")
     at = text.index("clock: ", text.index("\nlinks:"))
     plain, same = (
         played(scattered(compiled(one)), duration=Fraction(1, 2))
@@ -88,15 +88,15 @@ def test_how_finely_time_is_counted_changes_nothing(jit: bool) -> None:
     """A delay longer by 1e-13 s makes quanta of that, and 2 s of them more than a half of 2^63 parts hold."""
     coarse = apart(AVERAGE, "jitter: 25 ms, reorder: all")
     fine = replaced(coarse, ("delay: 8 ms, j", "delay: 8.0000000001 ms, j"))
-    scenes = [prepare(compiled(one), Settings(Fraction(2), jit=jit)) for one in (coarse, fine)]
-    assert [one.quantum for one in scenes] == [MS, Fraction(1, 10**13)]
-    np.testing.assert_array_equal(*map(rows_of, scenes))
+    topologies = [prepare(compiled(one), Settings(Fraction(2), jit=jit)) for one in (coarse, fine)]
+    assert [one.quantum for one in topologies] == [MS, Fraction(1, 10**13)]
+    np.testing.assert_array_equal(*map(rows_of, topologies))
 
 
 def test_a_link_that_loses_everything_leaves_every_copy_where_it_is_or_holds_the_start() -> None:
     """Until the first packet is due nobody knows of a loss: the start values pull for 8 ms, nothing after."""
-    scenes = [compiled(apart(AVERAGE, f"loss: 100 %{more}")) for more in ("", ", on_loss: zero")]
-    hold, zero = (prepare(one, Settings(Fraction(4), jit=False)) for one in scenes)
+    topologies = [compiled(apart(AVERAGE, f"loss: 100 %{more}")) for more in ("", ", on_loss: zero")]
+    hold, zero = (prepare(one, Settings(Fraction(4), jit=False)) for one in topologies)
     columns = [[one.name for one in hold.signals].index(f"user[{i}].cube.x") for i in (1, 2, 3)]
     assert np.abs(np.diff(rows_of(zero)[-200:, columns], axis=0)).max() < 1e-12
     # Each settles at the mean of the others' start values.

@@ -1,4 +1,4 @@
-"""Lossy scenes of any shape: no verdict or bound contradicts second moments moved pattern by pattern.
+"""Lossy topologies of any shape: no verdict or bound contradicts second moments moved pattern by pattern.
 
 Periods, phases, delays, weights and users of all kinds; losses one by one and in bursts, hold and zero.
 """
@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, assume, example, given, settings
 from hypothesis import strategies as st
 
 import apc
-from tests.bruteforce import Scene, common_period
+from tests.bruteforce import TopologySource, common_period
 from tests.networks.second_moments import Law, arrivals_of, second_moment_radius
 from tests.sites import MS
 from tests.topologies import compiled, replaced
@@ -25,7 +25,7 @@ MOST_TICKS, MOST_ARRIVALS = 12, 2  # in a frame
 
 
 @st.composite
-def scenes(draw: st.DrawFn) -> Scene:
+def topologies(draw: st.DrawFn) -> TopologySource:
     """Draw two users whose frame is stepped quickly."""
     periods = st.sampled_from([Fraction(one) for one in ("1", "2", "4", "3/2")])
     haptic = draw(periods)
@@ -37,7 +37,7 @@ def scenes(draw: st.DrawFn) -> Scene:
     weights = st.none() | st.floats(0.3, 1.5).map(lambda w: {(0, 1): round(w, 2), (1, 0): 1.0})
     users = st.just(()) | st.tuples(st.just({}), st.builds(lambda m: {"device": m / 100}, st.integers(5, 30)))
     operator = draw(st.sampled_from(["mean", "sum"]))
-    return Scene(
+    return TopologySource(
         operator,
         2,
         draw(st.integers(2, 24)) * 50.0,
@@ -69,20 +69,24 @@ def laws(draw: st.DrawFn) -> Law:
 
 @pytest.mark.whole
 @settings(max_examples=15, derandomize=True, suppress_health_check=[*HealthCheck])
-@given(scenes(), laws())
-@example(Scene(peers=2, kt=900.0, cube=0.3, comm=Fraction(12, 1000)), Law(0.03, 0.3, 0.9, 0.02, zero=True))
-@example(Scene(peers=2, haptic=3 * MS, network=2 * MS, comm=2 * MS, comp=MS), Law(0.1, 0.9))
-@example(Scene(peers=2, bt=3.0, network=MS / 2, comm=Fraction(0), comp=Fraction(0)), Law(0.5, 0.5))
-def test_verdicts_are_those_of_moments_followed_pattern_by_pattern(scene: Scene, law: Law) -> None:
-    assume(arrivals_of(scene) == 1 or (law.independent and not law.zero))  # or it takes seconds
-    said = f"loss: {{p: {law.p!r}, r: {law.r!r}, 1-h: {law.bad_loss!r}, 1-k: {law.good_loss!r}}}"
-    said += ", on_loss: zero" if law.zero else ""
-    text = replaced(text_of(scene), ("lan: {clock: network, ", f"lan: {{clock: network, {said}, "))
-    told = apc.judge_network(compiled(text))
+@given(topologies(), laws())
+@example(
+    TopologySource(peers=2, kt=900.0, cube=0.3, comm=Fraction(12, 1000)), Law(0.03, 0.3, 0.9, 0.02, zero=True)
+)
+@example(TopologySource(peers=2, haptic=3 * MS, network=2 * MS, comm=2 * MS, comp=MS), Law(0.1, 0.9))
+@example(TopologySource(peers=2, bt=3.0, network=MS / 2, comm=Fraction(0), comp=Fraction(0)), Law(0.5, 0.5))
+def test_verdicts_are_those_of_moments_followed_pattern_by_pattern(
+    topology: TopologySource, law: Law
+) -> None:
+    assume(arrivals_of(topology) == 1 or (law.independent and not law.zero))  # or it takes seconds
+    printed = f"loss: {{p: {law.p!r}, r: {law.r!r}, 1-h: {law.bad_loss!r}, 1-k: {law.good_loss!r}}}"
+    printed += ", on_loss: zero" if law.zero else ""
+    text = replaced(text_of(topology), ("lan: {clock: network, ", f"lan: {{clock: network, {printed}, "))
+    told = apc.mean_square_stability(compiled(text))
     assert told is not None
     if told.mean_square_radius is None:
         return
-    truth = second_moment_radius(scene, law)
+    truth = second_moment_radius(topology, law)
     room = ITERATED * max(truth, 1.0) + ((told.error or 0.0) if told.exact else ESTIMATED)
     assert abs(told.mean_square_radius - truth) <= room, (told, truth)
     assert told.stable in (None, truth < 1) or abs(truth - 1) <= room, (told, truth)

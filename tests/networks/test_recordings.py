@@ -15,9 +15,9 @@ from mpmath import betainc, workdps
 import apc
 from apc.__main__ import run
 from apc.compiler.errors import ApcError
-from apc.compiler.language.probes import read_probe
+from apc.compiler.language.ping_recordings import read_probe
 from apc.network.channel import ChannelLaw, PacketSource
-from apc.network.recorded import CONFIDENCE, LinkFit, describe
+from apc.network.link_fit import CONFIDENCE, LinkFit, fit_recording
 from tests.lossy import LINK
 from tests.topologies import AVERAGE, replaced
 
@@ -133,7 +133,7 @@ def test_each_program_and_language_is_read_or_refused(name: str, expected: str, 
         with pytest.raises(ApcError) as caught:
             read_probe(text.rstrip("\n"), "lan.txt")
         [mistake] = caught.value.mistakes
-        assert (mistake.code, mistake.place.line) == ("E704", int(line)), str(mistake)
+        assert (mistake.code, mistake.location.line) == ("E704", int(line)), str(mistake)
         assert words in mistake.sentence
         return
     listed, interval = expected.split("; ")
@@ -157,7 +157,7 @@ def test_windows_writes_in_code_pages_and_in_utf_16(tmp_path: Path, encoding: st
         text = texts[name].replace("’", "'").replace("12 ms", "12\xa0ms").replace("\n", "\r\n")
         mark = "\ufeff" if encoding == "utf-16-le" else ""
         (tmp_path / "lan.txt").write_bytes((mark + text).encode(encoding))
-        found = describe(tmp_path / "lan.txt")
+        found = fit_recording(tmp_path / "lan.txt")
         assert (found.lost.count, found.lost.of - found.lost.count, found.longest) == (lost, 2, 0.006)
 
 
@@ -212,7 +212,7 @@ def recorded(folder: Path, law: ChannelLaw, count: int, seed: int) -> LinkFit:
     delays = PacketSource(law, "lan", [[0, 1]], seed=seed).take(count)[0]
     rows = ("lost" if math.isinf(delay) else repr(delay * 1e3) for delay in delays.tolist())
     (folder / "t.csv").write_text("\n".join(["delay [ms]", *rows]), encoding="utf-8")
-    return describe(folder / "t.csv", 0.008)
+    return fit_recording(folder / "t.csv", 0.008)
 
 
 @pytest.mark.few(1)
@@ -222,13 +222,13 @@ def test_the_keys_are_those_of_the_link_that_was_recorded(tmp_path: Path, distri
     law = ChannelLaw(0.02, 0.3, 1.0, 0.0, 0.02, 0.003, distribution, None)
     found = recorded(tmp_path, law, 20_000, 3)
     assert found.bursty
-    assert found.turns_bad.interval[0] < 0.02 < found.turns_bad.interval[1]
-    assert found.turns_good.interval[0] < 0.3 < found.turns_good.interval[1]
-    assert found.law is not None and found.law.distribution == distribution
+    assert found.p.interval[0] < 0.02 < found.p.interval[1]
+    assert found.r.interval[0] < 0.3 < found.r.interval[1]
+    assert found.distribution is not None and found.distribution.distribution == distribution
     # Of 20,000 the standard errors of a median and of a distance of quartiles are below 0.01 of the jitter.
-    assert found.law.delay == pytest.approx(0.02, abs=5 * 0.01 * 0.003)
-    assert found.law.jitter == pytest.approx(0.003, rel=5 * 0.01)
-    assert not any("distributions" in told or "follow one another" in told for told in found.left_out)
+    assert found.distribution.delay == pytest.approx(0.02, abs=5 * 0.01 * 0.003)
+    assert found.distribution.jitter == pytest.approx(0.003, rel=5 * 0.01)
+    assert not any("distributions" in told or "follow one another" in told for told in found.limitations)
 
 
 @pytest.mark.whole
@@ -245,28 +245,28 @@ def test_an_interval_is_where_the_tails_hold_what_is_left_out(tmp_path: Path) ->
     """By 30 digits: at its ends, as many losses or more (fewer) have the probability (1 − 0.95)/2."""
     rest = (1 - CONFIDENCE) / 2
     (tmp_path / "t.csv").write_text("delay [ms]\n" + "lost\n" * 7 + "8\n" * 93, encoding="utf-8")
-    low, high = describe(tmp_path / "t.csv").lost.interval
+    low, high = fit_recording(tmp_path / "t.csv").lost.interval
     with workdps(30):  # P(7 or more of 100) = I(p; 7, 94), P(7 or fewer) = 1 − I(p; 8, 93)
         assert abs(float(betainc(7, 94, 0, low, regularized=True)) - rest) < 1e-10
         assert abs(float(1 - betainc(8, 93, 0, high, regularized=True)) - rest) < 1e-10
     (tmp_path / "t.csv").write_text("delay [ms]\n" + "8\n" * 100, encoding="utf-8")
-    none = describe(tmp_path / "t.csv").lost.interval
+    none = fit_recording(tmp_path / "t.csv").lost.interval
     # Of packets sent every 8 ms the first two arrive behind the third, a lost one behind nobody.
     (tmp_path / "o.csv").write_text("delay [ms]\n30\n20\n5\nlost\n9\n", encoding="utf-8")
-    assert describe(tmp_path / "o.csv", 0.008).overtaken == 2
-    assert describe(tmp_path / "o.csv").overtaken is None
+    assert fit_recording(tmp_path / "o.csv", 0.008).reordered == 2
+    assert fit_recording(tmp_path / "o.csv").reordered is None
     assert none == (0.0, pytest.approx(1 - rest ** (1 / 100), rel=1e-12))
 
 
 def test_what_the_keys_leave_out_is_said_first(tmp_path: Path) -> None:
     slow = 20 + 5 * np.sin(np.arange(500) / 20)
     (tmp_path / "t.csv").write_text("delay [ms]\n" + "\n".join(map(repr, slow.tolist())), encoding="utf-8")
-    text = str(apc.describe_network(tmp_path / "t.csv", interval="8 ms"))
+    text = str(apc.fit_link(tmp_path / "t.csv", interval="8 ms"))
     head = " ".join(text.partition("  lost ")[0].split())
     assert "delays follow one another (correlation 1.00" in head
     assert "spread as none of the distributions" in head
     (tmp_path / "p.txt").write_text(IPUTILS, encoding="utf-8")
-    assert "half of each stands for one way" in str(apc.describe_network(tmp_path / "p.txt"))
+    assert "half of each stands for one way" in str(apc.fit_link(tmp_path / "p.txt"))
 
 
 def test_the_entry_is_a_links_and_a_trace_reads_the_same_file(tmp_path: Path) -> None:
@@ -274,13 +274,13 @@ def test_the_entry_is_a_links_and_a_trace_reads_the_same_file(tmp_path: Path) ->
     with gzip.open(tmp_path / "lan.json.gz", "wb") as packed:
         packed.write((tmp_path / "lan.txt").read_bytes())
     (tmp_path / "t.csv").write_text("delay [ms]\n" + "8\n" * 40 + "lost\n" + "8\n" * 20, encoding="utf-8")
-    entry = apc.describe_network(tmp_path / "lan.txt").to_dict()["entry"]
+    entry = apc.fit_link(tmp_path / "lan.txt").to_dict()["entry"]
     assert entry == "lan: {clock: network, delay: 8 ms, loss: 1.64 %}"
     links = [f"  {entry}", *(f"{LINK[:-1]}, trace: {name}}}" for name in ("t.csv", "lan.txt", "lan.json.gz"))]
     verdicts = []
     for link in links:
         (tmp_path / "s.yaml").write_text(replaced(AVERAGE, (LINK, link)), encoding="utf-8")
-        found = apc.judge_network(apc.compile(tmp_path / "s.yaml"))
+        found = apc.mean_square_stability(apc.compile(tmp_path / "s.yaml"))
         assert found is not None
         verdicts.append(found.to_dict())
     assert verdicts[1] == verdicts[2] == verdicts[3]
@@ -293,7 +293,7 @@ def test_the_command(
     Path("p.txt").write_text(IPUTILS, encoding="utf-8")
     assert run(["network", "p.txt", "--json", "--out", "t.csv"]) == 0
     told = json.loads(capsys.readouterr().out)
-    assert (told["packets"], told["lost"]["count"], told["lost"]["share"], told["overtaken"]) == (
+    assert (told["packets"], told["lost"]["count"], told["lost"]["share"], told["reordered"]) == (
         6,
         3,
         0.5,
@@ -324,4 +324,4 @@ def test_a_packed_file_is_unpacked_within_bounds(tmp_path: Path) -> None:
         ("torn.json.gz", "no whole gzip file"),
     ):
         with pytest.raises(ApcError, match=words):
-            describe(tmp_path / name)
+            fit_recording(tmp_path / name)

@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from tests import bruteforce
-from tests.held_scenes import scene
+from tests.held_topologies import topology
 from tests.networks.second_moments import Law, rms_error
-from tests.networks.test_loss import judged
+from tests.networks.test_loss import decided
 from tests.topologies import replaced
 
 GROUPS = """\
@@ -20,7 +20,7 @@ GROUPS = """\
 
 
 def metres(text: str) -> float:
-    found = judged(text)
+    found = decided(text)
     assert found.rms_error_m is not None, found.notes
     return found.rms_error_m
 
@@ -40,7 +40,7 @@ def test_with_next_to_no_loss_the_error_is_that_of_an_ideal_network(
     count: int, stiffness: float, expected: float
 ) -> None:
     for more in ("", ", on_loss: zero"):
-        found = metres(scene(count, stiffness, loss="1e-9 %", more=more))
+        found = metres(topology(count, stiffness, loss="1e-9 %", more=more))
         assert found == pytest.approx(expected, rel=1e-9)
 
 
@@ -51,26 +51,26 @@ PATH = dict.fromkeys([(0, 1), (1, 0), (1, 2), (2, 1)], 1.0)
 @pytest.mark.parametrize(
     ("text", "more", "law"),
     [
-        (scene(2, 500.0, loss="40 %"), {}, Law(0.4, 0.6)),
-        (scene(2, 900.0, more=", on_loss: zero"), {"kt": 900.0}, Law(0.1, 0.9, zero=True)),
+        (topology(2, 500.0, loss="40 %"), {}, Law(0.4, 0.6)),
+        (topology(2, 900.0, more=", on_loss: zero"), {"kt": 900.0}, Law(0.1, 0.9, zero=True)),
         (
-            scene(2, 500.0, more=", on_loss: zero", delay="5 ms"),
+            topology(2, 500.0, more=", on_loss: zero", delay="5 ms"),
             {"comm": Fraction(5, 1000)},
             Law(0.1, 0.9, zero=True),
         ),
-        (scene(2, 500.0, loss="{p: 3 %, r: 30 %}"), {}, Law(0.03, 0.3)),
+        (topology(2, 500.0, loss="{p: 3 %, r: 30 %}"), {}, Law(0.03, 0.3)),
         (
-            scene(2, 500.0, loss="{p: 3 %, r: 30 %}", delay="13 ms"),
+            topology(2, 500.0, loss="{p: 3 %, r: 30 %}", delay="13 ms"),
             {"comm": Fraction(13, 1000)},
             Law(0.03, 0.3),
         ),
         (
-            replaced(scene(2, 500.0), ("  user: {count: 2}\n", GROUPS)),
+            replaced(topology(2, 500.0), ("  user: {count: 2}\n", GROUPS)),
             {"users": ({}, {"device": 0.25, "kt": 700.0, "kc": 800.0})},
             Law(0.1, 0.9),
         ),
         pytest.param(
-            scene(3, 500.0, loss="20 %", more=", graph: {edges: [[1, 2], [2, 3]]}"),
+            topology(3, 500.0, loss="20 %", more=", graph: {edges: [[1, 2], [2, 3]]}"),
             {"peers": 3, "weights": PATH, "cube": 0.2},
             Law(0.2, 0.8),
             marks=pytest.mark.whole,
@@ -79,14 +79,14 @@ PATH = dict.fromkeys([(0, 1), (1, 0), (1, 2), (2, 1)], 1.0)
 )
 def test_it_is_that_of_moments_followed_event_by_event(text: str, more: dict[str, Any], law: Law) -> None:
     """The largest of all copies; whatever the delay, it is looked at as packets are sent."""
-    followed = bruteforce.Scene(**{"peers": 2, "cube": 0.3, **more})
+    followed = bruteforce.TopologySource(**{"peers": 2, "cube": 0.3, **more})
     assert metres(text) == pytest.approx(rms_error(followed, law), rel=1e-9)
 
 
 @pytest.mark.whole
 def test_of_many_users_bursts_tell_an_estimate_that_is_called_one() -> None:
-    found = judged(scene(5, 500.0, loss="{p: 0.3 %, r: 30 %}"))
-    assert found.rms_error_m == pytest.approx(metres(scene(5, 500.0, loss="1e-9 %")), rel=0.01)
+    found = decided(topology(5, 500.0, loss="{p: 0.3 %, r: 30 %}"))
+    assert found.rms_error_m == pytest.approx(metres(topology(5, 500.0, loss="1e-9 %")), rel=0.01)
     assert any("an estimate: moments of at most 3 channels' states together" in note for note in found.notes)
 
 
@@ -95,7 +95,7 @@ def test_of_many_users_bursts_tell_an_estimate_that_is_called_one() -> None:
 def test_a_million_users_cost_what_three_do(more: str) -> None:
     """Each then follows a mean that the others hardly move: the error is that of a user held by a spring."""
     near, far = (
-        metres(replaced(scene(count, 500.0, more=more), ("0.6 kg", f"{0.2 * count:.1f} kg")))
+        metres(replaced(topology(count, 500.0, more=more), ("0.6 kg", f"{0.2 * count:.1f} kg")))
         for count in (10**3, 10**6)
     )
     assert near == pytest.approx(far, rel=1e-3)
@@ -105,13 +105,13 @@ def test_a_million_users_cost_what_three_do(more: str) -> None:
 @pytest.mark.whole
 def test_a_force_moves_all_that_is_rigidly_connected_with_a_device() -> None:
     geared = replaced(
-        scene(3, 500.0),
+        topology(3, 500.0),
         ("couplers:\n", "couplers:\n  gear: {type: Gear, a: device, b: motor, ratio: 1}\n"),
         ("  cube:", "  motor: {mass: 80 g}\n  cube:"),
     )
-    heavier = metres(replaced(scene(3, 500.0), ("mass: 0.1 kg", "mass: 0.18 kg")))
+    heavier = metres(replaced(topology(3, 500.0), ("mass: 0.1 kg", "mass: 0.18 kg")))
     assert metres(geared) == pytest.approx(heavier, rel=1e-12)
-    found = judged(replaced(geared, ("ratio: 1", "ratio: 2")))
+    found = decided(replaced(geared, ("ratio: 1", "ratio: 2")))
     why = "device moves with masses that move otherwise, and a hand may hold any of them (user)"
     assert found.rms_error_m is None and any(note.endswith(why) for note in found.notes)
 
@@ -131,6 +131,6 @@ def test_a_force_moves_all_that_is_rigidly_connected_with_a_device() -> None:
     ],
 )
 def test_where_there_is_none_it_says_why(change: tuple[str, str], why: str) -> None:
-    found = judged(replaced(scene(3, 500.0), change))
+    found = decided(replaced(topology(3, 500.0), change))
     assert found.rms_error_m is None
     assert f"root mean square error of copies: {why}" in found.notes

@@ -16,12 +16,12 @@ from hypothesis.extra import numpy as arrays
 from apc.npz import DamageError, read_arrays
 from tests.fuzz.models import zipped
 
-KINDS = {"time": ("<f8", 1), "packets[0-9]": ("<i8", 2), "missing": ("|b1", 2), "told": ("|u1", 1)}
+KINDS = {"time": ("<f8", 1), "packets[0-9]": ("<i8", 2), "missing": ("|b1", 2), "record": ("|u1", 1)}
 WHOLE = {
     "time": np.array([0.0, np.nan, -0.0]),
     "packets0": np.arange(6).reshape(2, 3),
     "missing": np.array([[True], [False]]),
-    "told": np.zeros(0, np.uint8),
+    "record": np.zeros(0, np.uint8),
 }
 
 

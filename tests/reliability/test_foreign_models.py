@@ -17,16 +17,16 @@ import pytest
 
 import apc
 from apc.__main__ import run
-from apc.compiler import cache, seal, store
+from apc.compiler import cache, signing, store
 from apc.compiler.compiled import Model
 from tests.commands import write
-from tests.reliability.test_unchanged_scenes import PART, TEXT
+from tests.reliability.test_unchanged_topologies import PART, TEXT
 from tests.topologies import AVERAGE, ROOT, compiled, replaced, told
 
 Other = Callable[[], Model]
-MODEL = Path("scene.apc")
+MODEL = Path("topology.apc")
 OTHER = replaced(AVERAGE, ("1000 N/m", "9000 N/m"))
-DAMAGED = r"scene\.apc: E604 is damaged: it is not what apc compile writes\. Write: "
+DAMAGED = r"topology\.apc: E604 is damaged: it is not what apc compile writes\. Write: "
 # Makes a function that calls a command when CasADi reads it, and reads it: the command leaves PWNED behind.
 ATTACK = """\
 import casadi, os
@@ -42,9 +42,9 @@ casadi.Function.deserialize(open("function").read())
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    (tmp_path / "scenes").mkdir()
-    monkeypatch.chdir(tmp_path / "scenes")
-    monkeypatch.setattr(seal, "_folder", lambda: tmp_path / "cache")
+    (tmp_path / "topologies").mkdir()
+    monkeypatch.chdir(tmp_path / "topologies")
+    monkeypatch.setattr(signing, "_folder", lambda: tmp_path / "cache")
     return tmp_path
 
 
@@ -53,7 +53,7 @@ def other(monkeypatch: pytest.MonkeyPatch) -> Other:
     """Return what loads the model as another user, who reads none: what is opened was compiled."""
 
     def load() -> Model:
-        monkeypatch.setattr(seal, "_folder", lambda: Path("../theirs").resolve())
+        monkeypatch.setattr(signing, "_folder", lambda: Path("../theirs").resolve())
         monkeypatch.setattr(store, "decoded", lambda model: pytest.fail("it is read"))
         return apc.load(MODEL)
 
@@ -73,9 +73,9 @@ def forge(text: tuple[str, bytes], **fields: Any) -> None:
 
 
 def unchanged(capsys: pytest.CaptureFixture[str]) -> bool:
-    """Compile the scene; return whether what was compiled already was good enough."""
+    """Compile the topology; return whether what was compiled already was good enough."""
     capsys.readouterr()
-    assert run(["compile", "scene.yaml"]) == 0
+    assert run(["compile", "topology.yaml"]) == 0
     return "unchanged" in capsys.readouterr().out
 
 
@@ -112,17 +112,17 @@ def test_lines_of_somebody_else_run_nothing_and_stand_for_no_topology(
     """Theirs say another topology, or hold a function that calls a command; they are sealed or not."""
     apc.save(compiled(OTHER), MODEL)
     other = lines_of(MODEL.read_bytes())
-    write("scene.yaml", AVERAGE)
+    write("topology.yaml", AVERAGE)
     assert (unchanged(capsys), unchanged(capsys)) == (False, True)
     mine = MODEL.read_bytes()
-    honest = apc.load(MODEL).kinds[0].derivative.serialize().encode()
+    honest = apc.load(MODEL).peer_types[0].derivative.serialize().encode()
     assert honest in mine
     lines = lines_of(mine)
     other[1:] = mark, other[2], lines[3].replace(honest, serialized)
     head, sealed, *rest = (other[k] if str(k) in theirs else lines[k] for k in range(4))
     checksum = hashlib.sha256(b"\n".join((head, *rest))).hexdigest().encode()
     MODEL.write_bytes(b"\n".join((head, sealed.split(b" ")[0] + b" " + checksum, *rest)))
-    for file in ("scene.yaml",) if "2" in theirs else ("scene.yaml", "scene.apc"):
+    for file in ("topology.yaml",) if "2" in theirs else ("topology.yaml", "topology.apc"):
         right = apc.analyze(compiled(AVERAGE)).spectral_radius
         assert apc.analyze(file).spectral_radius == right, "the texts decide"
     assert bool(told(apc.load, MODEL)) == ("2" in theirs), "it is stale"
@@ -131,7 +131,7 @@ def test_lines_of_somebody_else_run_nothing_and_stand_for_no_topology(
 
 
 @pytest.mark.parametrize(
-    ("happens", "again"),
+    ("happens", "repeated"),
     [
         *(("mv cache other", True), ("printf known > cache/secret", True)),
         *(("chmod 644 cache/secret; chmod 755 cache", True), ("rm -r cache", True)),
@@ -140,16 +140,16 @@ def test_lines_of_somebody_else_run_nothing_and_stand_for_no_topology(
     ],
 )
 def test_what_was_compiled_serves_this_user_alone(
-    happens: str, again: bool, folder: Path, capsys: pytest.CaptureFixture[str]
+    happens: str, repeated: bool, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Without a folder of one's own, or with a secret that others may know, all is compiled again."""
-    write("scene.yaml", AVERAGE)
+    write("topology.yaml", AVERAGE)
     assert (unchanged(capsys), unchanged(capsys)) == (False, True)
     if os.system(f"cd {folder} && {happens}"):
         pytest.skip("only root can give a folder to somebody else")
-    seal._secret.cache_clear()
-    assert (unchanged(capsys), unchanged(capsys)) == (False, again)
-    assert not again or (folder / "cache" / "secret").stat().st_mode & 0o777 == 0o600
+    signing._secret.cache_clear()
+    assert (unchanged(capsys), unchanged(capsys)) == (False, repeated)
+    assert not repeated or (folder / "cache" / "secret").stat().st_mode & 0o777 == 0o600
 
 
 # ---- a model by itself ----
@@ -161,12 +161,12 @@ def test_a_model_of_somebody_else_needs_no_file_beside_it_and_not_this_library(
     Path("parts").mkdir()
     write("parts/tie.yaml", PART)
     write("users.csv", "device.mass [kg]\n1\n2\n")
-    write("scene.yaml", TEXT)
+    write("topology.yaml", TEXT)
     assert run(["compile"]) == 0
     expected = store.encoded(apc.load(MODEL))
-    for path in ("scene.yaml", "users.csv", "parts/tie.yaml"):
+    for path in ("topology.yaml", "users.csv", "parts/tie.yaml"):
         Path(path).unlink()
-    write("mass.yaml", "component: Mass\nabout: Nothing.\n")
+    write("mass.yaml", "component: Mass\ndescription: Nothing.\n")
     library = {**cache.builtin_files(), "Mass": Path("mass.yaml").resolve()}
     for module in ("apc.compiler.components.component_library", "apc.compiler.cache"):
         monkeypatch.setattr(f"{module}.builtin_files", lambda: library)
@@ -174,16 +174,16 @@ def test_a_model_of_somebody_else_needs_no_file_beside_it_and_not_this_library(
 
 
 def test_what_was_changed_before_it_was_saved_is_changed_again(other: Other) -> None:
-    write("scene.yaml", AVERAGE)
+    write("topology.yaml", AVERAGE)
     numbers = {"contact.stiffness": "800 N/m", "lan.delay": "5/3 ms", "user.count": "5"}
-    system = apc.set_parameters(apc.with_hands(apc.compile("scene.yaml"), "held"), numbers)
+    system = apc.set_parameters(apc.with_hands(apc.compile("topology.yaml"), "held"), numbers)
     apc.save(system, MODEL)
     assert store.encoded(apc.load(MODEL)) == store.encoded(system)
     assert store.encoded(other()) == store.encoded(system)
 
 
 SECRETS = ("secret.csv", "../secret.csv", "/dev/zero", "/etc/passwd")
-NAMES = ("", ".", "..", "../scene.yaml", "/etc/passwd", "a/b")
+NAMES = ("", ".", "..", "../topology.yaml", "/etc/passwd", "a/b")
 ODD = ("\0", "n" * 300, "\x1b[31m")
 PATHS = ("./pipe", "./pipe/", "/", "/dev/zero", "Mass/", *NAMES, *ODD)
 NUMBERS = ("1e99999999", "1/0", "-1", "nan", "9" * 5000, "__import__('os')")
@@ -198,7 +198,7 @@ CHANGES = (*(("lan.delay", number) for number in NUMBERS), ("no", "1"), ("peers"
         *((name, {"topology": name}, "") for name in ODD),
         *((path, {}, "") for path in PATHS),
         *(("", {"changes": ((change,),)}, ".") for change in CHANGES),
-        ("scene.yaml", {}, r"scene\.yaml: E"),
+        ("topology.yaml", {}, r"topology\.yaml: E"),
     ],
 )
 def test_what_a_model_says_it_was_made_from_is_refused_or_compiled_and_not_looked_for(
@@ -215,14 +215,14 @@ def test_what_a_model_says_it_was_made_from_is_refused_or_compiled_and_not_looke
 def test_what_a_models_texts_name_is_read_from_the_model_alone(name: str, other: Other) -> None:
     write("secret.csv", "device.mass [kg]\n1\n2\n")
     write("../secret.csv", "device.mass [kg]\n1\n2\n")
-    forge(("scene.yaml", replaced(AVERAGE, ("count: 3", f"table: {name}")).encode()))
+    forge(("topology.yaml", replaced(AVERAGE, ("count: 3", f"table: {name}")).encode()))
     [line] = told(other)
-    assert line.startswith("scene.yaml:") and f"{name} does not exist" in line
+    assert line.startswith("topology.yaml:") and f"{name} does not exist" in line
 
 
 # ---- damage and size ----
 
-EMPTY = '{"topology": "scene.yaml", "texts": [], "program": "", "changes": []}'
+EMPTY = '{"topology": "topology.yaml", "texts": [], "program": "", "changes": []}'
 DEEP = "[" * 10**6
 
 
@@ -234,8 +234,8 @@ def unsealed(origin: str) -> str:
 
 
 ORIGINS = ("", "[]", "{}", "null", "\xff", DEEP, EMPTY, EMPTY.replace("}", f', "x": {DEEP}'))
-TEXTS = ('"scene.yaml"', '["scene.yaml", 3]', '["scene.yaml", "*"]')
-NEWER = f"scene.apc: E603 has format version 99, this program reads version {cache.FORMAT}"
+TEXTS = ('"topology.yaml"', '["topology.yaml", 3]', '["topology.yaml", "*"]')
+NEWER = f"topology.apc: E603 has format version 99, this program reads version {cache.FORMAT}"
 
 
 @pytest.mark.few(8)
@@ -251,8 +251,8 @@ NEWER = f"scene.apc: E603 has format version 99, this program reads version {cac
 def test_what_is_no_model_is_refused_and_beside_its_topology_passed_over(content: str, words: str) -> None:
     MODEL.write_bytes(content.encode("latin-1"))
     assert re.match(words, told(apc.load, MODEL)[0])
-    write("scene.yaml", AVERAGE)
-    assert apc.analyze("scene.yaml").topology == "three-users-average"
+    write("topology.yaml", AVERAGE)
+    assert apc.analyze("topology.yaml").topology == "three-users-average"
 
 
 def test_a_byte_changed_or_an_end_cut_off_is_refused(other: Other) -> None:
@@ -272,7 +272,7 @@ def test_a_byte_changed_or_an_end_cut_off_is_refused(other: Other) -> None:
         ("folder.apc", "E602 is a folder, not a compiled model."),
         ("large.apc", "E602 is larger than 256 MiB, the most it may have."),
         (
-            "scene.apc",
+            "topology.apc",
             "E604 is damaged: it is not what apc compile writes. "
             "Write: the file once more, from whoever made it",
         ),

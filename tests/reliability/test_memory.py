@@ -17,23 +17,23 @@ from tests.commands import Cli, folder, write
 from tests.topologies import AVERAGE, compiled, replaced
 
 LOSSY = replaced(AVERAGE, ("delay: 8 ms}", "delay: 8 ms, loss: 2 %}"))
-SHORT = "simulate scene.yaml --duration 16ms"
+SHORT = "simulate topology.yaml --duration 16ms"
 
 
 @pytest.mark.parametrize(
     ("text", "words", "needs"),
     [
-        (AVERAGE, "analyze scene.yaml", "E804 2 systems of up to 8 states take about .* kB"),
+        (AVERAGE, "analyze topology.yaml", "E804 2 systems of up to 8 states take about .* kB"),
         (
             AVERAGE,
-            "analyze scene.yaml --method determinant",
+            "analyze topology.yaml --method determinant",
             "E804 2 determinants of 2 peers that differ take about .* kB",
         ),
         (AVERAGE, SHORT, "E874 3 peers hold .* numbers in a frame, which take about .* kB"),
         (LOSSY, f"{SHORT} --runs 400", "E876 400 runs take about 120 kB"),
         (
             AVERAGE,
-            "sweep scene.yaml --out a.csv --over coordination.stiffness=0N/m:900N/m:1000",
+            "sweep topology.yaml --out a.csv --over coordination.stiffness=0N/m:900N/m:1000",
             "E883 1,000 points of 8 columns take about .* kB",
         ),
     ],
@@ -41,7 +41,7 @@ SHORT = "simulate scene.yaml --duration 16ms"
 def test_what_would_not_fit_is_refused_with_what_it_needs_and_what_there_is(
     monkeypatch: pytest.MonkeyPatch, cli: Cli, text: str, words: str, needs: str
 ) -> None:
-    write("scene.yaml", text)
+    write("topology.yaml", text)
     _leave(monkeypatch, 1000)
     ran = cli(words)
     assert ran.code == 1 and re.search(rf"{needs} of memory, and 1 kB are free\. Write: ", ran.err), ran.err
@@ -52,13 +52,13 @@ def test_what_would_not_fit_is_refused_with_what_it_needs_and_what_there_is(
 def test_a_file_that_would_not_fit_while_it_is_written_is_refused_and_not_begun(
     monkeypatch: pytest.MonkeyPatch, cli: Cli, suffix: str
 ) -> None:
-    write("scene.yaml", AVERAGE)
+    write("topology.yaml", AVERAGE)
     _leave(monkeypatch, 100_000)
     ran = cli(f"{SHORT} --out=a.{suffix}")
     assert ran.code == 1
     needs = rf"E876 24 rows of 25 columns in a\.{suffix} take about \d+ kB of memory, and 100 kB are free"
     assert re.search(rf"{needs}\. Write: fewer --signals", ran.err)
-    assert folder() == ["scene.yaml"]
+    assert folder() == ["topology.yaml"]
 
 
 def test_packets_that_would_not_fit_while_they_are_on_their_way_are_refused(
@@ -117,10 +117,10 @@ def test_what_no_estimate_foresaw_ends_in_words(
     def compile_topology(_: Path) -> None:
         raise lack
 
-    write("scene.yaml", AVERAGE)
+    write("topology.yaml", AVERAGE)
     monkeypatch.setattr("apc.compiler.pipeline.compile_topology", compile_topology)
     _leave(monkeypatch, 1e9)
-    assert cli("check scene.yaml") == (
+    assert cli("check topology.yaml") == (
         1,
         "",
         "apc check: E820 ran out of memory. "

@@ -63,15 +63,15 @@ def test_a_library_file_whose_name_is_no_text_is_refused_where_it_would_be_store
     Path("library").mkdir()
     write("library/flat.yaml", NESTED.format(stiffness="s").replace("Outer", "Other"))
     Path("library/flat.yaml").rename(os.fsdecode(b"library/\xff\xfe.yaml"))
-    write("scene.yaml", AVERAGE + "library: ./library\n")
-    assert cli("analyze scene.yaml").code == 0
-    ran = cli("compile scene.yaml")
+    write("topology.yaml", AVERAGE + "library: ./library\n")
+    assert cli("analyze topology.yaml").code == 0
+    ran = cli("compile topology.yaml")
     assert (ran.code, "E601" in ran.err) == (1, True), ran.err
 
 
 def test_an_unknown_backend_of_windows_is_none_of_our_business(tmp_path: Path) -> None:
-    (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
-    words = [sys.executable, "-m", "apc", "analyze", "scene.yaml", "--no-margins", "--plot", "p.svg"]
+    (tmp_path / "topology.yaml").write_text(AVERAGE, encoding="utf-8")
+    words = [sys.executable, "-m", "apc", "analyze", "topology.yaml", "--no-margins", "--plot", "p.svg"]
     environment = {**os.environ, "MPLBACKEND": "none-such"}
     ran = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, check=False)
     assert ran.returncode == 0, ran.stderr
@@ -79,7 +79,7 @@ def test_an_unknown_backend_of_windows_is_none_of_our_business(tmp_path: Path) -
 
 
 def test_a_failed_request_is_logged_without_the_token() -> None:
-    server = pytest.importorskip("apc.explore.server")
+    server = pytest.importorskip("apc.app.server")
     try:
         raise OSError("of somebody else")
     except OSError:

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 from apc.compiler.errors import ApcError
-from apc.loop.packets import Address, Data, Hello, HelloReply, Post
-from apc.loop.peer import AT_ONCE, KNOCK, NANO, PeerLoop
+from apc.realtime.packets import Address, Data, Hello, HelloReply, Post
+from apc.realtime.peer import AT_ONCE, KNOCK, NANO, PeerLoop
 from tests.fuzz.packets import run_packets
 from tests.surfaces.wire import HOUR, SOON, Other, Wire, loop_at, send_packets
 from tests.topologies import AVERAGE, compiled, replaced
 
-DIGEST = hashlib.sha256(b"a scene").digest()
+DIGEST = hashlib.sha256(b"a topology").digest()
 HERE: Address = ("127.0.0.1", 5000)
 THERE: Address = ("127.0.0.1", 5009)
 MOVING = replaced(AVERAGE, ("{count: 3}", "{count: 3, set: {device.x: 3 mm}}"))
@@ -37,9 +37,9 @@ def met(secret: bytes = b"") -> tuple[Post, Post]:
     """Return the posts of peers 2 and 1 that have said hello, at `HERE` and elsewhere."""
     two, one = post(2, secret=secret), post(secret=secret)
     two.addresses = {THERE: 1}
-    asked = one.read(two.hello(0, 1), HERE)
-    assert isinstance(asked, Hello)
-    two.read(one.answer(1, asked, 2, 3, 4), THERE)
+    requested = one.read(two.hello(0, 1), HERE)
+    assert isinstance(requested, Hello)
+    two.read(one.answer(1, requested, 2, 3, 4), THERE)
     one.read(two.hello(5, 1), HERE)
     assert (two.nonces, one.nonces) == ({1: one.nonce}, {2: two.nonce})
     return two, one
@@ -64,11 +64,13 @@ def test_what_is_written_is_read(secret: bytes) -> None:
 
 @SECRETS
 def test_what_is_not_a_peers_changes_nothing_but_a_counter(secret: bytes) -> None:
-    """Random bytes, every bit of good datagrams turned, others' scenes, secrets, sessions and addresses."""
-    luck = random.Random(1)
+    """Random bytes, every bit of good datagrams turned, others' topologies, secrets, sessions and
+    addresses.
+    """
+    noise = random.Random(1)
     sender, receiver = met(secret)
     good = sender.data(17, 1, 0, 4, (1.0,)) or b""
-    said = [good, sender.hello(18, 1), sender.answer(19, Hello(1, 5, receiver.nonce, 0), 6, -1, 8)]
+    printed = [good, sender.hello(18, 1), sender.answer(19, Hello(1, 5, receiver.nonce, 0), 6, -1, 8)]
     before = dict(receiver.nonces), dict(receiver.keys)
 
     def dropped(*datagrams: bytes, address: Address = HERE) -> dict[str, int]:
@@ -77,13 +79,13 @@ def test_what_is_not_a_peers_changes_nothing_but_a_counter(secret: bytes) -> Non
         assert {receiver.read(one, address) for one in datagrams} == {None}
         return dict(receiver.dropped)
 
-    assert dropped(*(luck.randbytes(luck.randrange(200)) for _ in range(2000))) == {"malformed": 2000}
+    assert dropped(*(noise.randbytes(noise.randrange(200)) for _ in range(2000))) == {"malformed": 2000}
     torn = [
         bytes(byte ^ (1 << at % 8) * (place == at // 8) for place, byte in enumerate(one))
-        for one in said
+        for one in printed
         for at in range(8 * len(one))
     ]
-    assert dropped(*torn)["other scene"] == 3 * 8 * 8
+    assert dropped(*torn)["other topology"] == 3 * 8 * 8
     assert dropped(good, address=("127.0.0.1", 5001)) == {"stranger": 1}
     assert dropped(post(2, secret=b"another secret of some length").hello(18, 1)) == {"forged": 1}
     assert dropped(met(secret)[0].data(17, 1, 0, 4, (1.0,)) or b"") == {"forged": 1}  # of another session
@@ -97,7 +99,7 @@ def test_what_is_not_a_peers_changes_nothing_but_a_counter(secret: bytes) -> Non
 def played(
     wire: Wire, secret: bytes, value: float, replayed: Sequence[tuple[int, bytes, Address]] = ()
 ) -> PeerLoop:
-    """Play a scene with two others; all that is replayed comes at once and when it came, twice."""
+    """Play a topology with two others; all that is replayed comes at once and when it came, twice."""
     loop, start = loop_at(wire, compiled(MOVING), DIGEST, secret), wire.time
     others = [Other(wire, number, DIGEST, secret) for number in (1, 2)]
     for time, datagram, address in replayed:
@@ -148,17 +150,17 @@ def test_a_peer_that_is_started_again_is_heard_and_what_it_was_before_is_not(
     others[0].send(wire.time + SOON, 0, (0.5,) * width)
     loop.take_in(wire.time + 2 * SOON)
     before = list(wire.given)
-    again = Other(wire, 1, DIGEST, b"")
-    again.ask()
+    repeated = Other(wire, 1, DIGEST, b"")
+    repeated.ask()
     loop.take_in(wire.time + 2 * SOON)  # it now knows this peer's nonce, and this peer not yet its own
     assert loop.post.nonces[1] == others[0].post.nonce
     for count in (1, 2):
-        again.send(wire.time + SOON, count, (0.75,) * width)
+        repeated.send(wire.time + SOON, count, (0.75,) * width)
         loop.take_in(wire.time + KNOCK)
     for _, datagram, address in before:
         wire.send(datagram, address)
     loop.take_in(wire.time + KNOCK)
-    assert loop.post.nonces[1] == again.post.nonce
+    assert loop.post.nonces[1] == repeated.post.nonce
     assert [row[1:3] for row in loop.player.arrivals] == [(1, 0), (1, 2)]
     assert set(loop.post.dropped) == {"forged", "heard before"}
 
@@ -179,7 +181,7 @@ def test_nobody_is_there_who_says_what_was_said_in_another_session(monkeypatch: 
 def test_peers_whose_clocks_were_started_at_different_times_begin_at_one_instant(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A clock that is never set counts from when its host was started, even after the scene began."""
+    """A clock that is never set counts from when its host was started, even after the topology began."""
     for ahead in (HOUR, -HOUR):
         wire = Wire(monkeypatch)
         loop = loop_at(wire, compiled(MOVING), DIGEST, b"", "2")
@@ -216,16 +218,16 @@ def test_a_ticks_packets_are_those_that_had_come(monkeypatch: pytest.MonkeyPatch
     player = loop.player
     loop.begins = 1
     period, values = 8_000_000, (0.25,) * len(player.links[0].channels_of(1))
-    way = player.routes[0].pairs.tolist().index([1, 0])
+    coupling_term = player.routes[0].pairs.tolist().index([1, 0])
 
     def newest(at: int) -> int:
         """Return the packet that a tick sees at the end of a period."""
         player.instant = at * period
         player._sees(0, 0, ())
-        return int(player.newest[0][way])
+        return int(player.newest[0][coupling_term])
 
     for count, came in ((3, 3 * period + 1), (2, 3 * period + 2)):
-        player.hear(Data(1, 0, 0, count, values), came)
+        player.receive(Data(1, 0, 0, count, values), came)
     assert newest(5) == 3, "the newest wins"
     for sender, link, count, came, given in (
         (1, 0, 3, 3 * period + 3, values),
@@ -236,17 +238,17 @@ def test_a_ticks_packets_are_those_that_had_come(monkeypatch: pytest.MonkeyPatch
         (0, 0, 4, 4 * period, values),
         (1, 0, 6, 6 * period, values),  # of later than the instant that this peer is at
     ):
-        player.hear(Data(sender, 0, link, count, given), came)
+        player.receive(Data(sender, 0, link, count, given), came)
     assert newest(5) == 3
     assert loop.post.dropped == {"heard before": 1, "early": 1, "late": 1, "malformed": 3}
     assert [row[2] for row in player.arrivals] == [3, 2, 6]
     assert newest(6) == 6
-    before, luck = player.packets.copy(), random.Random(2)
+    before, noise = player.packets.copy(), random.Random(2)
     loop.post.dropped.clear()
     for _ in range(10_000):
-        player.hear(Data(1, 0, 0, 6, (luck.random(),) * len(values)), 6 * period)
-        player.hear(Data(1, 0, 0, luck.randrange(20, 2**60), values), 6 * period)
-        player.hear(Data(1, 0, 0, luck.randrange(1000), values), 2000 * loop.frame_ns)
+        player.receive(Data(1, 0, 0, 6, (noise.random(),) * len(values)), 6 * period)
+        player.receive(Data(1, 0, 0, noise.randrange(20, 2**60), values), 6 * period)
+        player.receive(Data(1, 0, 0, noise.randrange(1000), values), 2000 * loop.frame_ns)
     assert loop.post.dropped == {"heard before": 10_000, "early": 10_000, "late": 10_000}
     assert (player.packets == before).all()
     assert len(player.arrivals) == 3
@@ -258,16 +260,16 @@ def test_a_peer_that_is_far_behind_loses_packets_and_hears_none_in_the_place_of_
     """Stopped for two seconds, of which packets of one are kept: what would overwrite those is let go."""
     loop = loop_at(Wire(monkeypatch), compiled(MOVING), DIGEST, b"", "4")
     loop.begins, player = 1, loop.player
-    width, kept = len(loop.player.links[0].channels_of(1)), player.population.hearing.ring
-    for count in range(2 * kept):
-        player.hear(Data(1, 0, 0, count, (float(count),) * width), 2 * kept * loop.frame_ns - 1)
-        player.hear(Data(2, 0, 0, count, (float(count),) * width), count * loop.frame_ns)
-    heard = [row[2] for row in player.arrivals if row[1] == 2]
-    assert heard == list(range(kept - 3))
-    column, link = player.population.hearing.column_of[2], player.links[0]
-    for count in heard:
+    width, stored = len(loop.player.links[0].channels_of(1)), player.population.exchange_program.ring
+    for count in range(2 * stored):
+        player.receive(Data(1, 0, 0, count, (float(count),) * width), 2 * stored * loop.frame_ns - 1)
+        player.receive(Data(2, 0, 0, count, (float(count),) * width), count * loop.frame_ns)
+    received = [row[2] for row in player.arrivals if row[1] == 2]
+    assert received == list(range(stored - 3))
+    column, link = player.population.exchange_program.column_of[2], player.links[0]
+    for count in received:
         keys = [link.keys[channel, 0] for channel in link.channels_of(2)]
-        assert (player.packets[count % kept, keys, column] == count).all()
+        assert (player.packets[count % stored, keys, column] == count).all()
 
 
 def test_of_answers_the_shortest_round_trip_tells_a_clock_and_the_first_the_beginning(
@@ -275,8 +277,8 @@ def test_of_answers_the_shortest_round_trip_tells_a_clock_and_the_first_the_begi
 ) -> None:
     """A peer that starts slowly answers old hellos: these are answers too."""
     loop = loop_at(Wire(monkeypatch), compiled(MOVING), DIGEST, b"", "1")
-    for asked, begins in ((1_000, 0), (2_000, 9_000), (1_000, 8_000)):
-        loop._met(HelloReply(1, 5_000, 3, 4, asked, 4_000, begins, int(begins > 0)), 6_000)
+    for requested, begins in ((1_000, 0), (2_000, 9_000), (1_000, 8_000)):
+        loop._connected(HelloReply(1, 5_000, 3, 4, requested, 4_000, begins, int(begins > 0)), 6_000)
     assert loop.offsets[1][0] == 6_000 - 2_000 - 1_000
     assert loop.began is not None
     assert loop.began.begins == 9_000

@@ -14,7 +14,7 @@ import pytest
 from apc.benchmark.scale import scale
 from apc.compiler.errors import ApcError
 from apc.processes import local_processes, model_bytes
-from apc.simulation.ensemble import play_many
+from apc.simulation.monte_carlo import simulate_many
 from apc.simulation.settings import Settings
 from apc.sweeps.grid import build_grid, parse_axis
 from apc.sweeps.resumable_sweep import LOST, sweep
@@ -62,22 +62,22 @@ def test_processes_end_at_once_whatever_they_do() -> None:
 STARTING = """\
 import sys
 from apc.__main__ import run
-from apc.explore.desk import Desk
-from apc.explore.sections import Task
-from apc.inputs import open_scene
+from apc.app.worker_process import Desk
+from apc.app.sections import Task
+from apc.inputs import open_topology
 from apc.processes import model_bytes
 
 if __name__ == "__main__":
     over = ["--over", "contact.stiffness=1 N/m:2 N/m:130"]
-    ran = [run(["sweep", "scene.yaml", *over, "--jobs", "2", "--out", "r.csv"])]
+    ran = [run(["sweep", "topology.yaml", *over, "--jobs", "2", "--out", "r.csv"])]
     if sys.argv[1:] == ["sweep"]:
         raise SystemExit(any(ran))
     ran += [
         run(["simulate", "lossy.yaml", "--duration", "40 ms", "--runs", "80", "--jobs", "2"]),
-        run(["bench", "scene.yaml", "--scale", "3,4"]),
-        run(["play", "scene.yaml", "--duration", "40 ms"]),
+        run(["bench", "topology.yaml", "--scale", "3,4"]),
+        run(["run", "topology.yaml", "--duration", "40 ms"]),
     ]
-    model = model_bytes(open_scene("scene.yaml", ()))
+    model = model_bytes(open_topology("topology.yaml", ()))
     desk = Desk(model, ("motion",), lambda call, _: call(), lambda *_: None)
     desk.ask(Task("motion", (), None))
     desk.close()
@@ -91,7 +91,7 @@ def test_no_process_that_is_started_runs_what_lies_beside_a_topology(what: str, 
     script, folder = tmp_path / "script.py", tmp_path / "folder"
     script.write_text(STARTING, encoding="utf-8")
     folder.mkdir()
-    (folder / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    (folder / "topology.yaml").write_text(AVERAGE, encoding="utf-8")
     (folder / "lossy.yaml").write_text(LOSSY, encoding="utf-8")
     for name in (*sys.stdlib_module_names, "apc", "casadi", "numpy", "scipy"):
         (folder / f"{name}.py").write_text(f"open('{name}.ran', 'w')\n", encoding="utf-8")
@@ -126,7 +126,7 @@ def test_an_interrupt_ends_the_processes_at_once_and_keeps_the_runs_that_are_don
         raise KeyboardInterrupt
 
     settings = Settings(Fraction(1, 10), jit=False)
-    found = play_many(compiled(LOSSY), settings, runs=400, jobs=2, progress=stop)
+    found = simulate_many(compiled(LOSSY), settings, runs=400, jobs=2, progress=stop)
     assert found.interrupted and 0 < len(found.runs) < 400
     assert set(workers_of_mine()) <= before
 
@@ -135,9 +135,9 @@ def test_an_interrupt_ends_the_processes_at_once_and_keeps_the_runs_that_are_don
 def test_a_number_of_peers_whose_process_is_lost_is_refused_and_the_others_are_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    (tmp_path / "topology.yaml").write_text(AVERAGE, encoding="utf-8")
     monkeypatch.setattr("apc.benchmark.scale._measure", _lost_at_four)
-    found = scale(tmp_path / "scene.yaml", [4, 5])
+    found = scale(tmp_path / "topology.yaml", [4, 5])
     assert list(found.rows) == [5]
     assert found.refused == (
         (4, "the process that measured it ended without a word: stopped from outside, or out of memory"),

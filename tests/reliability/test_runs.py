@@ -1,4 +1,4 @@
-"""Files of a run of `apc play`: written whole or not at all, read as data, refused where no run can be."""
+"""Files of a run of `apc run`: written whole or not at all, read as data, refused where no run can be."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ import pytest
 
 import apc
 from apc.compiler.errors import ApcError
-from apc.loop.run import PeerRun, run_of, write_run
-from apc.loop.run_folder import read_run
 from apc.processes import digest_of
+from apc.realtime.peer_run import PeerRun, run_of, write_run
+from apc.realtime.run_folder import read_run
 from tests.fuzz.models import recorded
 from tests.surfaces.wire import Wire, loop_at
 from tests.topologies import AVERAGE, compiled, told
 
 
 @pytest.fixture
-def kept(tmp_path: Path) -> Path:
+def stored(tmp_path: Path) -> Path:
     """Return the folder of a run of two peers."""
     folder = tmp_path / "a.run"
     folder.mkdir()
@@ -40,11 +40,11 @@ def changed(folder: Path, **how: Callable[[Any], Any]) -> None:
     path = folder / "user-1.npz"
     with np.load(path) as found:
         arrays = dict(found)
-    told = json.loads(arrays["told"].tobytes())
+    told = json.loads(arrays["record"].tobytes())
     for name, change in how.items():
-        kept = told if name in told else arrays
-        kept[name] = change(kept[name])
-    arrays["told"] = np.frombuffer(json.dumps(told).encode(), np.uint8)
+        stored = told if name in told else arrays
+        stored[name] = change(stored[name])
+    arrays["record"] = np.frombuffer(json.dumps(told).encode(), np.uint8)
     np.savez_compressed(path, **arrays)
 
 
@@ -68,7 +68,7 @@ def put(place: Any, number: float) -> Callable[[Any], Any]:
         ("time", put(-1, 1e9), "it leaves out a frame or more"),
         ("time", lambda array: array[:-1], "it has not one value of each signal at each time"),
         ("values", lambda array: array.ravel(), "its values has 1 dimensions, not 2"),
-        ("late", put(0, -1.0), "a tick began, or took, no time there is"),
+        ("delayed", put(0, -1.0), "a tick began, or took, no time there is"),
         ("took", put(0, math.inf), "a tick began, or took, no time there is"),
         ("took", lambda array: array[1:], "its ticks did not begin as often as they ended"),
         ("arrivals", put((0, 0), 1), "a packet came from where none comes"),
@@ -77,66 +77,66 @@ def put(place: Any, number: float) -> Callable[[Any], Any]:
         ("arrivals", put((0, 4), 2**63 - 1), "a packet came at no time that there is"),
         ("arrivals", lambda array: array[:, 1:], "what came is not told in five numbers"),
         ("packets0", put((0, 0), -2), "a packet has a number that none has"),
-        ("packets0", lambda array: array[:, :0], "it hears other peers than the scene's"),
+        ("packets0", lambda array: array[:, :0], "it hears other peers than the topology's"),
         ("missing0", lambda array: array.astype(np.int64), "its missing0 is no array of |b1"),
-        ("number", lambda _: 1, "the scene has no such peer"),
-        ("name", lambda _: "../../x", "the scene has no such peer"),
+        ("number", lambda _: 1, "the topology has no such peer"),
+        ("name", lambda _: "../../x", "the topology has no such peer"),
         ("first", lambda _: -1, "it joins after the end"),
-        ("signals", lambda listed: listed[1:], "its signals are not those of the scene"),
+        ("signals", lambda listed: listed[1:], "its signals are not those of the topology"),
         ("dropped", lambda _: {"late": -1}, "a count is negative"),
         ("dropped", lambda _: {"x": 1}, "datagrams are dropped for no known reason"),
         ("sent", lambda _: {0: {1: -1}}, "a count is negative"),
         ("sent", lambda _: {9: {1: 1}}, "it tells of a peer or link that isn't there"),
         ("offsets", lambda _: {9: [0.0, 0.0]}, "it tells of a peer or link that isn't there"),
-        ("offsets", lambda _: {1: [math.nan, 0.0]}, "what it tells is not what apc play writes"),
-        ("stopped", lambda _: 1, "what it tells is not what apc play writes"),
-        ("not_given", lambda _: ["\x1b[2J"], "what it tells is not what apc play writes"),
+        ("offsets", lambda _: {1: [math.nan, 0.0]}, "what it tells is not what apc run writes"),
+        ("stopped", lambda _: 1, "what it tells is not what apc run writes"),
+        ("not_given", lambda _: ["\x1b[2J"], "what it tells is not what apc run writes"),
     ],
 )
-def test_what_no_peer_of_the_scene_can_have_done_is_refused(
-    kept: Path, name: str, change: Callable[[Any], Any], why: str
+def test_what_no_peer_of_the_topology_can_have_done_is_refused(
+    stored: Path, name: str, change: Callable[[Any], Any], why: str
 ) -> None:
-    assert len(read_run(kept).peers) == 2
-    changed(kept, **{name: change})
-    (message,) = told(read_run, kept)
-    assert message.startswith(f"{kept / 'user-1.npz'}: E973 is no peer of this run: {why}")
+    assert len(read_run(stored).peers) == 2
+    changed(stored, **{name: change})
+    (message,) = told(read_run, stored)
+    assert message.startswith(f"{stored / 'user-1.npz'}: E973 is no peer of this run: {why}")
 
 
-def test_a_run_beside_another_scene_is_refused(kept: Path) -> None:
+def test_a_run_beside_another_topology_is_refused(stored: Path) -> None:
     """One of the same structure, whose numbers differ: what happened would be laid beside its motion."""
-    found = apc.load(kept / "scene.apc")
-    apc.save(apc.set_parameters(found, {"coordination.stiffness": "600 N/m"}), kept / "scene.apc")
-    assert "E973 its scene.apc is not the scene that was played" in told(lambda: read_run(kept))[0]
+    found = apc.load(stored / "topology.apc")
+    apc.save(apc.set_parameters(found, {"coordination.stiffness": "600 N/m"}), stored / "topology.apc")
+    assert "E973 its topology.apc is not the topology that was played" in told(lambda: read_run(stored))[0]
 
 
-def test_what_is_no_file_of_a_peer_is_refused_at_once(kept: Path) -> None:
-    path, bomb = kept / "user-1.npz", io.BytesIO()
+def test_what_is_no_file_of_a_peer_is_refused_at_once(stored: Path) -> None:
+    path, bomb = stored / "user-1.npz", io.BytesIO()
     np.savez_compressed(bomb, told=np.zeros((8 << 20) - 128, np.uint8))
     path.write_bytes(
         bomb.getvalue().replace((8 << 20).to_bytes(4, "little"), (1 << 31).to_bytes(4, "little"))
     )
-    assert "E973 is no peer of this run: it unpacks to more than 1024 MiB." in told(read_run, kept)[0]
+    assert "E973 is no peer of this run: it unpacks to more than 1024 MiB." in told(read_run, stored)[0]
     path.unlink()
     os.mkfifo(path)  # who opens it waits for ever
-    assert "E973 is no peer of this run: is a device, pipe or socket." in told(read_run, kept)[0]
+    assert "E973 is no peer of this run: is a device, pipe or socket." in told(read_run, stored)[0]
     path.unlink()
     path.symlink_to("user-2.npz")
-    assert "E973 holds a peer twice" in told(read_run, kept)[0]
-    (kept / "user-3.npz").symlink_to("user-2.npz")
-    assert "E973 holds 3 peers of a scene with 2" in told(read_run, kept)[0]
+    assert "E973 holds a peer twice" in told(read_run, stored)[0]
+    (stored / "user-3.npz").symlink_to("user-2.npz")
+    assert "E973 holds 3 peers of a topology with 2" in told(read_run, stored)[0]
 
 
-def test_a_run_is_not_written_to_where_links_in_its_folder_lead(kept: Path, tmp_path: Path) -> None:
-    found, mine = read_run(kept), tmp_path / "mine.txt"
+def test_a_run_is_not_written_to_where_links_in_its_folder_lead(stored: Path, tmp_path: Path) -> None:
+    found, mine = read_run(stored), tmp_path / "mine.txt"
     mine.write_text("mine", encoding="utf-8")
-    names = sorted(path.name for path in kept.iterdir())
-    assert len(names) == 5, "the scene, two peers and a way each"
+    names = sorted(path.name for path in stored.iterdir())
+    assert len(names) == 5, "the topology, two peers and a way each"
     for name in names:
-        (kept / name).unlink()
-        (kept / name).symlink_to(mine)
-    write_run(kept, found.system, found.peers)
+        (stored / name).unlink()
+        (stored / name).symlink_to(mine)
+    write_run(stored, found.system, found.peers)
     assert mine.read_text() == "mine"
-    assert len(read_run(kept).peers) == 2
+    assert len(read_run(stored).peers) == 2
 
 
 def written(folder: Path) -> dict[str, bytes]:
@@ -152,16 +152,16 @@ def renamed(peer: PeerRun, at: int) -> PeerRun:
 def test_a_run_is_put_in_place_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On a disk that is full after one of two peers the older run stays, and where none was, none is."""
     folder, save = tmp_path / "a.run", np.savez_compressed
-    scene = compiled(AVERAGE)
-    digest = digest_of(scene)
-    first = run_of(loop_at(Wire(monkeypatch), scene, digest, b""), digest, ())
+    topology = compiled(AVERAGE)
+    digest = digest_of(topology)
+    first = run_of(loop_at(Wire(monkeypatch), topology, digest, b""), digest, ())
     one, two, three = (renamed(first, at) for at in range(3))
     one = replace(one, arrivals=np.array([[0, 1, 5, 40, 50]]))
-    write_run(folder, scene, [one, two, three], whole=True)
+    write_run(folder, topology, [one, two, three], whole=True)
     before = written(folder)
     assert sorted(before) == [
         "lan-user-2-to-user-1.csv",
-        "scene.apc",
+        "topology.apc",
         *(f"user-{at}.npz" for at in (1, 2, 3)),
     ]
 
@@ -176,16 +176,16 @@ def test_a_run_is_put_in_place_whole_or_not_at_all(tmp_path: Path, monkeypatch: 
     for whole in (True, False):
         for target in (folder, tmp_path / "b.run"):
             with pytest.raises(ApcError, match=f"{target.name}: E601 can't be written: No space left"):
-                write_run(target, scene, later, whole=whole)
+                write_run(target, topology, later, whole=whole)
     assert written(folder) == before
     assert [path.name for path in tmp_path.iterdir()] == ["a.run"]
     monkeypatch.setattr(np, "savez_compressed", save)
     (folder / "notes.txt").write_text("mine", encoding="utf-8")
-    write_run(folder, scene, [replace(three, session=7)])  # one that plays by itself
+    write_run(folder, topology, [replace(three, session=7)])  # one that plays by itself
     with pytest.raises(ApcError, match="E973 holds peers that did not play together: of other runs"):
         read_run(folder)
-    write_run(folder, scene, later, whole=True)
+    write_run(folder, topology, later, whole=True)
     assert sorted(written(folder)) == sorted(
-        ["lan-user-2-to-user-1.csv", "notes.txt", "scene.apc", "user-1.npz", "user-2.npz"]
+        ["lan-user-2-to-user-1.csv", "notes.txt", "topology.apc", "user-1.npz", "user-2.npz"]
     )
     assert [peer.session for peer in read_run(folder).peers] == [7, 7]

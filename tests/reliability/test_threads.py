@@ -41,9 +41,9 @@ def _begun(environment: dict[str, str]) -> str:
         "print({p['num_threads'] for p in threadpoolctl.threadpool_info()}, end=' ')\n"
         "print([os.environ.get(name) for name in POOLS])"
     )
-    kept = {name: value for name, value in os.environ.items() if name not in POOLS}
+    stored = {name: value for name, value in os.environ.items() if name not in POOLS}
     run = [sys.executable, "-c", code]
-    return subprocess.run(run, env=kept | environment, capture_output=True, text=True, check=True).stdout
+    return subprocess.run(run, env=stored | environment, capture_output=True, text=True, check=True).stdout
 
 
 def test_a_command_of_small_matrices_makes_no_threads() -> None:
@@ -58,7 +58,7 @@ def test_the_environment_stays_once_the_libraries_are_loaded(monkeypatch: pytest
 
 
 def test_what_brings_a_pool_is_loaded_where_it_is_limited() -> None:
-    """Blocks of one thread are entered before a large scene asks for SciPy's linear algebra."""
+    """Blocks of one thread are entered before a large topology asks for SciPy's linear algebra."""
     for path in (ROOT / "runtime").rglob("*.py"):
         text = path.read_text(encoding="utf-8")
         assert not re.search(r"import scipy\.(sparse\.)?linalg|from scipy\.(sparse\.)?linalg", text), path

@@ -281,41 +281,41 @@ WITH_TABLE = replaced(AVERAGE, ("{count: 3}", "{table: users.csv}"))
 
 
 @pytest.fixture
-def scene(cli: Cli) -> Cli:
-    write("scene.yaml", AVERAGE)
+def topology(cli: Cli) -> Cli:
+    write("topology.yaml", AVERAGE)
     return cli
 
 
 @FIFO
-def test_a_pipe_as_a_model_or_as_a_table_is_not_waited_for(scene: Cli) -> None:
-    os.mkfifo("scene.apc")
-    assert scene("analyze scene.yaml").code == 0
-    assert "E602 is a device, pipe or socket, not a compiled model." in scene("analyze scene.apc").err
+def test_a_pipe_as_a_model_or_as_a_table_is_not_waited_for(topology: Cli) -> None:
+    os.mkfifo("topology.apc")
+    assert topology("analyze topology.yaml").code == 0
+    assert "E602 is a device, pipe or socket, not a compiled model." in topology("analyze topology.apc").err
     os.mkfifo("users.csv")
-    write("scene.yaml", WITH_TABLE)
-    assert "E701 the table users.csv is a device, pipe or socket." in scene("check").err
+    write("topology.yaml", WITH_TABLE)
+    assert "E701 the table users.csv is a device, pipe or socket." in topology("check").err
 
 
 @FIFO
-def test_a_model_is_never_compiled_into_what_is_none(scene: Cli) -> None:
+def test_a_model_is_never_compiled_into_what_is_none(topology: Cli) -> None:
     """Whoever packed a folder may have put anything under the model's name."""
-    model = Path("scene.apc")
+    model = Path("topology.apc")
     write("own.txt", "mine")
     os.mkfifo("pipe")
     link, special = (
-        f"scene.apc: E601 can't be written: it is {what}. Write: rm scene.apc\n"
+        f"topology.apc: E601 can't be written: it is {what}. Write: rm topology.apc\n"
         for what in ("a link to what is no compiled model", "a device, pipe or socket")
     )
     for target, message in (("own.txt", link), ("new.txt", link), ("pipe", special), ("/dev/zero", special)):
         model.symlink_to(target)
-        assert scene("compile scene.yaml") == (1, "", message)
+        assert topology("compile topology.yaml") == (1, "", message)
         model.unlink()
     os.mkfifo(model)
-    assert scene("compile scene.yaml") == (1, "", special)
+    assert topology("compile topology.yaml") == (1, "", special)
     model.unlink()
     assert Path("own.txt").read_text() == "mine" and not Path("new.txt").exists()
     model.symlink_to("other.apc")
-    assert scene("compile scene.yaml").code == 0
+    assert topology("compile topology.yaml").code == 0
     assert model.is_symlink() and Path("other.apc").is_file()
 
 
@@ -328,13 +328,13 @@ def test_a_model_is_never_compiled_into_what_is_none(scene: Cli) -> None:
     ],
 )
 def test_a_folder_without_end_is_no_library(
-    scene: Cli, monkeypatch: pytest.MonkeyPatch, library: str, message: str
+    topology: Cli, monkeypatch: pytest.MonkeyPatch, library: str, message: str
 ) -> None:
     Path("deep/a/b/c").mkdir(parents=True)
-    write("scene.yaml", f"library: {library}\n{AVERAGE}")
+    write("topology.yaml", f"library: {library}\n{AVERAGE}")
     monkeypatch.setattr(files, "MOST_ENTRIES", 9 if library == "deep" else 3)
     monkeypatch.setattr(files, "MOST_DEPTH", 2)
-    assert message in scene("check scene.yaml").err
+    assert message in topology("check topology.yaml").err
 
 
 SECRET = "root:$6$abc:19000:0:99999:7:::"
@@ -353,7 +353,7 @@ SECRET = "root:$6$abc:19000:0:99999:7:::"
         f"token: [{SECRET}\nroot: {{\n",
     ],
 )
-def test_a_file_about_something_else_is_told_without_its_text(scene: Cli, text: str) -> None:
+def test_a_file_about_something_else_is_told_without_its_text(topology: Cli, text: str) -> None:
     Path("parts").mkdir()
     for name, changed in (
         ("users.csv", WITH_TABLE),
@@ -361,42 +361,42 @@ def test_a_file_about_something_else_is_told_without_its_text(scene: Cli, text: 
         ("parts/config.yaml", f"library: ./parts\n{AVERAGE}"),
     ):
         write(name, text)
-        write("scene.yaml", changed)
-        ran = scene("check")
-        wanted = "E70" if name == "users.csv" else "E219" if "token" in text else ""
-        assert wanted in ran.err
+        write("topology.yaml", changed)
+        ran = topology("check")
+        requested = "E70" if name == "users.csv" else "E219" if "token" in text else ""
+        assert requested in ran.err
         assert not any(word in ran.err for word in ("root", "SS", "ghp"))
 
 
 # Every option that names a file to write, with what else its command wants.
-SHORT = "scene.yaml --duration 40ms"
+SHORT = "topology.yaml --duration 40ms"
 WRITING = {
-    ("analyze", "--plot"): ("scene.yaml", "new.svg"),
-    ("bench", "--plot"): ("scene.yaml", "new.svg"),
-    ("compare", "--out"): ("scene.yaml", "new.json"),
-    ("critical", "--plot"): ("contact.stiffness scene.yaml", "new.svg"),
-    ("export", "--out"): ("scene.yaml", "new.npz"),
-    ("feel", "--out"): ("scene.yaml", "new.csv"),
+    ("analyze", "--plot"): ("topology.yaml", "new.svg"),
+    ("bench", "--plot"): ("topology.yaml", "new.svg"),
+    ("compare", "--out"): ("topology.yaml", "new.json"),
+    ("critical", "--plot"): ("contact.stiffness topology.yaml", "new.svg"),
+    ("export", "--out"): ("topology.yaml", "new.npz"),
+    ("transparency", "--out"): ("topology.yaml", "new.csv"),
     ("network", "--out"): ("delays.csv", "new.csv"),
     ("new", "--out"): ("--list", "new.html"),
     ("region", "--out"): (
-        "scene.yaml --x contact.stiffness=1N/m:2N/m --y coordination.stiffness=1N/m:2N/m",
+        "topology.yaml --x contact.stiffness=1N/m:2N/m --y coordination.stiffness=1N/m:2N/m",
         "new.csv",
     ),
-    ("report", "--out"): ("scene.yaml", "new.html"),
+    ("report", "--out"): ("topology.yaml", "new.html"),
     ("schema", "--out"): ("", "new.json"),
-    ("show", "--out"): ("scene.yaml", "new.txt"),
+    ("show", "--out"): ("topology.yaml", "new.txt"),
     ("simulate", "--out"): (SHORT, "new.csv"),
     ("simulate", "--plot"): (SHORT, "new.svg"),
-    ("simulate", "--still"): (SHORT, "new.svg"),
-    ("sweep", "--out"): ("scene.yaml --over contact.stiffness=1N/m:2N/m:2 --jobs 1", "new.csv"),
+    ("simulate", "--snapshot"): (SHORT, "new.svg"),
+    ("sweep", "--out"): ("topology.yaml --over contact.stiffness=1N/m:2N/m:2 --jobs 1", "new.csv"),
     ("tune", "--write"): (
-        "scene.yaml --free contact.stiffness=1N/m:9N/m --maximize contact.stiffness",
+        "topology.yaml --free contact.stiffness=1N/m:9N/m --maximize contact.stiffness",
         "a.yaml",
     ),
 }
 # A folder, which has a test of its own; read and not written; a picture whose command takes half a minute.
-OTHERS = {("play", "--out"), ("play", "--device"), ("play", "--secret-file"), ("bench", "--hard"),
+OTHERS = {("run", "--out"), ("run", "--device"), ("run", "--secret-file"), ("bench", "--hard"),
           ("report", "--check"), ("tune", "--plot"), ("library", "--folder")}  # fmt: skip
 
 
@@ -411,17 +411,17 @@ def test_every_option_that_names_a_file_to_write_is_known_here() -> None:
     assert options == {*WRITING, *OTHERS}
 
 
-INPUTS = ("scene.yaml", "users.csv", "scene.apc", "delays.csv")  # a recording last
+INPUTS = ("topology.yaml", "users.csv", "topology.apc", "delays.csv")  # a recording last
 
 
 @pytest.fixture
-def inputs(scene: Cli) -> Cli:
+def inputs(topology: Cli) -> Cli:
     """Run commands where there are a topology, its table and compiled model, and a recording."""
     write("users.csv", TABLE)
-    write("scene.yaml", WITH_TABLE)
+    write("topology.yaml", WITH_TABLE)
     write("delays.csv", "delay [ms]\n1\n2\nlost\n3\n")
-    assert scene("compile scene.yaml").code == 0
-    return scene
+    assert topology("compile topology.yaml").code == 0
+    return topology
 
 
 @pytest.mark.few(10)
@@ -446,46 +446,47 @@ def test_a_link_to_what_a_command_reads_is_refused_and_a_file_that_is_read_only_
 
 
 @pytest.mark.parametrize(
-    ("line", "beside"),
+    ("line", "alongside"),
     [
-        ("export scene.yaml --peer user[1] --out new.c", "new.h"),
-        ("export scene.yaml --peer user[1] --out new.c", "new_test.c"),
+        ("export topology.yaml --peer user[1] --out new.c", "new.h"),
+        ("export topology.yaml --peer user[1] --out new.c", "new_test.c"),
         (f"simulate {SHORT} --out new.csv", "new.csv.json"),
     ],
 )
 def test_beside_what_is_asked_for_nothing_that_is_read_is_replaced(
-    inputs: Cli, line: str, beside: str
+    inputs: Cli, line: str, alongside: str
 ) -> None:
-    Path(beside).symlink_to("scene.apc")
+    Path(alongside).symlink_to("topology.apc")
     ran = inputs(line)
-    assert ran.code == 1 and f"{beside}: E616 is read by this command" in ran.err
-    assert "E973 holds the scene that is played" in inputs(f"play {SHORT} --out .").err
+    assert ran.code == 1 and f"{alongside}: E616 is read by this command" in ran.err
+    assert "E973 holds the topology that is played" in inputs(f"run {SHORT} --out .").err
 
 
 @pytest.mark.parametrize(
     ("line", "message"),
     [
         (
-            "sweep scene.yaml --over contact.stiffness=1N/m:2N/m:2 --out users.csv",
+            "sweep topology.yaml --over contact.stiffness=1N/m:2N/m:2 --out users.csv",
             "users.csv: E616 is read by this command: --out would replace it. Write: --out users-result.csv",
         ),
         (
-            "show scene.txt --out scene.txt",
-            "scene.txt: E616 is read by this command: --out would replace it. Write: --out scene-result.txt",
+            "show topology.txt --out topology.txt",
+            "topology.txt: E616 is read by this command: --out would replace it. Write: --out "
+            "topology-result.txt",
         ),
         (
-            "simulate scene.yaml --duration 1s --plot a.png --still ./a.png",
-            "a.png: E616 is given to --plot and to --still: the second would replace the first. "
-            "Write: --still a-result.png",
+            "simulate topology.yaml --duration 1s --plot a.png --snapshot ./a.png",
+            "a.png: E616 is given to --plot and to --snapshot: the second would replace the first. "
+            "Write: --snapshot a-result.png",
         ),
     ],
 )
 def test_what_a_command_reads_it_never_replaces(inputs: Cli, line: str, message: str) -> None:
-    write("scene.txt", AVERAGE)
+    write("topology.txt", AVERAGE)
     assert inputs(line) == (1, "", f"{message}\n")
-    assert (Path("users.csv").read_text(), Path("scene.txt").read_text()) == (TABLE, AVERAGE)
+    assert (Path("users.csv").read_text(), Path("topology.txt").read_text()) == (TABLE, AVERAGE)
     over = {"contact.stiffness": "1 N/m:2 N/m:2"}
-    assert told(lambda: apc.sweep("scene.yaml", over, out="users.csv")) == [
+    assert told(lambda: apc.sweep("topology.yaml", over, out="users.csv")) == [
         'users.csv: E616 is read by this command: out would replace it. Write: out="users-result.csv"'
     ]
 
@@ -504,18 +505,18 @@ def test_what_a_command_reads_it_never_replaces(inputs: Cli, line: str, message:
 def test_a_device_takes_the_text_of_a_command_and_its_words_stand_beside(
     capfd: pytest.CaptureFixture[str], line: str, start: str
 ) -> None:
-    write("scene.yaml", AVERAGE)
+    write("topology.yaml", AVERAGE)
     assert run([*line.split(), "--out", "/dev/stdout"]) == 0
     out, err = capfd.readouterr()
     assert out.startswith(start)
     assert "/dev/stdout" in err and "/dev/stdout" not in out
     assert run([*line.split(), "--out", os.devnull]) == 0
-    assert folder() == ["scene.yaml"]
+    assert folder() == ["topology.yaml"]
     assert not Path(f"{os.devnull}.parts").exists() and not Path(f"{os.devnull}.json").exists()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere every name is a text")
-def test_a_scene_whose_name_is_no_text_is_simulated(cli: Cli) -> None:
+def test_a_topology_whose_name_is_no_text_is_simulated(cli: Cli) -> None:
     name = os.fsdecode(b"b\xff.yaml")
     write(name, AVERAGE)
     assert cli("simulate --duration 20ms --no-jit", name, "--out", f"{name}.csv").code == 0

@@ -1,4 +1,4 @@
-"""A scene's page in a headless Chromium: served, opened, and its sliders moved.
+"""A topology's page in a headless Chromium: served, opened, and its sliders moved.
 
 Takes: a topology. Gives: `CHROMIUM`, `served`, `launched`, `Tab`; `MODEL`, `VERDICT`.
 """
@@ -27,7 +27,7 @@ VERDICT = f"{MODEL}('verdict').text"
 
 @contextmanager
 def served(path: Path, *words: str) -> Iterator[str]:
-    """Serve a scene and give its link; at the end Ctrl-C ends it, and it has nothing to complain of."""
+    """Serve a topology and give its link; at the end Ctrl-C ends it, and it has nothing to complain of."""
     command = [sys.executable, "-m", "apc", "explore", str(path), "--no-browser", *words]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:

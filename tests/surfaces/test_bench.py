@@ -18,10 +18,10 @@ from apc.benchmark.scale import scale
 from apc.benchmark.speed_and_error import SAME, Bench, MethodTiming, bench, pareto_front
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
-from apc.present.bench_output import bench_picture
+from apc.output.bench_output import bench_picture
 from tests.commands import Cli, write
 from tests.hard.truths import HERE, TRUTHS, truth_of
-from tests.topologies import AVERAGE, SCENES, compiled, replaced
+from tests.topologies import AVERAGE, TOPOLOGIES, compiled, replaced
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def found() -> Bench:
     return bench(compiled(AVERAGE), rounds=1, duration=Fraction(1, 50))
 
 
-def _one(name: str, seconds: float, error: float | None, spread: float = 0.0) -> MethodTiming:
+def _single(name: str, seconds: float, error: float | None, spread: float = 0.0) -> MethodTiming:
     return MethodTiming(name, seconds, spread, 3, error, None, False)
 
 
@@ -37,12 +37,20 @@ def _one(name: str, seconds: float, error: float | None, spread: float = 0.0) ->
     ("measured", "front"),
     [
         (
-            [_one("b", 2.0, 1e-5), _one("c", 3.0, 1e-4), _one("a", 1.0, 1e-3), _one("d", 4.0, 1e-9)],
+            [
+                _single("b", 2.0, 1e-5),
+                _single("c", 3.0, 1e-4),
+                _single("a", 1.0, 1e-3),
+                _single("d", 4.0, 1e-9),
+            ],
             {"a": True, "b": True, "c": False, "d": True},
         ),
-        ([_one("a", 1.0, 1e-9, 0.2), _one("b", 1.1, 1e-9, 0.1)], {"a": True, "b": True}),  # within spread
-        ([_one("a", 1.0, SAME / 2), _one("b", 2.0, 0.0)], {"a": True, "b": False}),  # but for rounding
-        ([_one("a", 1.0, None), _one("b", 2.0, None)], {"a": False, "b": False}),
+        (
+            [_single("a", 1.0, 1e-9, 0.2), _single("b", 1.1, 1e-9, 0.1)],
+            {"a": True, "b": True},
+        ),  # within spread
+        ([_single("a", 1.0, SAME / 2), _single("b", 2.0, 0.0)], {"a": True, "b": False}),  # but for rounding
+        ([_single("a", 1.0, None), _single("b", 2.0, None)], {"a": False, "b": False}),
     ],
 )
 def test_the_front_is_what_nothing_beats_in_both_ways(
@@ -75,8 +83,8 @@ def test_the_report_fits_a_terminal_and_names_the_choice(found: Bench) -> None:
 @pytest.mark.whole
 def test_more_peers_are_measured_each_in_a_process_of_its_own(cli: Cli) -> None:
     """The text with another count, of the group that grows; a number is measured once."""
-    write("scene.yaml", replaced(AVERAGE, ("user: {count: 3}", "one: {count: 1}\n  many: {count: 4}")))
-    grown = scale(Path("scene.yaml"), [5, 3000, 5])
+    write("topology.yaml", replaced(AVERAGE, ("user: {count: 3}", "one: {count: 1}\n  many: {count: 4}")))
+    grown = scale(Path("topology.yaml"), [5, 3000, 5])
     assert [(row.count, row.peers) for row in grown.rows] == [(5, 6), (3000, 3001)]
     assert all(row.error is not None and row.error <= row.bound for row in grown.rows)
     assert all(row.memory > 10 * 2**20 for row in grown.rows)
@@ -87,7 +95,7 @@ def test_more_peers_are_measured_each_in_a_process_of_its_own(cli: Cli) -> None:
 
 @pytest.mark.whole
 @pytest.mark.parametrize(
-    ("scene", "counts", "message"),
+    ("topology", "counts", "message"),
     [
         ("three-users-average", [1], r"E921 leaves nothing to measure: 1 peer of user: .* 2 peers"),
         ("users-table", [3], "no group of this topology has a count that could grow"),
@@ -96,9 +104,9 @@ def test_more_peers_are_measured_each_in_a_process_of_its_own(cli: Cli) -> None:
         ("three-users-average", [3, -1], "E921"),
     ],
 )
-def test_numbers_of_peers_that_are_none_are_refused(scene: str, counts: list[int], message: str) -> None:
+def test_numbers_of_peers_that_are_none_are_refused(topology: str, counts: list[int], message: str) -> None:
     with pytest.raises(ApcError, match=message):
-        scale(SCENES / f"{scene}.yaml", counts)
+        scale(TOPOLOGIES / f"{topology}.yaml", counts)
 
 
 # ---- the command ----
@@ -120,7 +128,7 @@ def test_a_picture_that_cannot_be_is_refused_before_anything_is_measured(
     monkeypatch.setattr("apc.benchmark.speed_and_error.bench", lambda *_: pytest.fail("it is measured"))
     if "E875" in message:
         monkeypatch.setitem(sys.modules, "matplotlib", None)
-    ran = cli(f"bench '{SCENES}/template.yaml' --plot {plot}")
+    ran = cli(f"bench '{TOPOLOGIES}/template.yaml' --plot {plot}")
     assert ran.code == 1 and message in ran.err
 
 
@@ -135,13 +143,13 @@ def test_what_goes_wrong_in_the_end_costs_no_figures(
     note = "WRONG: the bound of dense does not hold"
     first, *rest = found.comparisons
     broken = replace(found, comparisons=(replace(first, notes=(note,)), *rest))
-    monkeypatch.setattr("apc.present.pictures.write_figure", full)
+    monkeypatch.setattr("apc.output.pictures.write_figure", full)
     for measured, plot, messages in (
         (found, "--plot bench.png", ["E601 can't be written"]),
         (broken, "", ["E922", note]),
     ):
         monkeypatch.setattr("apc.benchmark.speed_and_error.bench", lambda *_, measured=measured: measured)
-        ran = cli(f"bench '{SCENES}/template.yaml' {plot}")
+        ran = cli(f"bench '{TOPOLOGIES}/template.yaml' {plot}")
         assert ran.code == 1 and all(one in ran.err for one in messages)
         assert "analyze chooses modes" in ran.out
 
@@ -152,11 +160,11 @@ STORED: dict[str, dict[str, object]] = json.loads(TRUTHS.read_text(encoding="utf
 NAMES = sorted(path.stem for path in HERE.glob("*.yaml"))
 
 
-def test_every_scene_has_its_truth_and_says_where_it_comes_from_and_what_is_hard() -> None:
+def test_every_topology_has_its_truth_and_says_where_it_comes_from_and_what_is_hard() -> None:
     assert sorted(STORED) == NAMES
     for name in NAMES:
         text = (HERE / f"{name}.yaml").read_text(encoding="utf-8")
-        assert f"topology: {name}\nabout: " in text
+        assert f"topology: {name}\ndescription: " in text
         assert "\n# From: " in text
 
 
@@ -219,7 +227,7 @@ def test_what_is_no_number_or_no_verdict_fails_and_is_counted(
     _one_case()
     report = run_hard_cases(Path(), solve=solve, repeats=1)
     assert [case.failed for case in report.failures] == [failed]
-    assert "1 of 1 scene failed" in str(report)
+    assert "1 of 1 topology failed" in str(report)
     assert report.to_dict()["undecided"] == (["tiny-device"] if "stable" in changes else [])
 
 

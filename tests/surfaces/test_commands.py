@@ -19,15 +19,15 @@ from apc.cli.commands import apc as group
 from apc.cli.options import Command
 from apc.cli.progress import at_work
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, visible
-from apc.present.forms import document, json_text
+from apc.output.formatting import document, json_text
 from tests.commands import Cli, Ran, folder, write
-from tests.topologies import AVERAGE, ROOT, SCENES, replaced
+from tests.topologies import AVERAGE, ROOT, TOPOLOGIES, replaced
 
 
 @pytest.fixture
-def scene(cli: Cli) -> Cli:
-    """Run commands in a folder with the paper's scene alone."""
-    write("scene.yaml", AVERAGE)
+def topology(cli: Cli) -> Cli:
+    """Run commands in a folder with the paper's topology alone."""
+    write("topology.yaml", AVERAGE)
     return cli
 
 
@@ -41,47 +41,47 @@ def test_from_nothing_to_a_verdict_in_three_commands(cli: Cli) -> None:
 
 
 def test_new_writes_under_the_name_given_and_overwrites_nothing(cli: Cli) -> None:
-    assert cli("new my-scene").code == 0
-    assert Path("my-scene.yaml").read_text(encoding="utf-8").count("topology: my-scene") == 1
-    write("my-scene.yaml", "mine")
-    message = "my-scene.yaml: E613 exists already and is left as it is. Write: apc new another-name\n"
-    assert cli("new my-scene") == Ran(1, "", message)
-    assert Path("my-scene.yaml").read_text(encoding="utf-8") == "mine"
+    assert cli("new my-topology").code == 0
+    assert Path("my-topology.yaml").read_text(encoding="utf-8").count("topology: my-topology") == 1
+    write("my-topology.yaml", "mine")
+    message = "my-topology.yaml: E613 exists already and is left as it is. Write: apc new another-name\n"
+    assert cli("new my-topology") == Ran(1, "", message)
+    assert Path("my-topology.yaml").read_text(encoding="utf-8") == "mine"
 
 
 @pytest.mark.parametrize("name", ["../evil", "a/b", "a b", ".hidden", "x" * 64, "", "a\nb"])
 def test_new_takes_a_plain_name_only(cli: Cli, name: str) -> None:
     ran = cli("new", name)
     assert (ran.code, ran.out) == (1, "")
-    assert "E612 a scene's name wants letters, digits, - and _, 63 at most" in ran.err
+    assert "E612 a topology's name wants letters, digits, - and _, 63 at most" in ran.err
     assert folder() == []
 
 
-def test_check_builds_nothing_and_reports_every_mistake(scene: Cli) -> None:
-    assert scene("check") == Ran(0, "scene.yaml: no mistakes. three-users-average, 3 peers.\n", "")
-    write("scene.yaml", AVERAGE.replace("0.1 kg", "0.1").replace("link: lan", "link: lam"))
-    ran = scene("check")
+def test_check_builds_nothing_and_reports_every_mistake(topology: Cli) -> None:
+    assert topology("check") == Ran(0, "topology.yaml: no mistakes. three-users-average, 3 peers.\n", "")
+    write("topology.yaml", AVERAGE.replace("0.1 kg", "0.1").replace("link: lan", "link: lam"))
+    ran = topology("check")
     assert (ran.code, ran.out) == (1, "")
-    assert [line for line in ran.err.splitlines() if line.startswith("scene.yaml")] == [
-        "scene.yaml:9:18: E204 mass wants kg, got 0.1 (no unit). Write: mass: 0.1 kg",
-        "scene.yaml:13:109: E206 coordination names link lam, which isn't in links; the nearest is lan. "
+    assert [line for line in ran.err.splitlines() if line.startswith("topology.yaml")] == [
+        "topology.yaml:9:18: E204 mass wants kg, got 0.1 (no unit). Write: mass: 0.1 kg",
+        "topology.yaml:13:109: E206 coordination names link lam, which isn't in links; the nearest is lan. "
         "Write: lan",
     ]
-    assert folder() == ["scene.yaml"]
+    assert folder() == ["topology.yaml"]
 
 
-def test_json_is_one_document_and_nothing_else(scene: Cli) -> None:
-    ran = scene("analyze --json")
+def test_json_is_one_document_and_nothing_else(topology: Cli) -> None:
+    ran = topology("analyze --json")
     assert (ran.code, ran.err) == (0, "")
     told = json.loads(ran.out)
     assert (told["topology"], told["peers"], told["frame_s"]) == ("three-users-average", 3, 0.008)
     assert (told["stable"], told["rigid_modes"]) == (True, 1)
     assert 0 < told["spectral_radius_error"] < 1e-9
     assert set(told["modes"][0]) >= {
-        *("eigenvalue", "magnitude", "multiplicity", "frequency_hz", "damping_ratio", "shape"),
+        *("eigenvalue", "magnitude", "multiplicity", "frequency_hz", "damping_ratio", "family"),
         "participation",
     }
-    unstable = scene("analyze --json --set 'coordination.stiffness=5000 N/m'")
+    unstable = topology("analyze --json --set 'coordination.stiffness=5000 N/m'")
     assert (unstable.code, json.loads(unstable.out)["stable"]) == (0, False), "which is an answer"
 
 
@@ -95,7 +95,7 @@ def test_json_is_one_document_and_nothing_else(scene: Cli) -> None:
         ("compile a b", "Got unexpected extra argument (b)"),
         ("simulate --jobs 1_0", "is not a whole number"),
         ("simulate --jobs ١", "is not a whole number"),
-        ("bench scene.yaml --hard", "--hard has scenes of its own"),
+        ("bench topology.yaml --hard", "--hard has topologies of its own"),
     ],
 )
 def test_a_wrong_call_ends_with_two(cli: Cli, words: str, message: str) -> None:
@@ -105,17 +105,17 @@ def test_a_wrong_call_ends_with_two(cli: Cli, words: str, message: str) -> None:
 
 
 def test_a_bug_of_ours_ends_with_three_and_keeps_a_report(
-    scene: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    topology: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     monkeypatch.setattr("apc.compiler.pipeline.compile_topology", lambda path: 1 // 0)
-    ran = scene("check scene.yaml")
+    ran = topology("check topology.yaml")
     assert (ran.code, ran.out) == (3, "")
     assert ran.err.startswith("apc: this is a bug of apc, not of your input; a report is in ")
     assert "Traceback" not in ran.err
     text = Path(ran.err.split(" a report is in ")[1].strip()).read_text(encoding="utf-8")
     assert "ZeroDivisionError" in text
-    assert "arguments: ['check', 'scene.yaml']" in text
+    assert "arguments: ['check', 'topology.yaml']" in text
 
 
 def test_help_fits_a_terminal_and_every_command_is_one_of_ours(cli: Cli) -> None:
@@ -160,7 +160,7 @@ def _finite(word: str) -> float:
     [
         "analyze",
         "critical contact.stiffness",
-        "feel",
+        "transparency",
         "region --x 'contact.stiffness=1 N/m:100 N/m' --y 'device.mass=1 g:1 kg'",
         "simulate --duration 16ms",
     ],
@@ -169,7 +169,7 @@ def _finite(word: str) -> float:
     "value", ["device.damping=1e30 N*s/m", "device.mass=1e-300 kg", "device.mass=1e300 kg"]
 )
 def test_json_has_no_number_that_is_not_finite(cli: Cli, command: str, value: str) -> None:
-    ran = cli(command, str(SCENES / "three-users-average.yaml"), "--set", value, "--json")
+    ran = cli(command, str(TOPOLOGIES / "three-users-average.yaml"), "--set", value, "--json")
     assert ran.code in (0, 1)
     if not ran.code:
         json.loads(ran.out, parse_constant=_finite)
@@ -203,19 +203,19 @@ def test_what_is_not_printed_is_written_out_as_json_has_it() -> None:
 def test_a_message_fits_the_terminal_and_is_one_line_elsewhere(
     cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write("scene.yaml", replaced(AVERAGE, ("haptic: 1 ms", "haptic: 1.0001 ms")))
+    write("topology.yaml", replaced(AVERAGE, ("haptic: 1 ms", "haptic: 1.0001 ms")))
     piped = cli("check").err
     monkeypatch.setattr("apc.__main__.sys.stderr.isatty", lambda: True)
     shown = cli("check").err
     assert max(map(len, shown.splitlines())) <= 80 < max(map(len, piped.splitlines()))
-    assert shown.startswith("scene.yaml:4:11: E805") and shown.split() == piped.split()
+    assert shown.startswith("topology.yaml:4:11: E805") and shown.split() == piped.split()
 
 
 @pytest.mark.few(2)
 @pytest.mark.parametrize("words", ["check", "compile", "analyze", "analyze --json", "show"])
 def test_a_name_in_a_file_does_not_act_on_the_terminal(cli: Cli, words: str) -> None:
-    write("scene.yaml", replaced(AVERAGE, ("topology: three-users-average", r'topology: "a\e[31mb"')))
-    ran = cli(f"{words} scene.yaml")
+    write("topology.yaml", replaced(AVERAGE, ("topology: three-users-average", r'topology: "a\e[31mb"')))
+    ran = cli(f"{words} topology.yaml")
     assert ran.code == 0 and "\x1b" not in ran.out and r"\u001b[31m" in ran.out
     for code, names in ((1, ("\x1b[2J.yaml",)), (2, ("a", "\x1b[2J.yaml"))):
         ran = cli("analyze", *names)
@@ -240,14 +240,14 @@ LONG = "n" * 300
         f"compile {LONG}.yaml",
         f"analyze {LONG}.apc",
         f"schema --out {LONG}.json",
-        f"simulate scene.yaml --duration 1ms --out {LONG}.csv",
-        f"sweep scene.yaml --over contact.stiffness=1N/m:2N/m:2 --out {LONG}.csv",
-        f"sweep scene.yaml --jobs 1 --over contact.stiffness=1N/m:2N/m:2 --out {LONG[:249]}.csv",
-        f"region scene.yaml --out {LONG}.csv",
+        f"simulate topology.yaml --duration 1ms --out {LONG}.csv",
+        f"sweep topology.yaml --over contact.stiffness=1N/m:2N/m:2 --out {LONG}.csv",
+        f"sweep topology.yaml --jobs 1 --over contact.stiffness=1N/m:2N/m:2 --out {LONG[:249]}.csv",
+        f"region topology.yaml --out {LONG}.csv",
     ],
 )
-def test_a_name_that_can_be_none_is_one_message(scene: Cli, words: str) -> None:
-    ran = scene(words)
+def test_a_name_that_can_be_none_is_one_message(topology: Cli, words: str) -> None:
+    ran = topology(words)
     assert (ran.code, ran.out, len(ran.err.splitlines())) == (1, "", 1)
 
 
@@ -265,12 +265,14 @@ def test_two_topologies_of_one_model_are_refused_naming_both(cli: Cli) -> None:
 @pytest.mark.parametrize(
     ("words", "parts"),
     [
-        ("compile --force", ["source", "scene", "flat", "clocked", "sorted", "compiled", "save"]),
-        ("simulate --duration 0.1s", ["read", "prepare", "play", "print"]),
+        ("compile --force", ["source", "topology", "flat", "clocked", "sorted", "compiled", "save"]),
+        ("simulate --duration 0.1s", ["read", "prepare", "simulate", "print"]),
     ],
 )
-def test_every_command_says_what_its_parts_take_on_stderr(scene: Cli, words: str, parts: list[str]) -> None:
-    plain, timed = scene(words), scene(f"{words} --timings")
+def test_every_command_says_what_its_parts_take_on_stderr(
+    topology: Cli, words: str, parts: list[str]
+) -> None:
+    plain, timed = topology(words), topology(f"{words} --timings")
     assert (plain.code, timed.code, timed.out) == (0, 0, plain.out)
     rows = [line.rsplit(maxsplit=2) for line in timed.err.splitlines()]
     names = [row[0].strip() for row in rows]

@@ -8,9 +8,9 @@ import pytest
 
 import apc
 from tests.commands import Cli
-from tests.topologies import SCENES
+from tests.topologies import TOPOLOGIES as FOLDER
 
-TOPOLOGIES = sorted(path.name for path in SCENES.glob("*.yaml"))
+TOPOLOGIES = sorted(path.name for path in FOLDER.glob("*.yaml"))
 # The words of each call; STIFFNESS and DELAY are the first parameters of that unit that the topology has.
 CALLS = (
     "analyze",
@@ -22,12 +22,12 @@ CALLS = (
     "analyze --method dense --no-margins",
     "analyze --method determinant --no-margins",
     "analyze --method paper --no-margins",
-    "analyze --conventions --no-margins --nominal --json",
+    "analyze --event-order --no-margins --nominal --json",
     "analyze --no-margins --box STIFFNESS=±1% --cells 50",
     "critical STIFFNESS",
     "critical STIFFNESS --hands passive",
     "critical STIFFNESS --hands clamped",
-    "critical STIFFNESS --in nominal --json",
+    "critical STIFFNESS --criterion nominal --json",
     "critical DELAY --upper 20_ms",
     "critical PERIOD",
     "critical COUNT",
@@ -36,11 +36,11 @@ CALLS = (
     "sweep --over STIFFNESS=10_N/m:900_N/m:3 --out s.csv --jobs 1",
     "tune --free STIFFNESS=10_N/m:900_N/m --maximize STIFFNESS --time 2_s",
     "compare --json",
-    "feel --points 5",
-    "feel --points 5 --unstable --json",
+    "transparency --points 5",
+    "transparency --points 5 --unstable --json",
     "simulate --duration 20_ms --no-jit --json",
     "simulate --duration 20_ms --method rk4:1e-4 --error",
-    "simulate --duration 20_ms --strike PEER --runs 2",
+    "simulate --duration 20_ms --impulse PEER --runs 2",
     "export --to control --out e.py",
     "export --to modelica --out e.mo",
     "export --to c --peer PEER --out e.c",
@@ -100,10 +100,10 @@ CASES = [
 def test_no_call_is_a_bug(
     topology: str, call: str, cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = words_for(call, apc.compile(SCENES / topology))
+    words = words_for(call, apc.compile(FOLDER / topology))
     if words is None:
         pytest.skip("the topology has no such parameter")
     monkeypatch.chdir(tmp_path)
-    ran = cli(words[0], *words[1:], str(SCENES / topology))
+    ran = cli(words[0], *words[1:], str(FOLDER / topology))
     assert ran.code in (0, 1, 2), ran.err
     assert (ran.code == 0) or ran.err

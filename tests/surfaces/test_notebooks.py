@@ -54,8 +54,8 @@ def test_a_result_is_its_text_and_its_picture_and_elsewhere_a_line() -> None:
     model = compiled(AVERAGE)
     results: tuple[Any, ...] = (
         apc.analyze(model),
-        apc.feel(model, np.geomspace(1, 50, 20)),
-        apc.simulate(model, set={"device.v": "0.1 m/s"}, duration="20 ms", jit=False),
+        apc.transparency(model, np.geomspace(1, 50, 20)),
+        apc.simulate(model, params={"device.v": "0.1 m/s"}, duration="20 ms", jit=False),
     )
     for found in results:
         shown = bundle(found)
@@ -69,8 +69,8 @@ def test_a_result_is_its_text_and_its_picture_and_elsewhere_a_line() -> None:
     assert model._repr_html_() == f"<pre>{model}</pre>"
 
 
-def test_what_a_scene_says_is_no_markup_in_a_notebook() -> None:
-    model = compiled(replaced(AVERAGE, ("about: ", "about: <b>bold</b> ")))
+def test_what_a_topology_says_is_no_markup_in_a_notebook() -> None:
+    model = compiled(replaced(AVERAGE, ("description: ", "description: <b>bold</b> ")))
     assert "<b>" not in model._repr_html_() and "&lt;b&gt;" in model._repr_html_()
 
 

@@ -1,4 +1,6 @@
-"""The page of a scene: its sliders say what they set, its answers are the API's, and nobody else gets in."""
+"""The page of a topology: its sliders say what they set, its answers are the API's, and nobody else gets
+in.
+"""
 
 from __future__ import annotations
 
@@ -23,43 +25,43 @@ import pytest
 
 import apc
 from apc.compiler.compiled import Model
-from apc.frame.names import ParameterRef
 from apc.frame.overrides import parse_override
+from apc.frame.parameter_names import ParameterRef
 from tests.commands import Cli, write
 from tests.surfaces.pages import CHROMIUM, MODEL, VERDICT, Tab, launched, served
-from tests.topologies import AVERAGE, SCENES
+from tests.topologies import AVERAGE, TOPOLOGIES
 
 pytest.importorskip("bokeh")
 
 from bokeh.document import Document
 
-from apc.explore import sections
-from apc.explore.desk import Desk
-from apc.explore.motion import motion_of
-from apc.explore.page import TopologyTab, scene_of
-from apc.explore.sections import SectionAnswer, Task, compute
-from apc.explore.server import MOST, _shortened
-from apc.explore.sliders import (
+from apc.app import sections
+from apc.app.motion import motion_of
+from apc.app.page import TopologyTab, topology_of
+from apc.app.sections import SectionAnswer, Task, compute
+from apc.app.server import MOST, _shortened
+from apc.app.sliders import (
     Slider,
     axes_of,
     is_number,
     overrides_of,
-    place_of,
+    position_of,
     set_to,
     sliders_of,
     with_value,
 )
-from apc.explore.written import with_values
+from apc.app.worker_process import Desk
+from apc.app.yaml_edit import with_values
 from apc.processes import Workers, model_bytes
-from apc.simulation.strike import SPEED
+from apc.simulation.initial_velocity import SPEED
 
 NOTHING = "topology: none\npeers: {user: {count: 1}}\nmasses: {}\n"
 LOSSY = AVERAGE.replace("delay: 8 ms}", "delay: 8 ms, loss: 10 %, jitter: 1 ms}")
 
 
 def compiled(text: str, folder: Path) -> Model:
-    (folder / "scene.yaml").write_text(text, encoding="utf-8")
-    return apc.compile(folder / "scene.yaml")
+    (folder / "topology.yaml").write_text(text, encoding="utf-8")
+    return apc.compile(folder / "topology.yaml")
 
 
 def named(sliders: tuple[Slider, ...], label: str) -> Slider:
@@ -74,14 +76,14 @@ def named(sliders: tuple[Slider, ...], label: str) -> Slider:
     "name", ["three-users-average", "experiment-average", "mixed-clocks", "lossy-average"]
 )
 def test_what_a_slider_says_is_what_set_takes(name: str) -> None:
-    system = apc.compile(SCENES / f"{name}.yaml")
+    system = apc.compile(TOPOLOGIES / f"{name}.yaml")
     for one in sliders_of(system):
         assert list(one.values) == sorted(set(one.values)), one.label
         for value, text in zip(one.values, one.texts, strict=True):
             assert parse_override(system, f"{one.label}={text}").value == value
 
 
-def test_every_number_of_the_paper_s_scene_has_a_slider(tmp_path: Path) -> None:
+def test_every_number_of_the_paper_s_topology_has_a_slider(tmp_path: Path) -> None:
     sliders = sliders_of(compiled(AVERAGE, tmp_path))
     assert [one.label for one in sliders] == [
         *("contact.stiffness", "coordination.stiffness", "contact.damping", "coordination.damping"),
@@ -109,7 +111,7 @@ def test_a_value_that_a_slider_has_not_gets_a_place_of_its_own(tmp_path: Path) -
     (override,) = overrides_of([moved], [at])
     assert override.value == Fraction("1234.5")
     assert overrides_of([moved], [moved.start]) == []
-    assert moved.values[place_of(moved, 1234.0)] == Fraction("1234.5")
+    assert moved.values[position_of(moved, 1234.0)] == Fraction("1234.5")
 
 
 def test_what_follows_from_others_has_no_slider(tmp_path: Path) -> None:
@@ -133,31 +135,31 @@ def test_sections_tell_what_the_api_tells(tmp_path: Path) -> None:
     overrides = tuple(overrides_of(sliders, places))
     setting = {one.free.label: f"{float(one.value) * 1e3!r} ms" for one in overrides}
 
-    def told(section: str, asked: Any = None) -> dict[str, Any]:
-        answer = compute(model, Task(section, overrides, asked)).found
+    def told(section: str, requested: Any = None) -> dict[str, Any]:
+        answer = compute(model, Task(section, overrides, requested)).result
         assert answer is not None
         return answer
 
-    analysis, whole = apc.analyze(system, set=setting), apc.region(system, set=setting)
-    verdict, feel = told("verdict"), told("feel")
+    analysis, whole = apc.analyze(system, params=setting), apc.region(system, params=setting)
+    verdict, transparency = told("verdict"), told("transparency")
     assert verdict["radius"] == analysis.spectral_radius and verdict["text"] == str(analysis)
     region = told("region", (*axes_of(sliders, places, (0, 1)), "nominal"))
     assert region["share"] == pytest.approx(whole.stable_area / (5000 * 1500), rel=1e-4)  # drawn to 1e-5
-    felt = apc.feel(system, feel["frequency"], set=setting)
-    assert np.array_equal(feel["magnitude"], np.abs(felt.impedance))
+    used = apc.transparency(system, transparency["frequency"], params=setting)
+    assert np.array_equal(transparency["magnitude"], np.abs(used.impedance))
     best = apc.tune(
-        system, {"contact.stiffness": "0 N/m:5000 N/m"}, maximize="contact.stiffness", set=setting
+        system, {"contact.stiffness": "0 N/m:5000 N/m"}, maximize="contact.stiffness", params=setting
     )
     assert told("tune", (("contact.stiffness=0 N/m:5000 N/m",), "contact.stiffness"))["text"] == str(best)
 
 
-def test_a_section_that_a_scene_has_nothing_for_says_so(tmp_path: Path) -> None:
+def test_a_section_that_a_topology_has_nothing_for_says_so(tmp_path: Path) -> None:
     model = model_bytes(compiled(AVERAGE, tmp_path))
     told = compute(model, Task("network", ()))
-    assert told.found is None
+    assert told.result is None
     assert "no link here loses packets" in told.why and "loss: 1 %" in told.why
     unstable = (parse_override(compiled(AVERAGE, tmp_path), "contact.stiffness=5000 N/m"),)
-    why = compute(model, Task("feel", unstable)).why
+    why = compute(model, Task("transparency", unstable)).why
     assert "unstable" in why and "--" not in why  # a page has no command line
 
 
@@ -175,9 +177,9 @@ def test_what_goes_wrong_in_a_section_is_told_there(tmp_path: Path, monkeypatch:
     def broken(*_: object) -> dict[str, Any]:
         raise ValueError("shapes differ")
 
-    monkeypatch.setitem(sections.SECTIONS, "feel", broken)
-    told = compute(model_bytes(compiled(AVERAGE, tmp_path)), Task("feel", ()))
-    assert told.why == "This is a bug of apc, not of your scene: ValueError: shapes differ"
+    monkeypatch.setitem(sections.SECTIONS, "transparency", broken)
+    told = compute(model_bytes(compiled(AVERAGE, tmp_path)), Task("transparency", ()))
+    assert told.why == "This is a bug of apc, not of your topology: ValueError: shapes differ"
 
 
 # Who computes it.
@@ -187,15 +189,15 @@ class Held:
     """Workers that do nothing until they are told to."""
 
     def __init__(self) -> None:
-        self.asked: list[tuple[Task, Future[SectionAnswer]]] = []
+        self.requested: list[tuple[Task, Future[SectionAnswer]]] = []
 
     def submit(self, task: Task) -> Future[SectionAnswer]:
-        self.asked.append((task, Future()))
-        return self.asked[-1][1]
+        self.requested.append((task, Future()))
+        return self.requested[-1][1]
 
     def finish(self, place: int) -> None:
-        task, future = self.asked[place]
-        future.set_result(SectionAnswer({"of": task.asked}))
+        task, future = self.requested[place]
+        future.set_result(SectionAnswer({"of": task.request}))
 
 
 def at_once(call: Callable[[], None], seconds: float) -> None:
@@ -205,7 +207,7 @@ def at_once(call: Callable[[], None], seconds: float) -> None:
 
 def test_an_old_answer_never_takes_the_place_of_a_newer_one() -> None:
     held, shown = Held(), []
-    desk = Desk(b"", ("a", "b"), at_once, lambda section, told: shown.append((section, told.found)))
+    desk = Desk(b"", ("a", "b"), at_once, lambda section, told: shown.append((section, told.result)))
     desk.workers = Workers(held.submit, 1, lambda _: None)
     assert desk.ask(Task("b", (), 1)) and not desk.ask(Task("b", (), 1))
     for number in (2, 3, 4):  # while it computes, the newest waits in the place of those before it
@@ -241,7 +243,7 @@ def test_a_value_is_written_where_it_stands(label: str, value: str, line: str, t
     text = with_values(AVERAGE, system, {ParameterRef(label): value})
     assert line in text
     changed = compiled(text, tmp_path)
-    expected = apc.analyze(system, set={label: value})
+    expected = apc.analyze(system, params={label: value})
     assert apc.analyze(changed).spectral_radius == pytest.approx(expected.spectral_radius, rel=1e-12)
     assert len(text.splitlines()) == len(AVERAGE.splitlines())  # and comments stay where they were
     assert "# a copy at each peer" in text
@@ -253,17 +255,17 @@ def test_a_value_is_written_where_it_stands(label: str, value: str, line: str, t
 def test_what_can_t_be_explored_is_told_before_a_page_is_served(
     cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write("scene.yaml", AVERAGE)
-    assert "E204" in cli("explore scene.yaml --set 'contact.stiffness=5 kg'").err
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
+    write("topology.yaml", AVERAGE)
+    assert "E204" in cli("explore topology.yaml --set 'contact.stiffness=5 kg'").err
+    with socket.socket() as used:
+        used.bind(("127.0.0.1", 0))
+        used.listen()
+        port = used.getsockname()[1]
         message = f"--port: E982 port {port} is taken. Write: --port 0  (any that is free)\n"
-        assert cli(f"explore scene.yaml --no-browser --port {port}") == (1, "", message)
+        assert cli(f"explore topology.yaml --no-browser --port {port}") == (1, "", message)
     monkeypatch.setitem(sys.modules, "bokeh.server.server", None)
     message = "E875 bokeh.server.server is not installed. Write: pip install '.[explore]'"
-    assert message in cli("explore scene.yaml").err
+    assert message in cli("explore topology.yaml").err
 
 
 # In a browser.
@@ -271,7 +273,7 @@ def test_what_can_t_be_explored_is_told_before_a_page_is_served(
 
 @pytest.fixture(scope="module")
 def link(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    path = tmp_path_factory.mktemp("explore") / "scene.yaml"
+    path = tmp_path_factory.mktemp("explore") / "topology.yaml"
     path.write_text(AVERAGE, encoding="utf-8")
     with served(path) as found:
         yield found
@@ -303,12 +305,12 @@ def test_a_slider_that_is_moved_changes_region_and_verdict_to_what_the_api_says(
     text = first.press("lan.delay", "PageUp", 3).replace("·", "*")
     setting = {"lan.delay": text}
     assert text != "8 ms"
-    first.radius(apc.analyze(system, set=setting).spectral_radius)
-    share = apc.region(system, set=setting).stable_area / (5000 * 1500)
+    first.radius(apc.analyze(system, params=setting).spectral_radius)
+    share = apc.region(system, params=setting).stable_area / (5000 * 1500)
     first.page.wait_for_function(f"{MODEL}('region-words').text.includes('{100 * share:.3g} %')")
     # An axis of the region: the point moves, and the verdict becomes another.
     text = first.press("contact.stiffness", "End", 1).replace("·", "*")
-    found = apc.analyze(system, set=setting | {"contact.stiffness": text})
+    found = apc.analyze(system, params=setting | {"contact.stiffness": text})
     assert found.stable is False
     first.radius(found.spectral_radius)
     assert "class='unstable'" in first.page.evaluate(VERDICT)
@@ -336,7 +338,7 @@ def test_topology_and_numbers_are_downloaded_with_the_values(tab: Tab, link: str
         waited.value.save_as(found[label])
     numbers = json.loads(found["Numbers"].read_text("utf-8"))
     assert numbers["set"]["device.damping"] == text
-    expected = apc.analyze(compiled(AVERAGE, tmp_path), set=numbers["set"])
+    expected = apc.analyze(compiled(AVERAGE, tmp_path), params=numbers["set"])
     assert apc.analyze(found["Topology"]).spectral_radius == expected.spectral_radius
     assert found["Picture"].read_bytes().startswith(b"\x89PNG")
     assert numbers["analyze"]["spectral_radius"] == expected.spectral_radius
@@ -358,11 +360,11 @@ def test_whoever_sees_no_pictures_and_has_no_mouse_finds_everything_by_name(tab:
 
 
 @pytest.mark.whole
-def test_a_scene_without_two_axes_is_shown_without_a_region(browser: Any, tmp_path: Path) -> None:
+def test_a_topology_without_two_axes_is_shown_without_a_region(browser: Any, tmp_path: Path) -> None:
     (tmp_path / "none.yaml").write_text(NOTHING, encoding="utf-8")
     with served(tmp_path / "none.yaml") as link:
         tab = Tab(browser, f"{link}&x-axis=user.count")
-        tab.page.wait_for_function(f"{MODEL}('region-words').text.includes('this scene has fewer')")
+        tab.page.wait_for_function(f"{MODEL}('region-words').text.includes('this topology has fewer')")
         assert "user.count can be no axis" in tab.page.evaluate(f"{MODEL}('message').text")
         assert tab.page.get_by_role("combobox", name="Region: horizontal axis").count() == 0
         assert tab.press("user.count", "ArrowRight", 1) == "2"
@@ -373,24 +375,24 @@ def test_a_scene_without_two_axes_is_shown_without_a_region(browser: Any, tmp_pa
 
 
 @pytest.mark.whole
-def test_a_scene_may_name_its_numbers_as_the_link_does(browser: Any, tmp_path: Path) -> None:
+def test_a_topology_may_name_its_numbers_as_the_link_does(browser: Any, tmp_path: Path) -> None:
     text = AVERAGE.replace("clocks:", "parameters: {x: 1000 N/m, y: 500 N/m, token: 5 N*s/m}\nclocks:", 1)
     text = text.replace("stiffness: 1000 N/m", "stiffness: x").replace("stiffness: 500 N/m", "stiffness: y")
     system = compiled(
         text.replace("mass: 0.1 kg, damping: 5 N*s/m", "mass: 0.1 kg, damping: token"), tmp_path
     )
-    with served(tmp_path / "scene.yaml") as link:
+    with served(tmp_path / "topology.yaml") as link:
         tab = Tab(browser, link)
         setting = {name: tab.press(name, "PageDown", 1).replace("·", "*") for name in ("x", "token")}
-        radius = apc.analyze(system, set=setting).spectral_radius
+        radius = apc.analyze(system, params=setting).spectral_radius
         tab.radius(radius)
         tab.page.wait_for_function("new URLSearchParams(location.search).getAll('token').length == 2")
         url = tab.page.url
         tab.close(link)
-        again = Tab(browser, url)
-        again.radius(radius)
-        assert again.page.evaluate(f"{MODEL}('message').text") == ""
-        again.close(link)
+        repeated = Tab(browser, url)
+        repeated.radius(radius)
+        assert repeated.page.evaluate(f"{MODEL}('message').text") == ""
+        repeated.close(link)
 
 
 SERVED = """
@@ -398,7 +400,7 @@ import os, webbrowser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 from tornado.httpclient import AsyncHTTPClient
-from apc.explore.server import bound, run
+from apc.app.server import bound, run
 
 async def opened(url):
     path = Path(unquote(urlsplit(url).path))
@@ -426,7 +428,7 @@ def test_the_browser_opens_a_file_of_ours_and_ctrl_c_closes_the_tabs_that_are_op
 FLOODED = """
 import resource, socket
 from tornado.httpclient import AsyncHTTPClient
-from apc.explore.server import MOST, bound, run
+from apc.app.server import MOST, bound, run
 
 async def opened():
     port = int(link.rpartition(":")[2].partition("/")[0])
@@ -461,13 +463,13 @@ def test_connections_that_ask_for_nothing_keep_nobody_out(left: int) -> None:
 class Asked:
     """What stands in the place of a `Desk`: it keeps what it is asked."""
 
-    asked: ClassVar[list[Task]] = []
+    requested: ClassVar[list[Task]] = []
 
     def __init__(self, model: bytes, order: Sequence[str], *_: object) -> None:
         self.order, self.busy = order, None
 
     def ask(self, task: Task) -> bool:
-        self.asked.append(task)
+        self.requested.append(task)
         return True
 
     def forget(self, section: str) -> None:
@@ -483,19 +485,19 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> TopologyTab:
     document, request = Document(), SimpleNamespace(arguments={})
     context = SimpleNamespace(request=request)
     document._session_context = lambda: context  # type: ignore[assignment]
-    scene = compiled(LOSSY, tmp_path_factory.mktemp("page"))
+    topology = compiled(LOSSY, tmp_path_factory.mktemp("page"))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("apc.explore.page.Desk", Asked)
-        found = TopologyTab(scene_of(scene, (), None), document)
+        patch.setattr("apc.app.page.Desk", Asked)
+        found = TopologyTab(topology_of(topology, (), None), document)
     found._deliver("verdict", SectionAnswer(None, "none"))
     names = ["user[1].device.x", "user[1].cube.x"]
-    felt = {"names": names, "at": names[0], "notes": ()} | {one: np.ones(2) for one in FELT}
-    found._deliver("feel", SectionAnswer(felt))
-    Asked.asked.clear()
+    used = {"names": names, "at": names[0], "notes": ()} | {one: np.ones(2) for one in TRANSPARENCY}
+    found._deliver("transparency", SectionAnswer(used))
+    Asked.requested.clear()
     return found
 
 
-FELT = ("frequency", "magnitude", "phase")
+TRANSPARENCY = ("frequency", "magnitude", "phase")
 NAN, INFINITY = {"type": "number", "value": "nan"}, {"type": "number", "value": "+inf"}
 ZEROS = {"type": "bytes", "data": base64.b64encode(gzip.compress(bytes(8))).decode()}
 ARRAY = {"type": "ndarray", "array": ZEROS, "dtype": "float64", "shape": [1], "order": "little"}
@@ -533,7 +535,7 @@ def test_what_the_browser_can_t_say_changes_nothing(page: TopologyTab) -> None:
                 tapped(page, x, y)
         assert [one.value for one in models] == before, value
     assert page.places == [one.start for one in page.sliders]
-    assert not Asked.asked
+    assert not Asked.requested
 
 
 def status(link: str, **headers: str) -> int:
@@ -553,15 +555,15 @@ def test_what_the_browser_may_say_is_computed(page: TopologyTab) -> None:
         (page.handles[0], last),
         (page.selects[0], "device.mass"),
         (page.meant, "packets as they are lost and late (takes long)"),
-        (page.begins, "as the scene begins"),
+        (page.begins, "as the topology begins"),
         (page.at, "user[1].cube.x"),
     ):
         says(page, model, value)
     assert page.places[0] == last
     assert page.sliders[page.chosen[0]].label == "device.mass"
     assert page.meant.value.startswith("packets")
-    assert next(one for one in reversed(Asked.asked) if one.section == "motion").asked is False
-    assert Asked.asked[-1].asked == "user[1].cube.x"
+    assert next(one for one in reversed(Asked.requested) if one.section == "motion").request is False
+    assert Asked.requested[-1].request == "user[1].cube.x"
     says(page, page.handles[0], last + 1)
     assert "contact.stiffness can&#x27;t be" in page.message.model.text
     says(page, page.selects[0], "contact.stiffness")
@@ -569,7 +571,7 @@ def test_what_the_browser_may_say_is_computed(page: TopologyTab) -> None:
     moved = {one.label: one.values[at] for one, at in zip(page.sliders, page.places, strict=True)}
     assert moved["contact.stiffness"] == 1500 and moved["coordination.stiffness"] == 300
     page._ask_tune()
-    free, best = Asked.asked[-1].asked
+    free, best = Asked.requested[-1].request
     assert best == "coordination.stiffness" and free[0] == "contact.stiffness=0.0 N/m:5000.0 N/m"
 
 
@@ -589,7 +591,7 @@ def test_only_this_machine_with_the_token_and_no_other_origin_gets_in(link: str)
     for wrong in (bare, f"{bare}?token=", f"{link}x", f"{bare}?token=%ff"):
         assert status(wrong) in (400, 403)
     foreign = {"Origin": "http://example.org"}
-    for asked, headers in (
+    for requested, headers in (
         (link, foreign),
         (link, {"Host": "example.org"}),
         (f"{bare}metadata", {}),
@@ -597,6 +599,11 @@ def test_only_this_machine_with_the_token_and_no_other_origin_gets_in(link: str)
         (f"{bare}ws", UPGRADE),
         (f"{bare}ws?{query}", UPGRADE | foreign),
     ):
-        assert status(asked, **headers) == 403
-    for path in ("etc/passwd", "static/../../../../../../etc/passwd", "scene.yaml", "static/extensions/x/y"):
+        assert status(requested, **headers) == 403
+    for path in (
+        "etc/passwd",
+        "static/../../../../../../etc/passwd",
+        "topology.yaml",
+        "static/extensions/x/y",
+    ):
         assert status(f"{bare}{path}?{query}") in (403, 404)

@@ -14,20 +14,20 @@ import numpy as np
 import pytest
 
 import apc
-from apc.present import animation
-from apc.present.analysis_output import analysis_picture
-from apc.present.pictures import colours_of, write_figure
-from apc.present.region_picture import panels_picture
+from apc.output import animation
+from apc.output.analysis_output import analysis_picture
+from apc.output.pictures import colours_of, write_figure
+from apc.output.region_picture import panels_picture
 from apc.regions.panels import compare_regions
 from tests.commands import Cli, folder
-from tests.topologies import AVERAGE, SCENES, compiled, replaced
+from tests.topologies import AVERAGE, TOPOLOGIES, compiled, replaced
 
-SCENE = str(SCENES / "three-users-average.yaml")
+TOPOLOGY = str(TOPOLOGIES / "three-users-average.yaml")
 X, Y = "contact.stiffness=0 N/m:3000 N/m", "coordination.stiffness=0 N/m:3000 N/m"
 
 
 @pytest.mark.whole
-def test_eight_scenes_have_eight_lines_and_one_that_is_another_says_so() -> None:
+def test_eight_topologies_have_eight_lines_and_one_that_is_another_says_so() -> None:
     names = [*(f"scheme-{place}" for place in range(8)), "again"]
     systems = [
         compiled(
@@ -54,9 +54,9 @@ def test_the_eigenvalues_drawn_are_those_of_the_analysis_within_the_circle() -> 
     found = apc.analyze(compiled(AVERAGE))
     ax = analysis_picture(found)
     drawn = np.concatenate([line.get_xydata() for line in ax.lines if line.get_marker() != "None"])
-    wanted = [mode.eigenvalue for mode in found.modes]
-    assert len(drawn) >= len(wanted)
-    for value in wanted:
+    requested = [mode.eigenvalue for mode in found.modes]
+    assert len(drawn) >= len(requested)
+    for value in requested:
         assert np.abs(drawn @ [1, 1j] - value).min() < 1e-12
     (low, high), (bottom, top) = ax.get_xlim(), ax.get_ylim()
     assert low < -1 < 1 < high and bottom < -1 < 1 < top
@@ -101,7 +101,7 @@ def test_a_root_locus_passes_the_circle_where_stability_changes() -> None:
     points = np.asarray(axes.collections[0].get_offsets()) @ [1, 1j]
     assert np.abs(points).max() > 1.01
     for value in (500, 1096):
-        modes = apc.analyze(system, set={"coordination.stiffness": f"{value} N/m"}).modes
+        modes = apc.analyze(system, params={"coordination.stiffness": f"{value} N/m"}).modes
         for mode in modes:
             assert np.abs(points - mode.eigenvalue).min() < 0.02
 
@@ -111,7 +111,7 @@ def test_what_settles_is_told_in_seconds() -> None:
     stable = apc.analyze(compiled(AVERAGE))
     assert stable.settling_s is not None
     assert stable.spectral_radius ** (stable.settling_s / stable.frame_s) == pytest.approx(0.02)
-    assert apc.analyze(compiled(AVERAGE), set={"coordination.stiffness": "5000 N/m"}).settling_s is None
+    assert apc.analyze(compiled(AVERAGE), params={"coordination.stiffness": "5000 N/m"}).settling_s is None
 
 
 @pytest.mark.whole
@@ -122,7 +122,7 @@ def test_what_settles_is_told_in_seconds() -> None:
 def test_a_run_is_written_as_a_moving_picture(suffix: str, magic: bytes, cli: Cli) -> None:
     if suffix == "mp4" and not pytest.importorskip("matplotlib.animation").writers.is_available("ffmpeg"):
         pytest.skip("ffmpeg is not installed")
-    ran = cli(f"simulate '{SCENES}/planar-users.yaml' --duration 20ms --out run.{suffix}")
+    ran = cli(f"simulate '{TOPOLOGIES}/planar-users.yaml' --duration 20ms --out run.{suffix}")
     assert ran.code == 0 and f"run.{suffix} is written" in ran.out
     assert magic in Path(f"run.{suffix}").read_bytes()[:8]
     assert folder() == [f"run.{suffix}"]
@@ -131,14 +131,14 @@ def test_a_run_is_written_as_a_moving_picture(suffix: str, magic: bytes, cli: Cl
 def test_without_ffmpeg_it_says_what_to_do(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     writers = pytest.importorskip("matplotlib.animation").writers
     monkeypatch.setattr(type(writers), "is_available", lambda self, name: False)
-    ran = cli(f"simulate '{SCENES}/planar-users.yaml' --out run.mp4")
+    ran = cli(f"simulate '{TOPOLOGIES}/planar-users.yaml' --out run.mp4")
     message = "E875 ffmpeg is not installed, which writes .mp4. Write: --out run.gif, or install ffmpeg"
     assert ran.code == 1 and message in ran.err
     assert folder() == []
 
 
 @pytest.mark.whole
-@pytest.mark.parametrize("words", [f"analyze '{SCENE}'", f"critical coordination.stiffness '{SCENE}'"])
+@pytest.mark.parametrize("words", [f"analyze '{TOPOLOGY}'", f"critical coordination.stiffness '{TOPOLOGY}'"])
 def test_pictures_beside_answers_are_refused_before_anything_is_computed(words: str, cli: Cli) -> None:
     assert "E878 the suffix of --plot" in cli(f"{words} --plot a.txt").err
     assert "E930" in cli(f"{words} --hands passive --plot a.svg").err
@@ -157,22 +157,22 @@ def test_pictures_beside_answers_are_refused_before_anything_is_computed(words: 
 def test_a_picture_is_drawn_without_the_settings_in_the_working_folder(
     tmp_path: Path, settings: str | None
 ) -> None:
-    (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    (tmp_path / "topology.yaml").write_text(AVERAGE, encoding="utf-8")
     if settings is None:
         os.mkfifo(tmp_path / "matplotlibrc")  # who opens it waits for ever
     else:
         (tmp_path / "matplotlibrc").write_text(settings, errors="surrogateescape")
-    made = "from apc.__main__ import run; failed = run(['show', 'scene.yaml', '--out', 'scene.png'])"
+    made = "from apc.__main__ import run; failed = run(['show', 'topology.yaml', '--out', 'topology.png'])"
     told = f"{made}\nimport matplotlib; print(failed, matplotlib.rcParams['animation.ffmpeg_path'])"
     ran = subprocess.run(
         [sys.executable, "-c", told], cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60
     )
     assert ran.stdout.splitlines()[-1:] == ["0 ffmpeg"], ran.stderr
-    assert (tmp_path / "scene.png").is_file()
+    assert (tmp_path / "topology.png").is_file()
 
 
 @pytest.mark.whole
 def test_settings_that_somebody_made_in_python_stay(cli: Cli) -> None:
     with matplotlib.rc_context({"animation.ffmpeg_path": "mine"}):
-        assert cli(f"show '{SCENE}' --out a.png").code == 0
+        assert cli(f"show '{TOPOLOGY}' --out a.png").code == 0
         assert matplotlib.rcParams["animation.ffmpeg_path"] == "mine"

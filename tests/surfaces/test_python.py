@@ -15,9 +15,9 @@ import pytest
 
 import apc
 from apc.arguments import _fits, _hints
-from tests.topologies import AVERAGE, SCENES, compiled, replaced, told
+from tests.topologies import AVERAGE, TOPOLOGIES, compiled, replaced, told
 
-PATH = SCENES / "three-users-average.yaml"
+PATH = TOPOLOGIES / "three-users-average.yaml"
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def test_every_public_name_is_there_and_nothing_else() -> None:
 
 
 def test_a_saved_model_analyses_as_the_one_it_was(model: apc.Model, tmp_path: Path) -> None:
-    path = tmp_path / "scene.apc"
+    path = tmp_path / "topology.apc"
     apc.save(model, path)
     assert apc.analyze(apc.load(path)) == apc.analyze(model)
     assert apc.analyze(path) == apc.analyze(str(PATH)) == apc.analyze(model)
@@ -45,25 +45,25 @@ def test_setting_changes_a_copy_and_is_as_good_as_writing(model: apc.Model, tmp_
     changed = apc.set_parameters(model, settings)
     for system, value in ((changed, 5000), (model, 500)):
         assert {p.name: p.value for p in system.parameters}["coordination.stiffness"] == value
-    path = tmp_path / "scene.yaml"
+    path = tmp_path / "topology.yaml"
     text = PATH.read_text(encoding="utf-8")
     path.write_text(replaced(text, ("500 N/m,", "5 N/mm,"), ("delay: 8 ms", "delay: 16 ms")), "utf-8")
-    assert apc.analyze(changed) == apc.analyze(model, set=settings) == apc.analyze(path)
+    assert apc.analyze(changed) == apc.analyze(model, params=settings) == apc.analyze(path)
     assert apc.analyze(changed).verdict == "unstable"
 
 
-def test_people_read_the_scene_s_own_units_and_programs_si(model: apc.Model) -> None:
+def test_people_read_the_topology_s_own_units_and_programs_si(model: apc.Model) -> None:
     own = compiled(replaced(AVERAGE, ("500 N/m,", "0.5 N/mm,"), ("mass: 0.1 kg", "mass: 100 g")))
     stiffness, mass = "coordination.stiffness", "device.mass"
     axes = {"x": f"{stiffness}=0 N/m:2000 N/m", "y": f"{mass}=0.05 kg:0.2 kg"}
-    for ask, said in (
-        (lambda scene: apc.critical(scene, stiffness), "below 1.09641 N/mm\n"),
-        (lambda scene: apc.critical(scene, mass), "is now 100 g\n"),
+    for ask, printed in (
+        (lambda topology: apc.critical(topology, stiffness), "below 1.09641 N/mm\n"),
+        (lambda topology: apc.critical(topology, mass), "is now 100 g\n"),
         (apc.parameters, "0.5 N/mm "),
-        (lambda scene: apc.region(scene, **axes), f"{mass}             50 to 200 g"),
-        (lambda scene: apc.prove_box(scene, {mass: "±5%"}), f"{mass} from 95 g to 105 g"),
+        (lambda topology: apc.region(topology, **axes), f"{mass}             50 to 200 g"),
+        (lambda topology: apc.robust_stability(topology, {mass: "±5%"}), f"{mass} from 95 g to 105 g"),
     ):
-        assert said in str(ask(own))
+        assert printed in str(ask(own))
         plain, same = (json.dumps(ask(one).to_dict() | {"origin": None}) for one in (own, model))
         assert plain == same
 
@@ -80,15 +80,15 @@ def test_results_are_frozen_and_plain_data(model: apc.Model) -> None:
     assert sum(mode["multiplicity"] for mode in document["modes"]) == 3 * 8 - 1, "all but the translation"
 
 
-def test_a_list_of_no_scenes_is_refused_and_one_scene_needs_no_list(model: apc.Model) -> None:
+def test_a_list_of_no_topologies_is_refused_and_one_topology_needs_no_list(model: apc.Model) -> None:
     assert told(apc.compare, []) == [
-        'compare: E610 no scene is given. Write: apc.compare(["average.yaml", "mesh.yaml"])'
+        'compare: E610 no topology is given. Write: apc.compare(["average.yaml", "mesh.yaml"])'
     ]
     assert told(apc.report, []) == [
-        'report: E610 no scene is given. Write: apc.report(["average.yaml", "mesh.yaml"])'
+        'report: E610 no topology is given. Write: apc.report(["average.yaml", "mesh.yaml"])'
     ]
     assert [scheme.topology for scheme in apc.compare(str(PATH)).schemes] == ["three-users-average"]
-    assert told(apc.prove_box, model, {}) == [
+    assert told(apc.robust_stability, model, {}) == [
         "box: E830 no parameter is left open. Write: contact.stiffness=±1%"
     ]
 
@@ -130,11 +130,13 @@ def test_an_argument_of_a_wrong_type_is_said_to_be_one(
 
 def test_a_number_in_si_is_the_quantity(model: apc.Model) -> None:
     name, other = "contact.stiffness", "coordination.stiffness"
-    assert apc.analyze(model, set={"lan.delay": 0.016, "user.count": 4, name: np.float64(800)}) == (
-        apc.analyze(model, set={"lan.delay": "16 ms", "user.count": "4", name: "800 N/m"})
+    assert apc.analyze(model, params={"lan.delay": 0.016, "user.count": 4, name: np.float64(800)}) == (
+        apc.analyze(model, params={"lan.delay": "16 ms", "user.count": "4", name: "800 N/m"})
     )
     assert apc.critical(model, other, upper=3000).value == apc.critical(model, other, upper="3 kN/m").value
-    assert apc.prove_box(model, {name: (900, 1100)}) == apc.prove_box(model, {name: "900 N/m:1100 N/m"})
+    assert apc.robust_stability(model, {name: (900, 1100)}) == apc.robust_stability(
+        model, {name: "900 N/m:1100 N/m"}
+    )
     lists = apc.sweep(model, {name: [800, 900.0]}, jobs=1), apc.sweep(model, {name: "800,900 N/m"}, jobs=1)
     assert str(lists[0].to_dataframe()) == str(lists[1].to_dataframe())
     areas = [
@@ -146,11 +148,11 @@ def test_a_number_in_si_is_the_quantity(model: apc.Model) -> None:
 
 
 def test_one_peer_is_struck(model: apc.Model) -> None:
-    found = apc.simulate(model, strike="user[2]")  # as fast as a list says, with a value a peer
+    found = apc.simulate(model, impulse="user[2]")  # as fast as a list says, with a value a peer
     text = replaced(AVERAGE, ("{count: 3}", "{count: 3, set: {device.v: [0 m/s, 0.1 m/s, 0 m/s]}}"))
     assert np.array_equal(found.values, apc.simulate(compiled(text), duration="1 s").values)
-    with pytest.raises(apc.ApcError, match=r'E983 there is no peer user\[4\] .*Write: --strike "user\[1\]"'):
-        apc.simulate(model, strike="user[4]")
+    with pytest.raises(apc.ApcError, match=r'E983 there is no peer user\[4\] .*Write: --impulse "user\[1\]"'):
+        apc.simulate(model, impulse="user[4]")
 
 
 @pytest.mark.parametrize("wrong", [7, None, ("1 N/m", "2 N/m"), {"a": "b"}, [3]], ids=repr)
@@ -160,11 +162,11 @@ def test_of_a_value_of_a_wrong_type_nothing_else_is_raised(
 ) -> None:
     values: dict[str, Any] = {"contact.stiffness": wrong}
     calls: dict[str, Callable[[], object]] = {
-        "set": lambda: apc.analyze(model, set=values),
+        "set": lambda: apc.analyze(model, params=values),
         "critical": lambda: apc.critical(model, "contact.stiffness", lower="1 N/m", upper=cast(Any, wrong)),
         "sweep": lambda: apc.sweep(model, values),
         "analyze_many": lambda: apc.analyze_many(model, values),
-        "prove_box": lambda: apc.prove_box(model, values),
+        "prove_box": lambda: apc.robust_stability(model, values),
     }
     with contextlib.suppress(TypeError, apc.ApcError):  # a number in SI is a value of `analyze_many`
         calls[call]()

@@ -13,12 +13,12 @@ from apc.compiler.components import declarations
 from apc.compiler.components.component import ROLES
 from apc.compiler.components.definitions import COMPONENT, CONNECTOR
 from apc.compiler.components.parts import PART_KEYS
-from apc.compiler.scene.graphs import PAIRS
-from apc.compiler.scene.groups import GROUP
-from apc.compiler.scene.links import PROBABILITIES
-from apc.compiler.scene.scene import TOPOLOGY
-from apc.compiler.scene.studies import AXES, EXPERIMENT
-from apc.compiler.scene.timebase import CLOCK
+from apc.compiler.topology.graphs import PAIRS
+from apc.compiler.topology.groups import GROUP
+from apc.compiler.topology.links import PROBABILITIES
+from apc.compiler.topology.studies import AXES, EXPERIMENT
+from apc.compiler.topology.timebase import CLOCK
+from apc.compiler.topology.topology import TOPOLOGY
 from tests.commands import Cli, write
 from tests.topologies import ROOT
 
@@ -38,8 +38,8 @@ def block_after(mark: str) -> str:
 @pytest.mark.parametrize(
     "words",
     [
-        "analyze models/scenes/three-users-average.yaml",
-        "critical coordination.stiffness models/scenes/three-users-average.yaml",
+        "analyze models/topologies/three-users-average.yaml",
+        "critical coordination.stiffness models/topologies/three-users-average.yaml",
     ],
 )
 def test_what_is_shown_is_what_is_printed(words: str, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -59,7 +59,7 @@ def last_digit(number: str) -> Fraction:
     return Fraction(1, 10 ** len(number.partition(".")[2]))
 
 
-def test_the_topology_shown_is_a_scene_and_the_error_shown_is_its_message(cli: Cli) -> None:
+def test_the_topology_shown_is_a_topology_and_the_error_shown_is_its_message(cli: Cli) -> None:
     blocks = re.findall(r"```yaml\n(.*?)```", TEXT, re.DOTALL)
     topology = next(block for block in blocks if block.startswith("topology:"))
     write("three-users.yaml", topology)

@@ -1,4 +1,4 @@
-"""Peers in real time: `apc play` does what is simulated, a device outside is measured, mistakes are told."""
+"""Peers in real time: `apc run` does what is simulated, a device outside is measured, mistakes are told."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ import pytest
 
 from apc.__main__ import run
 from apc.compiler.errors import ApcError, Diagnostic
-from apc.loop.device import device_function
-from apc.loop.run import run_of
-from apc.loop.run_folder import read_run
-from apc.loop.start import Play, RunPart, play_all
 from apc.processes import Workers
+from apc.realtime.device import device_function
+from apc.realtime.peer_run import run_of
+from apc.realtime.run_folder import read_run
+from apc.realtime.start import LocalRun, RunPart, run_all
 from tests.surfaces.wire import Other, Wire, loop_at, send_packets
 from tests.topologies import AVERAGE, compiled, replaced
 
@@ -39,10 +39,10 @@ DIGEST = bytes(32)
 @pytest.fixture(autouse=True)
 def no_claims(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave this process as it is: a peer's own keeps all memory, collects none, and goes before others."""
-    monkeypatch.setattr("apc.loop.start.claim", tuple)
+    monkeypatch.setattr("apc.realtime.start.claim", tuple)
 
 
-def test_all_peers_of_a_scene_do_what_is_simulated_with_the_packets_they_heard(
+def test_all_peers_of_a_topology_do_what_is_simulated_with_the_packets_they_heard(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each in a process of its own: every signal at every tick, to the last bits; some packets are lost."""
@@ -54,15 +54,17 @@ def test_all_peers_of_a_scene_do_what_is_simulated_with_the_packets_they_heard(
         ("delay: 8 ms}", "delay: 8 ms, loss: 20 %}"),
     )
     Path("three.yaml").write_text(text, encoding="utf-8")
-    assert run(["play", "--duration", "1 s", "--emulate", "--json"]) == 0
+    assert run(["run", "--duration", "1 s", "--emulate", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["why_not"] == ""
-    assert max(far for far, _ in told["apart"].values()) <= 1e-9
-    assert told["apart"]["N"][1] > 0.1
-    assert len(told["ways"]) == 2
-    for way in told["ways"]:
-        assert 0.01 < way["came"]["lost"]["share"] < 0.45  # of 125, of which 20 % are lost: 6 deviations
-        assert way["came"]["shortest"] >= 0.008
+    assert max(far for far, _ in told["differences"].values()) <= 1e-9
+    assert told["differences"]["N"][1] > 0.1
+    assert len(told["arcs"]) == 2
+    for coupling_term in told["arcs"]:
+        assert (
+            0.01 < coupling_term["came"]["lost"]["share"] < 0.45
+        )  # of 125, of which 20 % are lost: 6 deviations
+        assert coupling_term["came"]["shortest"] >= 0.008
     assert [one.name for one in read_run(Path("three.run")).peers] == ["user[1]", "user[2]"]
     assert run(["compare", "three.run"]) == 0
     out = capsys.readouterr().out
@@ -148,9 +150,9 @@ def test_what_cant_be_played_is_told(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("three.yaml").write_text(MOVING, encoding="utf-8")
-    taken = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    taken.bind(("127.0.0.1", 0))
-    port = taken.getsockname()[1]
+    used = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    used.bind(("127.0.0.1", 0))
+    port = used.getsockname()[1]
     other = ["--to", "user[2]=127.0.0.1:1", "--to", "user[3]=127.0.0.1:2"]
     Path("own").mkdir()
     Path("own/thesis.txt").write_text("mine", encoding="utf-8")
@@ -163,7 +165,7 @@ def test_what_cant_be_played_is_told(
     text = text.replace("$OTHER", shlex.join(other)).replace("$PORT", str(port))
     for line in text.splitlines():
         words, _, message = line.partition(" → ")
-        assert run(["play", "three.yaml", "--duration", "1 s", *shlex.split(words)]) == 1, words
+        assert run(["run", "three.yaml", "--duration", "1 s", *shlex.split(words)]) == 1, words
         assert message in " ".join(capsys.readouterr().err.split()), words
     assert Path("own/thesis.txt").read_text(encoding="utf-8") == "mine"
     assert sorted(str(one) for one in Path().rglob("*")) == there  # nothing is begun
@@ -172,9 +174,9 @@ def test_what_cant_be_played_is_told(
     assert "E973" in capsys.readouterr().err
     alone = replaced(MOVING, ("{count: 3,", "{count: 65,"))
     Path("many.yaml").write_text(alone, encoding="utf-8")
-    assert run(["play", "many.yaml", "--duration", "1 s"]) == 1
+    assert run(["run", "many.yaml", "--duration", "1 s"]) == 1
     assert "E975 65 peers would be as many processes: at most 64" in capsys.readouterr().err
-    taken.close()
+    used.close()
 
 
 def test_a_peer_that_is_lost_or_silent_takes_nothing_of_the_others_along(
@@ -199,10 +201,10 @@ def test_a_peer_that_is_lost_or_silent_takes_nothing_of_the_others_along(
             raise KeyboardInterrupt
         return now(*given, **how)
 
-    monkeypatch.setattr("apc.loop.start.local_processes", workers)
-    monkeypatch.setattr("apc.loop.start.wait", waiting)
-    monkeypatch.setattr("apc.loop.start.TO_END", 0.0)
-    parts = play_all(compiled(MOVING), Play(Fraction(1), b"", emulate=False, seed=None, patience=1.0))
+    monkeypatch.setattr("apc.realtime.start.local_processes", workers)
+    monkeypatch.setattr("apc.realtime.start.wait", waiting)
+    monkeypatch.setattr("apc.realtime.start.TO_END", 0.0)
+    parts = run_all(compiled(MOVING), LocalRun(Fraction(1), b"", emulate=False, seed=None, patience=1.0))
     assert [one.run for one in parts if one.run] == [whole]
     assert [str(one.trouble) for one in parts if one.trouble] == [
         "user[2]: E975 ended without a word: what it played is lost.",
@@ -245,7 +247,7 @@ def test_ctrl_c_ends_a_peer_and_what_it_did_is_kept(tmp_path: Path) -> None:
     assert waiting.returncode == 130
     assert not (tmp_path / "no.run").exists()
     told = playing.communicate(timeout=240)
-    if playing.returncode != 130:  # the scene had begun
+    if playing.returncode != 130:  # the topology had begun
         assert playing.returncode == 0, told[1]
         assert "stopped before the end" in told[0]
         assert all(one.stopped for one in read_run(tmp_path / "all.run").peers)

@@ -16,15 +16,15 @@ import numpy as np
 import pytest
 
 import apc
-from apc.explore.motion import motion_of
-from apc.present import report_output as pages
-from apc.present.report_output import kept_report, report_page
+from apc.app.motion import motion_of
+from apc.output import report_output as pages
+from apc.output.report_output import read_page, report_page
 from apc.reports.contents import Report, differences
 from apc.reports.shown_lines import line_differences
 from tests.commands import Cli, folder, write
-from tests.topologies import AVERAGE, SCENES, replaced
+from tests.topologies import AVERAGE, TOPOLOGIES, replaced
 
-SCENE = SCENES / "three-users-average.yaml"
+TOPOLOGY = TOPOLOGIES / "three-users-average.yaml"
 
 
 LONE = "topology: lone\npeers: {user: {count: 1}}\nmasses: {device: {mass: 1 kg, damping: 1 N*s/m}}\n"
@@ -32,7 +32,7 @@ LONE = "topology: lone\npeers: {user: {count: 1}}\nmasses: {device: {mass: 1 kg,
 
 @functools.cache
 def paper() -> Report:
-    return apc.report(SCENE)
+    return apc.report(TOPOLOGY)
 
 
 @functools.cache
@@ -45,7 +45,7 @@ class Reader(HTMLParser):
 
     def __init__(self, text: str) -> None:
         super().__init__()
-        self.wanted: list[str] = []
+        self.requested: list[str] = []
         self.scripts: list[str | None] = []
         self.open: list[str] = []
         self.feed(text)
@@ -54,7 +54,7 @@ class Reader(HTMLParser):
     def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         """Note what an element names."""
         for name, value in attrs:
-            self.wanted += (
+            self.requested += (
                 [value] if name in ("src", "href", "xlink:href", "data", "action") and value else []
             )
             assert not name.startswith("on"), name
@@ -73,7 +73,7 @@ class Reader(HTMLParser):
 @pytest.mark.whole
 def test_a_page_loads_nothing_runs_nothing_and_names_nothing_twice() -> None:
     reader = Reader(page())
-    assert all(one.startswith(("#", "data:")) for one in reader.wanted)
+    assert all(one.startswith(("#", "data:")) for one in reader.requested)
     assert reader.scripts == ["application/json"]
     assert "default-src 'none'" in page()
     assert len(page().encode("utf-8")) < 5 * 2**20
@@ -91,13 +91,13 @@ def test_every_section_is_there_with_its_picture_text_and_command() -> None:
             continue
         assert "<pre>" in section and "Produced by <code>apc " in section
         assert ("data:image/svg" in section) == (key != "compiled")
-    assert AVERAGE.splitlines()[0] in page()  # the scene's own text
+    assert AVERAGE.splitlines()[0] in page()  # the topology's own text
     assert "prefers-color-scheme: dark" in page()
 
 
 def test_the_numbers_are_those_of_the_commands() -> None:
-    model = apc.compile(SCENE)
-    sections = {one.key: one for one in paper().scenes[0].sections}
+    model = apc.compile(TOPOLOGY)
+    sections = {one.key: one for one in paper().topologies[0].sections}
     assert str(apc.margins(model)) in str(sections["verdict"].results[0])
     [stiffness, _] = sections["limits"].results
     assert str(stiffness) == str(apc.critical(model, "coordination.stiffness")) in page()
@@ -107,40 +107,41 @@ def test_the_numbers_are_those_of_the_commands() -> None:
 
 def test_one_user_is_struck_as_by_the_command_and_in_the_browser() -> None:
     """A common initial velocity excites the common mode alone, in which mesh and average are the same."""
-    section = next(one for one in paper().scenes[0].sections if one.key == "response")
+    section = next(one for one in paper().topologies[0].sections if one.key == "response")
     [played] = section.results
     start = {one.name: played.values[0, at] for at, one in enumerate(played.signals) if one.unit == "m/s"}
     assert {name: value for name, value in start.items() if value} == {"user[1].device.v": 0.1}
     words = shlex.split(section.command)
-    assert words[words.index("--strike") + 1] == "user[1]"
-    seen = motion_of(apc.compile(SCENE), struck=True)
+    assert words[words.index("--impulse") + 1] == "user[1]"
+    observed = motion_of(apc.compile(TOPOLOGY), struck=True)
     places = [at for at, one in enumerate(played.signals) if one.local == "device.x"]
     moved = 1e3 * played.values[:, places]
-    columns = [at for at, (_, body) in enumerate(seen.bodies) if body.states[0] == "device.x"]
-    off = seen.x[:, columns] - seen.x[0, columns]
-    rows = np.searchsorted(played.time, seen.time)
+    columns = [at for at, (_, body) in enumerate(observed.bodies) if body.states[0] == "device.x"]
+    off = observed.x[:, columns] - observed.x[0, columns]
+    rows = np.searchsorted(played.time, observed.time)
     np.testing.assert_allclose(off, moved[rows], atol=1e-9)
 
 
 @pytest.mark.whole
-def test_what_a_scene_says_is_text_and_no_markup(cli: Cli) -> None:
+def test_what_a_topology_says_is_text_and_no_markup(cli: Cli) -> None:
     evil = "</pre></script><script>alert(1)</script><img src=x>"
-    write("scene.yaml", replaced(LONE, ("lone\n", f'lone\nabout: "{evil}"\n')))
-    assert cli("report scene.yaml --out r.html").code == 0
+    write("topology.yaml", replaced(LONE, ("lone\n", f'lone\ndescription: "{evil}"\n')))
+    assert cli("report topology.yaml --out r.html").code == 0
     text = Path("r.html").read_text("utf-8")
     reader = Reader(text)
     assert reader.scripts == ["application/json"]
-    assert "<script>alert" not in text and "x" not in reader.wanted
-    assert kept_report(Path("r.html"))["scenes"][0]["about"] == evil
+    assert "<script>alert" not in text and "x" not in reader.requested
+    assert read_page(Path("r.html")).stored["topologies"][0]["description"] == evil
 
 
 @pytest.mark.whole
-def test_sections_that_a_scene_cannot_fill_say_why(cli: Cli) -> None:
-    write("scene.yaml", LONE)
-    report = apc.report("scene.yaml")
-    why = {one.key: one.refused for one in report.scenes[0].sections if one.refused}
+def test_sections_that_a_topology_cannot_fill_say_why(cli: Cli) -> None:
+    write("topology.yaml", LONE)
+    report = apc.report("topology.yaml")
+    why = {one.key: one.refused for one in report.topologies[0].sections if one.refused}
     assert (
-        why["region"] == "all peers share fewer than two stiffnesses, and the scene says no studies: region:"
+        why["region"]
+        == "all peers share fewer than two stiffnesses, and the topology says no studies: region:"
     )
     assert why["network"] == "loss: there is no link"
     text = html.unescape(report_page(report))
@@ -149,28 +150,28 @@ def test_sections_that_a_scene_cannot_fill_say_why(cli: Cli) -> None:
 
 @pytest.mark.whole
 def test_from_python_a_report_is_a_result_and_a_page(cli: Cli) -> None:
-    write("scene.yaml", LONE)
-    report = apc.report("scene.yaml", "r.html", set={"device.mass": "2 kg"})
-    assert isinstance(report, apc.Report) and report.scenes[0].settings == ("device.mass=2 kg",)
-    assert kept_report(Path("r.html"))["scenes"][0]["settings"] == ["device.mass=2 kg"]
-    again = apc.report(["scene.yaml"], set={"device.mass": "2 kg"})
-    assert Path("r.html").read_text("utf-8") == report_page(again) + "\n"
+    write("topology.yaml", LONE)
+    report = apc.report("topology.yaml", "r.html", params={"device.mass": "2 kg"})
+    assert isinstance(report, apc.Report) and report.topologies[0].settings == ("device.mass=2 kg",)
+    assert read_page(Path("r.html")).stored["topologies"][0]["settings"] == ["device.mass=2 kg"]
+    repeated = apc.report(["topology.yaml"], params={"device.mass": "2 kg"})
+    assert Path("r.html").read_text("utf-8") == report_page(repeated) + "\n"
     with pytest.raises(apc.ApcError, match="E616"):
-        apc.report("scene.yaml", "scene.yaml")
+        apc.report("topology.yaml", "topology.yaml")
 
 
 @pytest.mark.whole
 def test_a_report_is_computed_anew_from_itself_alone(cli: Cli) -> None:
-    write("scene.yaml", replaced(LONE, ("{count: 1}", "{table: users.csv}")))
+    write("topology.yaml", replaced(LONE, ("{count: 1}", "{table: users.csv}")))
     write("users.csv", "device.mass [kg]\n0.1\n0.12\n")
-    assert cli("report scene.yaml --set 'device.damping=2 N*s/m' --out r.html").code == 0
-    for name in ("scene.yaml", "users.csv"):
+    assert cli("report topology.yaml --set 'device.damping=2 N*s/m' --out r.html").code == 0
+    for name in ("topology.yaml", "users.csv"):
         Path(name).unlink()
     assert "r.html: every number is the same, computed anew" in cli("report --check r.html").out
     assert folder() == ["r.html"]
     text = Path("r.html").read_text(encoding="utf-8")
-    kept = kept_report(Path("r.html"))
-    old = kept["scenes"][0]["sections"][1]["results"][0]["spectral_radius"]
+    stored = read_page(Path("r.html")).stored
+    old = stored["topologies"][0]["sections"][1]["results"][0]["spectral_radius"]
     version = f'"apc": "{apc.__version__}"'
     assert version in text
     write("r.html", text.replace(f"{old!r},", f"{old + 0.001!r},").replace(version, '"apc": "0.0.1"'))
@@ -209,11 +210,11 @@ def in_figure(page: str, old: str, new: str) -> str:
 
 @pytest.mark.whole
 def test_what_a_page_shows_is_what_is_checked(cli: Cli) -> None:
-    write("scene.yaml", LONE)
-    assert cli("report scene.yaml --out r.html").code == 0
+    write("topology.yaml", LONE)
+    assert cli("report topology.yaml --out r.html").code == 0
     text = Path("r.html").read_text(encoding="utf-8")
     [radius] = re.findall(r"(spectral radius +[0-9.]+)", text)[:1]
-    kept = text[text.index(SCRIPT) :]
+    stored = text[text.index(SCRIPT) :]
     changes = {
         "a digit": text.replace(radius, f"{radius[:-1]}{(int(radius[-1]) + 1) % 10}"),
         "a verdict": text.replace("lone: ", "lone: proved "),
@@ -226,7 +227,7 @@ def test_what_a_page_shows_is_what_is_checked(cli: Cli) -> None:
         "an inserted line": text.replace("<header>", "<p>gain margin 9</p>\n<header>"),
         "a removed section": re.sub(r'<section id="verdict">.*?</section>\n', "", text, flags=re.DOTALL),
         "the end": text.replace("</body>", "").replace("</html>", ""),
-        "a second one": text.replace("</body>", kept.partition("</script>")[0] + "</script></body>"),
+        "a second one": text.replace("</body>", stored.partition("</script>")[0] + "</script></body>"),
         "a version": text.replace(f"apc              {apc.__version__}", "apc              9.9.9"),
     }
     for what, page in changes.items():
@@ -276,7 +277,7 @@ SCRIPT = '<script type="application/json" id="apc-report">'
 
 
 @pytest.mark.parametrize(
-    "kept",
+    "stored",
     [
         "",
         "<html></html>",
@@ -287,16 +288,16 @@ SCRIPT = '<script type="application/json" id="apc-report">'
         f"{SCRIPT}[]</script>",
         f"{SCRIPT}{'[' * 100_000}</script>",
         SCRIPT * 10_000,
-        f'{SCRIPT}{{"scenes": [{{"name": 3}}]}}</script>',
+        f'{SCRIPT}{{"topologies": [{{"name": 3}}]}}</script>',
         None,
     ],
 )
-def test_what_is_no_report_is_refused(kept: str | None, cli: Cli) -> None:
-    if kept is not None:
-        write("r.html", kept)
+def test_what_is_no_report_is_refused(stored: str | None, cli: Cli) -> None:
+    if stored is not None:
+        write("r.html", stored)
     ran = cli("report --check r.html")
     assert ran.code == 1 and "E990" in ran.err
-    assert kept is None or "E990 is no report that apc has written, or is damaged" in ran.err
+    assert stored is None or "E990 is no report that apc has written, or is damaged" in ran.err
 
 
 @pytest.mark.parametrize(
@@ -307,22 +308,22 @@ def test_a_report_from_somebody_writes_nowhere_else(name: str, cli: Cli) -> None
     assert old in page()
     write("r.html", page().replace(old, json.dumps([name, "x"])[:-5]))
     ran = cli("report --check r.html")
-    assert ran.code == 1 and "E990 names a file outside of the scene's folder" in ran.err
+    assert ran.code == 1 and "E990 names a file outside of the topology's folder" in ran.err
     assert folder() == ["r.html"]
 
 
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
-        (f"'{SCENE}' --out r.txt", 1, "E878 the suffix of --out"),
-        (f"'{SCENE}' --out no/r.html", 1, "E601"),
+        (f"'{TOPOLOGY}' --out r.txt", 1, "E878 the suffix of --out"),
+        (f"'{TOPOLOGY}' --out no/r.html", 1, "E601"),
         (
-            f"'{SCENE}' --out r.pdf",
+            f"'{TOPOLOGY}' --out r.pdf",
             1,
             "E875 Chromium is not installed, which prints a .pdf. Write: --out r.html",
         ),
-        (f"'{SCENE}'", 2, "--out"),
-        ("scene.apc --out r.html", 1, "E615"),
+        (f"'{TOPOLOGY}'", 2, "--out"),
+        ("topology.apc --out r.html", 1, "E615"),
     ],
 )
 def test_what_cannot_be_written_or_read_is_refused_before_anything_is_computed(
@@ -336,17 +337,17 @@ def test_what_cannot_be_written_or_read_is_refused_before_anything_is_computed(
 
 @pytest.mark.skipif(not any(map(shutil.which, pages.BROWSERS)), reason="there is no Chromium")
 def test_a_pdf_is_printed(tmp_path: Path) -> None:
-    (tmp_path / "scene.yaml").write_text(LONE, encoding="utf-8")
-    pages.save_report(apc.report([tmp_path / "scene.yaml"]), tmp_path / "r.pdf")
+    (tmp_path / "topology.yaml").write_text(LONE, encoding="utf-8")
+    pages.save_report(apc.report([tmp_path / "topology.yaml"]), tmp_path / "r.pdf")
     assert (tmp_path / "r.pdf").read_bytes().startswith(b"%PDF")
-    assert sorted(one.name for one in tmp_path.iterdir()) == ["r.pdf", "scene.yaml"]
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["r.pdf", "topology.yaml"]
 
 
 def made_up(**fields: object) -> str:
     """Return a page of one topology with some other fields."""
-    scene = {"name": "n", "about": "", "file": "s.yaml", "settings": [], "texts": [["s.yaml", LONE]]}
-    scene |= {"origin": [], "sections": []} | fields
-    return f"{SCRIPT}{json.dumps({'versions': {}, 'scenes': [scene]})}</script>"
+    topology = {"name": "n", "description": "", "file": "s.yaml", "settings": [], "texts": [["s.yaml", LONE]]}
+    topology |= {"origin": [], "sections": []} | fields
+    return f"{SCRIPT}{json.dumps({'versions': {}, 'topologies': [topology]})}</script>"
 
 
 HUGE = [{"key": "verdict", "refused": "", "results": [{"spectral_radius": 10**400}]}]
@@ -355,7 +356,7 @@ HUGE = [{"key": "verdict", "refused": "", "results": [{"spectral_radius": 10**40
 @pytest.mark.parametrize(
     ("page", "told"),
     [
-        (f'{SCRIPT}{{"versions": {{}}, "scenes": []}}</script>', "holds no topology"),
+        (f'{SCRIPT}{{"versions": {{}}, "topologies": []}}</script>', "holds no topology"),
         (made_up(file=""), "holds no text of ''"),
         (made_up(file="other.yaml"), "holds no text of 'other.yaml'"),
         (
@@ -389,13 +390,13 @@ def test_a_folder_is_no_report(cli: Cli) -> None:
 
 @pytest.mark.whole
 def test_a_digest_that_is_not_that_of_its_text_is_found(cli: Cli) -> None:
-    write("scene.yaml", LONE)
-    assert cli("report scene.yaml --out r.html").code == 0
+    write("topology.yaml", LONE)
+    assert cli("report topology.yaml --out r.html").code == 0
     text = Path("r.html").read_text(encoding="utf-8")
-    digest = dict(kept_report(Path("r.html"))["scenes"][0]["origin"])["scene.yaml"]
+    digest = dict(read_page(Path("r.html")).stored["topologies"][0]["origin"])["topology.yaml"]
     write("r.html", text.replace(digest, "0" * 64))
     ran = cli("report --check r.html")
-    assert ran.code == 1 and "the SHA-256 of scene.yaml is not that of its text" in ran.err
+    assert ran.code == 1 and "the SHA-256 of topology.yaml is not that of its text" in ran.err
 
 
 @pytest.mark.whole

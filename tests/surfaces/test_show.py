@@ -1,4 +1,4 @@
-"""`show`: graph, equations and schedule of a scene, as text, document, Graphviz text and picture."""
+"""`show`: graph, equations and schedule of a topology, as text, document, Graphviz text and picture."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import pytest
 
 import apc
 from apc.compiler.view.listing import diagram_of
-from apc.present.graph import graph_picture
+from apc.output.graph import graph_picture
 from tests.commands import Cli, Ran, folder, write
-from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, replaced
+from tests.topologies import AVERAGE, MESH, ONE_MASS, TOPOLOGIES, replaced
 
-FILE = SCENES / "three-users-average.yaml"
+FILE = TOPOLOGIES / "three-users-average.yaml"
 MANY = """\
 topology: many
-about: A chain on the ground, a rod of two masses, a long array, and groups that differ in much.
+description: A chain on the ground, a rod of two masses, a long array, and groups that differ in much.
 clocks: {haptic: 1 ms, video: {period: 1/90 s, phase: 1 ms}, network: 8 ms, wide: 50 ms}
 parameters: {kt: 2000 N/m}
 peers:
@@ -56,8 +56,8 @@ TEXTS = {
 
 
 def shown(text: str, form: str, path: Path) -> str:
-    path.joinpath("scene.yaml").write_text(text, encoding="utf-8")
-    return apc.show(path / "scene.yaml", format=form)  # type: ignore[arg-type] # a word
+    path.joinpath("topology.yaml").write_text(text, encoding="utf-8")
+    return apc.show(path / "topology.yaml", format=form)  # type: ignore[arg-type] # a word
 
 
 def words_of(svg: str) -> list[str]:
@@ -68,7 +68,7 @@ def words_of(svg: str) -> list[str]:
 @pytest.mark.parametrize("name", TEXTS)
 def test_no_text_of_a_picture_stands_over_another_or_leaves_the_page(name: str, tmp_path: Path) -> None:
     words = words_of(shown(TEXTS[name], "svg", tmp_path))
-    figure = graph_picture(diagram_of(tmp_path / "scene.yaml"))
+    figure = graph_picture(diagram_of(tmp_path / "topology.yaml"))
     figure.draw_without_rendering()
     labels = [label for ax in figure.axes[1:] if ax.axison for label in ax.get_yticklabels()]
     drawn = [*(text for ax in figure.axes for text in (*ax.texts, ax.title)), *labels]
@@ -93,9 +93,9 @@ def test_the_picture_names_every_part_with_its_type_and_numbers() -> None:
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("form", ["svg", "mermaid"])
-def test_text_of_a_scene_cannot_break_out_of_the_picture(form: str, tmp_path: Path) -> None:
+def test_text_of_a_topology_cannot_break_out_of_the_picture(form: str, tmp_path: Path) -> None:
     mark = '"<script>alert(1)</script> & Three'
-    about = ("about: Three", f"about: {mark}"), ("others.  ", 'others."  ')
+    about = ("description: Three", f"description: {mark}"), ("others.  ", 'others."  ')
     drawn = shown(replaced(AVERAGE, *about), form, tmp_path)
     assert "<script>" not in drawn
     if form == "svg":
@@ -144,15 +144,15 @@ def test_the_text_tells_graph_equations_and_schedule() -> None:
 
 
 @pytest.mark.few(3)
-@pytest.mark.parametrize("path", sorted(SCENES.glob("*.yaml")), ids=lambda path: path.stem)
-def test_every_scene_can_be_shown_in_80_columns(path: Path) -> None:
+@pytest.mark.parametrize("path", sorted(TOPOLOGIES.glob("*.yaml")), ids=lambda path: path.stem)
+def test_every_topology_can_be_shown_in_80_columns(path: Path) -> None:
     assert max(map(len, apc.show(path).splitlines())) <= 80
     ET.fromstring(apc.show(path, format="svg"))
 
 
 FURTHEST = """\
 component: Furthest
-about: Pulls by tanh of each distance.
+description: Pulls by tanh of each distance.
 connectors: {object: Flange}
 sends: {x: sample(object.x)}
 parameters: {stiffness: {unit: N/m}, reach: {unit: m, default: 1}, delay: {unit: s}, clock: clock, link: link}
@@ -165,11 +165,12 @@ equations:
 def test_what_costs_a_pair_is_said(cli: Cli) -> None:
     text = replaced(AVERAGE, ("topology: three-users-average", "topology: furthest\nlibrary: ."))
     write(
-        "scene.yaml", replaced(text, ("type: AveragePosition", "type: Furthest"), ("1 ms, link", "0 s, link"))
+        "topology.yaml",
+        replaced(text, ("type: AveragePosition", "type: Furthest"), ("1 ms, link", "0 s, link")),
     )
     write("furthest.yaml", FURTHEST)
-    assert "link lan, pairwise" in " ".join(cli("show scene.yaml").out.split())
-    ran = cli("compile scene.yaml")
+    assert "link lan, pairwise" in " ".join(cli("show topology.yaml").out.split())
+    ran = cli("compile topology.yaml")
     assert ran.code == 0, ran.err
     assert re.search(
         r"costs N²: sum\(.*others\.coordination\.x.*\) is evaluated once a pair of peers, as what it "
@@ -203,23 +204,25 @@ def test_graphviz_text_has_every_node_once_and_closes_every_quote() -> None:
     ],
 )
 def test_the_file_says_the_format(suffix: str, start: bytes, cli: Cli) -> None:
-    assert cli("show", str(FILE), "--out", f"scene.{suffix}") == Ran(0, f"scene.{suffix} is written\n", "")
-    assert Path(f"scene.{suffix}").read_bytes().startswith(start)
+    assert cli("show", str(FILE), "--out", f"topology.{suffix}") == Ran(
+        0, f"topology.{suffix} is written\n", ""
+    )
+    assert Path(f"topology.{suffix}").read_bytes().startswith(start)
 
 
 KINDS = ".txt, .json, .dot, .gv, .mmd, .svg, .png, .pdf"
 
 
 @pytest.mark.parametrize(
-    ("words", "name", "wanted"),
+    ("words", "name", "requested"),
     [
-        ((), "scene.jpg", f"one of {KINDS}, got .jpg. Write: --out scene.txt"),
-        (("--format", "dot"), "scene.svg", "one of .dot, .gv, got .svg. Write: --out scene.dot"),
+        ((), "topology.jpg", f"one of {KINDS}, got .jpg. Write: --out topology.txt"),
+        (("--format", "dot"), "topology.svg", "one of .dot, .gv, got .svg. Write: --out topology.dot"),
     ],
 )
 def test_no_file_is_written_as_what_its_name_does_not_say(
-    words: tuple[str, ...], name: str, wanted: str, cli: Cli
+    words: tuple[str, ...], name: str, requested: str, cli: Cli
 ) -> None:
-    message = f"{name}: E878 the suffix of --out wants {wanted}\n"
+    message = f"{name}: E878 the suffix of --out wants {requested}\n"
     assert cli("show", str(FILE), *words, "--out", name) == Ran(1, "", message)
     assert folder() == []

@@ -8,22 +8,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apc.simulation import rows_in_time, simulation
+from apc.simulation import output_blocks, simulation
 from tests.commands import Cli, folder, write
-from tests.topologies import AVERAGE, SCENES, replaced
+from tests.topologies import AVERAGE, TOPOLOGIES, replaced
 
 MOVED = replaced(AVERAGE, ("{count: 3}", "{count: 3, set: {device.x: 5 mm}}"))
 
 
 @pytest.fixture
 def moved(cli: Cli) -> Cli:
-    write("scene.yaml", MOVED)
+    write("topology.yaml", MOVED)
     return cli
 
 
 @pytest.mark.whole
-def test_the_only_scene_of_a_folder_is_played_for_as_long_as_it_says(cli: Cli) -> None:
-    write("scene.yaml", (SCENES / "experiment-average.yaml").read_text(encoding="utf-8"))
+def test_the_only_topology_of_a_folder_is_played_for_as_long_as_it_says(cli: Cli) -> None:
+    write("topology.yaml", (TOPOLOGIES / "experiment-average.yaml").read_text(encoding="utf-8"))
     ran = cli("simulate")
     assert (ran.code, ran.err) == (0, "")
     assert ran.out.startswith("experiment-average: decays\n")
@@ -32,7 +32,7 @@ def test_the_only_scene_of_a_folder_is_played_for_as_long_as_it_says(cli: Cli) -
 
 def test_rows_and_picture_are_written_and_named(moved: Cli) -> None:
     pytest.importorskip("matplotlib")
-    ran = moved("simulate scene.yaml --duration 50ms --signals cube.x --out run.csv --plot run.svg")
+    ran = moved("simulate topology.yaml --duration 50ms --signals cube.x --out run.csv --plot run.svg")
     assert ran.code == 0
     assert ran.out.endswith("  run.csv is written\n  run.svg is written\n")
     lines = Path("run.csv").read_text(encoding="utf-8").splitlines()
@@ -51,27 +51,27 @@ def test_json_is_one_document_with_what_made_it(moved: Cli) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "printed"),
     [
-        ("", "scene.yaml: E877 the scene says no duration."),
+        ("", "topology.yaml: E877 the topology says no duration."),
         ("--duration 3", '--duration: E204 duration wants s, got 3 (no unit). Write: --duration "3 s"'),
         ("--duration 1s --out run.doc", "run.doc: E878 the suffix of --out wants one of .csv,"),
         ("--out p.png", "wants one of .csv, .parquet, .mat, .npz, .gif, .mp4, got .png. Write: --plot p.png"),
-        ("--duration 1s --still run.doc", "run.doc: E878 the suffix of --still wants one of"),
+        ("--duration 1s --snapshot run.doc", "run.doc: E878 the suffix of --snapshot wants one of"),
         ("--duration 1s --plot run.doc", "run.doc: E878 the suffix of --plot wants one of .png,"),
         ("--duration 1s --out no/run.csv", "no/run.csv: E601 can't be written: No such file"),
         ("--duration 1s --method euler:1ms", "--method: E910 the method wants one of exact,"),
     ],
 )
-def test_what_is_wrong_is_told_in_one_line(words: str, said: str, moved: Cli) -> None:
+def test_what_is_wrong_is_told_in_one_line(words: str, printed: str, moved: Cli) -> None:
     ran = moved(f"simulate {words}")
     assert (ran.code, ran.out) == (1, "")
-    assert said in ran.err
-    assert folder() == ["scene.yaml"]
+    assert printed in ran.err
+    assert folder() == ["topology.yaml"]
 
 
-def test_a_scene_at_rest_is_said_to_rest_and_an_unstable_one_is_an_answer(cli: Cli) -> None:
-    write("scene.yaml", AVERAGE)
+def test_a_topology_at_rest_is_said_to_rest_and_an_unstable_one_is_an_answer(cli: Cli) -> None:
+    write("topology.yaml", AVERAGE)
     assert cli("simulate --duration 1s").out.splitlines() == [
         "three-users-average: at rest",
         "",
@@ -79,7 +79,7 @@ def test_a_scene_at_rest_is_said_to_rest_and_an_unstable_one_is_an_answer(cli: C
         "",
         "  recorded       1001 rows of 24 signals until 1 s",
     ]
-    write("scene.yaml", replaced(MOVED, ("stiffness: 500 N/m", "stiffness: 50 kN/m")))
+    write("topology.yaml", replaced(MOVED, ("stiffness: 500 N/m", "stiffness: 50 kN/m")))
     ran = cli("simulate --duration 10s --out run.csv")
     assert ran.code == 0 and "three-users-average: diverges" in ran.out
     text = Path("run.csv").read_text(encoding="utf-8")
@@ -88,14 +88,14 @@ def test_a_scene_at_rest_is_said_to_rest_and_an_unstable_one_is_an_answer(cli: C
 
 def test_ctrl_c_keeps_what_is_done(moved: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(simulation, "MOST_FRAMES", 5)
-    pushes = rows_in_time.pushes
+    pushes = output_blocks.forces_in_time
 
     def interrupted(played: simulation.Simulation, first: int) -> list[np.ndarray | None]:
         if first >= 10:
             raise KeyboardInterrupt
         return pushes(played, first)
 
-    monkeypatch.setattr(rows_in_time, "pushes", interrupted)
+    monkeypatch.setattr(output_blocks, "forces_in_time", interrupted)
     ran = moved("simulate --duration 1s --out run.csv")
     assert ran.code == 130 and "run.csv is written" in ran.out
     assert ran.err.startswith("stopped at 0.079 s of 1 s; what was done is kept")

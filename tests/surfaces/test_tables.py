@@ -38,7 +38,7 @@ def test_parquet_keeps_types_and_what_made_it(tmp_path: Path) -> None:
     write_table(path, COLUMNS, blocks_of(ROWS), {"model": "abc"})
     table = parquet.read_table(path)
     assert [tuple(row.values()) for row in table.to_pylist()] == list(ROWS)
-    assert [str(kind) for kind in table.schema.types] == ["double", "string", "int64"]
+    assert [str(peer_type) for peer_type in table.schema.types] == ["double", "string", "int64"]
     assert json.loads(table.schema.metadata[b"apc"]) == {"model": "abc"}
 
 

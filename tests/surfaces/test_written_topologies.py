@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 
 import apc
+from apc.app.yaml_edit import with_values, write_topology
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
-from apc.explore.written import with_values, write_topology
-from apc.frame.names import find
 from apc.frame.overrides import apply, parse_override
-from apc.frame.settable import parameters
+from apc.frame.parameter_listing import parameters
+from apc.frame.parameter_names import find
 from tests.commands import Cli, write
-from tests.topologies import SCENES
+from tests.topologies import TOPOLOGIES
 
 HEAD = """# äöü 😀
 topology: t
@@ -199,7 +199,7 @@ def test_a_text_that_would_be_another_topology_is_refused_and_not_written(tmp_pa
 
 
 @pytest.mark.few(5)
-@pytest.mark.parametrize("path", sorted(SCENES.glob("*.yaml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", sorted(TOPOLOGIES.glob("*.yaml")), ids=lambda path: path.stem)
 def test_of_every_number_of_every_shipped_topology_only_that_one_changes(path: Path) -> None:
     """The writer compiles what it wrote and compares every number, or raises."""
     system, text = apc.compile(path), path.read_text(encoding="utf-8")

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from apc.compiler.compiled import Model
-from apc.loop.packets import Address, Hello, Post
-from apc.loop.peer import NANO, PeerLoop
+from apc.realtime.packets import Address, Hello, Post
+from apc.realtime.peer import NANO, PeerLoop
 
 OWN: Address = ("127.0.0.1", 5000)
 SOON = 100_000  # nanoseconds that a datagram is on its way
@@ -35,8 +35,8 @@ class Wire:
         clocks = SimpleNamespace(
             monotonic_ns=lambda: self.time, time_ns=lambda: self.time % (NANO // 7) - HOUR
         )
-        monkeypatch.setattr("apc.loop.realtime.time", clocks)
-        monkeypatch.setattr("apc.loop.peer.select", SimpleNamespace(select=self.wait))
+        monkeypatch.setattr("apc.realtime.process_priority.time", clocks)
+        monkeypatch.setattr("apc.realtime.peer.select", SimpleNamespace(select=self.wait))
 
     def send(self, datagram: bytes, address: Address, at: int = 0) -> None:
         """Have a datagram come from an address, `SOON` or at an instant."""
@@ -82,9 +82,9 @@ class Other:
         wire.told[self.address] = self.take
 
     def take(self, datagram: bytes) -> None:
-        said, time = self.post.read(datagram, OWN), self.wire.time + self.ahead
-        if isinstance(said, Hello):
-            answer = self.post.answer(time + SOON, said, time + SOON, self.begins, self.session)
+        printed, time = self.post.read(datagram, OWN), self.wire.time + self.ahead
+        if isinstance(printed, Hello):
+            answer = self.post.answer(time + SOON, printed, time + SOON, self.begins, self.session)
             self.wire.send(answer, self.address, self.wire.time + 2 * SOON)
             if 0 not in self.post.nonces:
                 self.ask()
@@ -109,7 +109,7 @@ def loop_at(
     device: Any = None,
     stop: Any = None,
 ) -> PeerLoop:
-    """Return the first peer of a scene at a wire, where the others are known."""
+    """Return the first peer of a topology at a wire, where the others are known."""
     names = [f"{group.name}[{at + 1}]" for group in system.groups for at in range(group.count)]
     others = {name: (OWN[0], OWN[1] + at) for at, name in enumerate(names) if at}
     return PeerLoop(
@@ -131,4 +131,4 @@ def send_packets(loop: PeerLoop, others: list[Other], value: float) -> None:
     for count in range(loop.frames * link.slots):
         at = loop.begins + link.instant(count) + NANO // 1000
         for place, other in enumerate(others):
-            other.send(at + place, count, (value * (count + 1),) * len(link.channels_of(other.post.own)))
+            other.send(at + place, count, (value * (count + 1),) * len(link.channels_of(other.post.local)))

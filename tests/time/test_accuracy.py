@@ -7,7 +7,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from apc.present.simulation_output import error_text
+from apc.output.simulation_output import error_text
 from apc.simulation.settings import parse_method
 from apc.simulation.trajectory import simulate
 from tests.fifty_digits.truth import exact_course
@@ -24,7 +24,7 @@ experiment: {duration: 1 s}
 """
 
 
-def test_an_exact_scene_is_off_by_roundings_and_the_estimate_is_no_less() -> None:
+def test_an_exact_topology_is_off_by_roundings_and_the_estimate_is_no_less() -> None:
     system = compiled(SPRING)
     found = simulate(system, error=True, jit=False)
     assert found.error is not None
@@ -39,7 +39,7 @@ def test_an_exact_scene_is_off_by_roundings_and_the_estimate_is_no_less() -> Non
 
 @pytest.mark.few(3)
 @pytest.mark.parametrize("method", ["rk4:1ms", "semi-implicit:0.1ms", "cvodes:1e-7", "rk4:0.3ms"])
-def test_the_estimate_of_a_linear_scene_is_its_distance_from_the_exact_motion(method: str) -> None:
+def test_the_estimate_of_a_linear_topology_is_its_distance_from_the_exact_motion(method: str) -> None:
     system = compiled(replaced(AVERAGE, ("{count: 3}", "{count: 3, set: {device.x: [9 mm, 0 mm, 0 mm]}}")))
     duration = Fraction(1, 10)
     exact = simulate(system, duration=duration, jit=False)

@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from apc.compiler.errors import ApcError
-from apc.simulation.rows_in_time import blocks
+from apc.simulation.output_blocks import blocks
 from apc.simulation.settings import Method, Settings, parse_method
 from apc.simulation.simulation import prepare
 from apc.simulation.trajectory import Trajectory, simulate
@@ -36,13 +36,13 @@ experiment: {duration: 0.3 s}
 """
 STOP = """\
 component: Stop
-about: A wall that acts at every moment.
+description: A wall that acts at every moment.
 source: none
 connectors: {flange: Flange}
 parameters:
-  stiffness: {unit: N/m, min: 0, about: force per depth}
-  damping:   {unit: N*s/m, min: 0, default: 0 N*s/m, about: force per rate of depth}
-  place:     {unit: m, default: 0 m, about: of the wall}
+  stiffness: {unit: N/m, min: 0, description: force per depth}
+  damping:   {unit: N*s/m, min: 0, default: 0 N*s/m, description: force per rate of depth}
+  place:     {unit: m, default: 0 m, description: of the wall}
 equations:
   - flange.f = if flange.x > place then stiffness*(flange.x - place) + damping*der(flange.x) else 0
 """
@@ -100,7 +100,7 @@ def test_hunt_and_crossleys_impact_is_that_of_an_independent_integration() -> No
     assert tight < 3e-8
 
 
-def test_tolerances_follow_the_scenes_scales_and_are_reported() -> None:
+def test_tolerances_follow_the_topologies_scales_and_are_reported() -> None:
     found = simulate(compiled(CROSSLEY), duration=MS, jit=False)
     assert found.provenance.method == "exact where linear, cvodes:1e-10 elsewhere"
     absolute = {one.state: one.absolute for one in found.provenance.tolerances}
@@ -167,8 +167,8 @@ experiment: {duration: 50 ms}
 
 
 def columns(trajectory: Trajectory, start: str) -> np.ndarray:
-    kept = [i for i, one in enumerate(trajectory.signals) if one.name.startswith(start)]
-    return trajectory.values[:, kept]
+    stored = [i for i, one in enumerate(trajectory.signals) if one.name.startswith(start)]
+    return trajectory.values[:, stored]
 
 
 def test_linear_peers_and_parts_keep_their_exact_motion() -> None:
@@ -204,7 +204,7 @@ def test_what_cant_be_integrated_on_is_kept_until_there(
 
 
 @pytest.mark.parametrize(("method", "order"), [("rk4", 4), ("semi-implicit", 1)])
-def test_a_linear_scene_converges_to_the_exact_one_with_the_order_of_the_method(
+def test_a_linear_topology_converges_to_the_exact_one_with_the_order_of_the_method(
     method: str, order: int
 ) -> None:
     moved = replaced(AVERAGE, ("{count: 3}", "{count: 3, set: {device.x: [10 mm, 0 mm, -5 mm]}}"))
@@ -240,7 +240,7 @@ def test_semi_implicit_takes_the_new_velocity_for_the_position() -> None:
 
 SOFT = """\
 component: SoftSpring
-about: A spring that gives way more the harder it is pulled.
+description: A spring that gives way more the harder it is pulled.
 connectors: {flange: Flange}
 parameters: {stiffness: {unit: N/m}, soft: {unit: 1/N^2}CLOCK}
 variables: {f: {unit: N}}
@@ -248,7 +248,7 @@ equations:
   - f + soft*f^3 = stiffness*PLACE
   - flange.f = FORCE
 """
-SOFT_SCENE = """\
+SOFT_TOPOLOGY = """\
 topology: soft
 clocks: {tick: 1 ms}
 peers: {user: {count: 1, set: {device.x: 20 mm}}}
@@ -268,8 +268,10 @@ def test_a_loop_that_newtons_method_solves_is_played(tmp_path: Path, sampled: bo
     text = SOFT
     for name, word in zip(("CLOCK", "PLACE", "FORCE"), words, strict=True):
         text = text.replace(name, word)
-    scene = SOFT_SCENE.replace("soft: 1 1/N^2", "soft: 1 1/N^2, clock: tick") if sampled else SOFT_SCENE
-    found = simulate(compiled(scene, library(tmp_path, text)), duration=MS * 50, jit=False)
+    topology = (
+        SOFT_TOPOLOGY.replace("soft: 1 1/N^2", "soft: 1 1/N^2, clock: tick") if sampled else SOFT_TOPOLOGY
+    )
+    found = simulate(compiled(topology, library(tmp_path, text)), duration=MS * 50, jit=False)
     if sampled:
         x, v = 0.02, 0.0
         for row in range(50):

@@ -92,5 +92,5 @@ def test_angles_and_lengths_are_fitted_together() -> None:
     )
     found = fit_motion(1e-3, x, np.ptp(x, axis=0))
     assert found is not None and abs(found.rate + 0.2) <= found.error < 1e-4
-    assert found.oscillation is not None and found.oscillation.place == 1
+    assert found.oscillation is not None and found.oscillation.index == 1
     assert abs(found.oscillation.frequency - 9) <= found.oscillation.error < 1e-4

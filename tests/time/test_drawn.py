@@ -1,4 +1,4 @@
-"""How a scene begins, drawn from its equations alone, and how a run went, drawn from its rows."""
+"""How a topology begins, drawn from its equations alone, and how a run went, drawn from its rows."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from scipy.spatial.transform import Rotation
 
 import apc
 from apc.compiler.compiled import Model
-from apc.present.bodies import heading
-from apc.present.pictures import write_picture
-from apc.present.simulation_output import paths_of
-from apc.present.still import draw_actors
-from tests.topologies import AVERAGE, SCENES, compiled, library, replaced
+from apc.output.object_shapes import heading
+from apc.output.pictures import write_picture
+from apc.output.simulation_output import paths_of
+from apc.output.still_picture import draw_actors
+from tests.topologies import AVERAGE, TOPOLOGIES, compiled, library, replaced
 
 pytest.importorskip("matplotlib")
 
 
-def scene(name: str) -> Model:
-    return compiled((SCENES / f"{name}.yaml").read_text(encoding="utf-8").partition("\n")[2])
+def topology(name: str) -> Model:
+    return compiled((TOPOLOGIES / f"{name}.yaml").read_text(encoding="utf-8").partition("\n")[2])
 
 
 def test_every_peer_has_a_row_and_the_rest_is_counted(tmp_path: Path) -> None:
-    drawn = draw_actors(scene("experiment-average"))[0].axes[0]
+    drawn = draw_actors(topology("experiment-average"))[0].axes[0]
     assert [one.get_text() for one in drawn.get_yticklabels()] == ["right[1]", "left[1]", "left[2]"]
     assert len(drawn.patches) == 3
     many = draw_actors(compiled(replaced(AVERAGE, ("count: 3", "count: 1000"))))[0]
     assert many.get_suptitle() == "three-users-average: at the start (988 more peers)"
-    write_picture(lambda: draw_actors(scene("experiment-average"))[0], tmp_path / "still.svg")
+    write_picture(lambda: draw_actors(topology("experiment-average"))[0], tmp_path / "still.svg")
     assert (tmp_path / "still.svg").read_text(encoding="utf-8").startswith("<?xml")
 
 
@@ -52,7 +52,7 @@ couplers:
 """
 PEG = """\
 component: Peg
-about: A fixed point of a plane.
+description: A fixed point of a plane.
 connectors: {b: PlanarFlange}
 parameters: {at_: {unit: m, size: 2}}
 equations: ["b.x = at_"]
@@ -71,7 +71,7 @@ def test_every_peer_has_a_plane_of_its_own_to_one_scale(tmp_path: Path) -> None:
 
 
 def test_what_turns_has_a_bar_along_its_axis_and_what_does_not_none() -> None:
-    device, beam = sorted(draw_actors(scene("carried-beam"))[1][:2], key=lambda one: one.turning)
+    device, beam = sorted(draw_actors(topology("carried-beam"))[1][:2], key=lambda one: one.turning)
     assert (device.turning, beam.turning, len(device.artists)) == ((), ("left[1].beam.angle",), 1)
     vectors = np.random.default_rng(1).uniform(-2, 2, (9, 3))  # turned by up to 3.4 rad, half its tangent
     size = np.linalg.norm(vectors, axis=1, keepdims=True)
@@ -102,7 +102,7 @@ def test_a_run_in_a_plane_is_drawn_as_paths_as_well(tmp_path: Path) -> None:
 
 # ---- a run ----
 
-RUN = apc.simulate(SCENES / "experiment-mesh.yaml", duration="0.5 s", jit=False)
+RUN = apc.simulate(TOPOLOGIES / "experiment-mesh.yaml", duration="0.5 s", jit=False)
 
 
 @pytest.mark.whole

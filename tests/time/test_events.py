@@ -1,4 +1,4 @@
-"""The motion of a scene is what its events make of it: each tick, packet and force at its own time.
+"""The motion of a topology is what its events make of it: each tick, packet and force at its own time.
 
 A `Link` brings each packet after its delay; forces act when they are due; between events the motion is exact.
 """
@@ -14,27 +14,27 @@ import pytest
 from apc.compiler.compiled import Model
 from apc.compiler.pipeline import compile_topology
 from apc.frame.overrides import apply, parse_override
-from apc.simulation.native import compiler
-from apc.simulation.rows_in_time import blocks
+from apc.simulation.c_compiler import compiler
+from apc.simulation.output_blocks import blocks
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare
 from apc.simulation.trajectory import Trajectory, simulate
 from tests.fifty_digits.truth import exact_course
 from tests.schemes import experiment
 from tests.sites import MS, alone, paper
-from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, compiled, replaced
+from tests.topologies import AVERAGE, MESH, ONE_MASS, TOPOLOGIES, compiled, replaced
 
 MOVED = "{count: 3, set: {device.x: [10 mm, 0 mm, -5 mm], cube.x: [2 mm, 0 mm, 1 mm]}}"
 
 
 def users(trajectory: Trajectory, n: int) -> np.ndarray:
     """Return the rows as (rows, users, [x, v, x_O, v_O, F_C, F_T])."""
-    kept = [i for i, one in enumerate(trajectory.signals) if not one.local.endswith(" acting")]
-    return trajectory.values[:, kept].reshape(len(trajectory.time), n, 6)
+    stored = [i for i, one in enumerate(trajectory.signals) if not one.local.endswith(" acting")]
+    return trajectory.values[:, stored].reshape(len(trajectory.time), n, 6)
 
 
-def scene_file(name: str) -> str:
-    return (SCENES / name).read_text(encoding="utf-8").partition("\n")[2]
+def topology_file(name: str) -> str:
+    return (TOPOLOGIES / name).read_text(encoding="utf-8").partition("\n")[2]
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ def test_the_papers_experiment_is_what_stepping_it_by_hand_gives(
 ) -> None:
     # The mesh shakes: each contact made or lost multiplies the roundings.
     length = Fraction(4, 5)
-    found = simulate(compiled(scene_file(f"experiment-{name}.yaml")), duration=length, jit=False)
+    found = simulate(compiled(topology_file(f"experiment-{name}.yaml")), duration=length, jit=False)
     expected = experiment(operator, 801)
     expected[:, 0, 4] *= -1  # a push is positive on either side
     assert found.time.tolist() == [tick / 1000 for tick in range(801)]
@@ -88,9 +88,9 @@ def test_delays_of_any_length_act_when_they_should(text: str, graph: str, comp: 
 
 
 @pytest.mark.few(2)
-@pytest.mark.parametrize("scene", ["mixed-clocks", "users-table", "star-lecture"])
-def test_groups_tables_and_clocks_are_followed(scene: str) -> None:
-    system = compile_topology(SCENES / f"{scene}.yaml")
+@pytest.mark.parametrize("topology", ["mixed-clocks", "users-table", "star-lecture"])
+def test_groups_tables_and_clocks_are_followed(topology: str) -> None:
+    system = compile_topology(TOPOLOGIES / f"{topology}.yaml")
     group = system.groups[0].name
     check_followed(apply(system, [parse_override(system, f"{group}.device.x=10 mm")]), Fraction(1, 20))
 
@@ -103,7 +103,7 @@ LIMITED = replaced(MESH, ("{count: 3}", MOVED), ("type: FullMesh", "type: Satura
 @pytest.mark.parametrize(
     "text",
     [
-        scene_file("experiment-average.yaml"),
+        topology_file("experiment-average.yaml"),
         replaced(
             MOVING, ("delay: 8 ms}", "delay: 8 ms, loss: {p: 10 %, r: 30 %}, jitter: 9 ms, graph: ring}")
         ),

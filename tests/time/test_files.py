@@ -15,8 +15,8 @@ import pytest
 import scipy.io
 
 from apc.compiler.errors import ApcError
-from apc.present.recording import SUFFIXES, open_recording
-from apc.simulation.rows_in_time import blocks
+from apc.output.recording import SUFFIXES, open_recording
+from apc.simulation.output_blocks import blocks
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
 from apc.simulation.trajectory import simulate
@@ -84,16 +84,16 @@ def test_a_file_holds_every_digit_of_every_row(simulation: Simulation, tmp_path:
     assert provenance["method"] == "exact"
     assert provenance["parameters"]["contact.stiffness"] == {"value": 1000.0, "unit": "N/m"}
     assert provenance["versions"].keys() == {"apc", "casadi", "numpy"}
-    beside = {path.name, *([f"{path.name}.json"] if suffix == ".csv" else [])}
-    assert {one.name for one in tmp_path.iterdir()} == beside, "no temporary is left"
+    alongside = {path.name, *([f"{path.name}.json"] if suffix == ".csv" else [])}
+    assert {one.name for one in tmp_path.iterdir()} == alongside, "no temporary is left"
 
 
 def test_what_cannot_be_written_is_refused_before_anything_runs(
     simulation: Simulation, tmp_path: Path
 ) -> None:
-    wanted = r"E878 the suffix of --out wants one of .*, got \.xls\. Write: --out .*run\.csv"
-    for name, said in (("run.xls", wanted), ("nowhere/run.csv", "E879 can't be written: No such file")):
-        with pytest.raises(ApcError, match=said):
+    requested = r"E878 the suffix of --out wants one of .*, got \.xls\. Write: --out .*run\.csv"
+    for name, printed in (("run.xls", requested), ("nowhere/run.csv", "E879 can't be written: No such file")):
+        with pytest.raises(ApcError, match=printed):
             open_recording(tmp_path / name, simulation)
 
 
@@ -109,7 +109,7 @@ def no_room_after(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def told_of(simulation: Simulation, path: Path) -> str:
+def reported_by(simulation: Simulation, path: Path) -> str:
     """Record until there is no more room; return what is told then, "" if all was written."""
     try:
         written(simulation, path)
@@ -142,7 +142,7 @@ def test_wherever_the_disk_is_full_the_blocks_before_are_kept(
         path.unlink()
         path.with_name(f"{path.name}.json").unlink(missing_ok=True)
         with no_room_after(int(share * whole)):
-            message = told_of(simulation, path)
+            message = reported_by(simulation, path)
         if not path.exists():
             assert re.search(r"E879 can't be written: \w+", message)
             assert list(tmp_path.iterdir()) == []

@@ -21,7 +21,7 @@ from apc.simulation.trajectory import simulate
 from tests.topologies import ONE_MASS, replaced
 
 MASS, DAMPING = 0.25, 2.0  # kg, N·s/m: numbers of a few bits, so that text and closed form mean the same
-SCENE = """
+TOPOLOGY = """
 topology: pushed
 library: ./
 clocks: {haptic: 4 ms}
@@ -35,7 +35,8 @@ hands:
 """
 TABLE = "time [s],force [N]\n0.0,0\n0.0625,2\n0.078125,-1\n0.125,-1\n"
 OWN = (
-    "component: NAME\nabout: Pushes.\nconnectors: {flange: Flange}\nparameters: {f: {unit: N, default: 1 N},"
+    "component: NAME\ndescription: Pushes.\nconnectors: {flange: Flange}\nparameters: "
+    "{f: {unit: N, default: 1 N},"
     " T: {unit: s, default: 1 s}}\nequations:\n  - flange.f = -f*(LAW)\n"
 )
 LAWS = {
@@ -108,14 +109,14 @@ def by_quadrature(
         return [float(x), float(v)]
 
 
-def pushed(words: str, folder: Path, scene: str = SCENE) -> apc.Model:
-    """Compile the scene with a force, the files it names in a folder."""
+def pushed(words: str, folder: Path, topology: str = TOPOLOGY) -> apc.Model:
+    """Compile the topology with a force, the files it names in a folder."""
     (folder / "push.csv").write_text(TABLE, encoding="utf-8")
     for name, law in LAWS.items():
         text = OWN.replace("NAME", name).replace("LAW", law)
         (folder / f"{name}.yaml").write_text(text, encoding="utf-8")
-    path = folder / "scene.txt"
-    path.write_text(scene.replace("PUSH", words), encoding="utf-8")
+    path = folder / "topology.txt"
+    path.write_text(topology.replace("PUSH", words), encoding="utf-8")
     return compile_topology(path)
 
 
@@ -132,10 +133,10 @@ def test_a_force_of_time_moves_a_mass_as_its_integral_says(what: str, tmp_path: 
         assert found.values[row, :2] == pytest.approx(expected, rel=2e-14)
 
 
-def test_a_scene_in_which_nothing_ticks_is_pushed_too(tmp_path: Path) -> None:
+def test_a_topology_in_which_nothing_ticks_is_pushed_too(tmp_path: Path) -> None:
     words, force, edges = PUSHES["a sine"]
-    scene = SCENE.replace("clocks: {haptic: 4 ms}\n", "")
-    head, _, rest = scene.partition("couplers:")
+    topology = TOPOLOGY.replace("clocks: {haptic: 4 ms}\n", "")
+    head, _, rest = topology.partition("couplers:")
     system = pushed(words, tmp_path, head + "hands:" + rest.partition("hands:")[2])
     expected = by_quadrature(force, edges, Fraction(1, 20))
     found = simulate(system, duration=Fraction(1, 20), jit=False)
@@ -153,7 +154,7 @@ LATE = [(f"type: StepForce, force: 2 N, start: {at!r} s", lambda t, at=at: 2 * (
 def test_a_device_that_forgets_at_once_is_pushed_as_its_integral_says(
     words: str, force: Callable[[Any], Any], edges: list[float], mass: float, tmp_path: Path
 ) -> None:
-    light = replaced(SCENE, ("mass: 0.25 kg, damping: 2 N*s/m", f"mass: {mass!r} kg, damping: 500 N*s/m"))
+    light = replaced(TOPOLOGY, ("mass: 0.25 kg, damping: 2 N*s/m", f"mass: {mass!r} kg, damping: 500 N*s/m"))
     found = simulate(pushed(words, tmp_path, light), duration=Fraction(1, 50), jit=False)
     for row in (1, 5):
         end = Fraction(row, 250)
@@ -168,7 +169,7 @@ def test_two_masses_on_a_spring_are_pushed_as_their_modes_are(what: str, tmp_pat
     words, force, edges = PUSHES[what]
     two = "  load: {mass: 0.25 kg, damping: 2 N*s/m}\ncouplers:\n"
     two += "  tie: {type: SpringDamper, a: device, b: load, stiffness: 300 N/m}\n"
-    text = replaced(SCENE, ("couplers:\n", two), (", set: {device.x: 0.5 m, device.v: 0.125 m/s}", ""))
+    text = replaced(TOPOLOGY, ("couplers:\n", two), (", set: {device.x: 0.5 m, device.v: 0.125 m/s}", ""))
     found = simulate(pushed(words, tmp_path, text), duration=Fraction(1, 10), signals=["device.*"], jit=False)
     with mpmath.workdps(40):
         rate = mpmath.mpf(DAMPING) / MASS
@@ -196,8 +197,8 @@ def test_two_masses_on_a_spring_are_pushed_as_their_modes_are(what: str, tmp_pat
 def test_peers_are_pushed_for_long_each_by_its_own_force_one_of_them_by_none(tmp_path: Path) -> None:
     """m v' + b v = F sin(ω t + φ): what is left after 10 s is the response to the sine alone."""
     peers = "count: 3, set: {push.force: [0 N, 2 N, 1 N], push.frequency: [3 Hz, 4 Hz, 500 Hz]}"
-    scene = replaced(SCENE, ("count: 1, set: {device.x: 0.5 m, device.v: 0.125 m/s}", peers))
-    system = pushed("type: SineForce, force: 1 N, frequency: 1 Hz, phase: 0.5 rad", tmp_path, scene)
+    topology = replaced(TOPOLOGY, ("count: 1, set: {device.x: 0.5 m, device.v: 0.125 m/s}", peers))
+    system = pushed("type: SineForce, force: 1 N, frequency: 1 Hz, phase: 0.5 rad", tmp_path, topology)
     found = simulate(system, duration=Fraction(10), signals=["*.v"], jit=False)
     for row in (2499, 2500):
         turn = 2 * np.pi * np.array([3, 4, 500])
@@ -215,16 +216,16 @@ def test_a_force_that_changes_without_end_is_refused(tmp_path: Path) -> None:
 def test_a_long_table_is_followed_row_by_row_and_costs_no_operation_a_row(tmp_path: Path) -> None:
     generator = np.random.default_rng(4)
     text = f"{ONE_MASS}hands: {{hand: {{type: TableForce, flange: device, force: force.csv}}}}\n"
-    (tmp_path / "scene.yaml").write_text(text, encoding="utf-8")
+    (tmp_path / "topology.yaml").write_text(text, encoding="utf-8")
     lengths = []
     for count in (60, 1000):
         times = np.cumsum(generator.uniform(1e-4, 3e-3, count)) + 0.05
         forces = generator.normal(size=count)
         rows = "".join(f"{t!r},{f!r}\n" for t, f in zip(times.tolist(), forces.tolist(), strict=True))
         (tmp_path / "force.csv").write_text(f"time [s],force [N]\n{rows}", encoding="utf-8")
-        system = compile_topology(tmp_path / "scene.yaml")
-        [kind] = system.kinds
-        lengths.append(kind.derivative.n_instructions())
+        system = compile_topology(tmp_path / "topology.yaml")
+        [peer_type] = system.peer_types
+        lengths.append(peer_type.derivative.n_instructions())
         found = simulate(system, duration=Fraction(1, 10), signals=["*.v"], jit=False)
         # m v' + b v = F, a line between rows: by quadrature on each of them.
         panels = np.unique(np.concatenate([[0.0], times[times < 0.1], [0.1]]))

@@ -11,15 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from apc.compiler import seal
-from apc.simulation import native as module
-from apc.simulation.native import compiler, native
+from apc.compiler import signing
+from apc.simulation import c_compiler as module
+from apc.simulation.c_compiler import compiler, native
 from tests.topologies import ROOT
 
 
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(seal, "_folder", lambda: tmp_path / "cache")
+    monkeypatch.setattr(signing, "_folder", lambda: tmp_path / "cache")
     return tmp_path / "cache"
 
 
@@ -77,9 +77,9 @@ def test_a_library_with_a_bit_turned_is_compiled_again(cache: Path, part: int) -
 AGAIN = """
 import sys
 from pathlib import Path
-from apc.compiler import seal
+from apc.compiler import signing
 from tests.time.test_native import TEXT, half, native
-seal._folder = lambda: Path(sys.argv[1])
+signing._folder = lambda: Path(sys.argv[1])
 print(half(native(TEXT)))
 """
 
@@ -119,7 +119,7 @@ def test_without_a_compiler_or_a_folder_to_keep_it_in_there_is_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").write_text("", encoding="utf-8")
-    monkeypatch.setattr(seal, "_folder", lambda: tmp_path / "file" / "cache")
+    monkeypatch.setattr(signing, "_folder", lambda: tmp_path / "file" / "cache")
     assert native(TEXT) is None
     monkeypatch.setattr(module, "compiler", lambda: None)
     assert native(TEXT) is None

@@ -36,33 +36,33 @@ def limited(x: float, v: float, x_j: float, v_j: float) -> float:
     return max(-LIMIT, min(LIMIT, K * (x - x_j) + B * (v - v_j)))
 
 
-def of_sum(x: float, v: float, f: float, t: float, heard: Heard) -> float:
-    return sum(w * limited(x, v, *one) for w, *one in heard)
+def of_sum(x: float, v: float, f: float, t: float, received: Heard) -> float:
+    return sum(w * limited(x, v, *one) for w, *one in received)
 
 
-def of_mean(x: float, v: float, f: float, t: float, heard: Heard) -> float:
-    return of_sum(x, v, f, t, heard) / sum(w for w, *_ in heard)
+def of_mean(x: float, v: float, f: float, t: float, received: Heard) -> float:
+    return of_sum(x, v, f, t, received) / sum(w for w, *_ in received)
 
 
-def of_largest(x: float, v: float, f: float, t: float, heard: Heard) -> float:
-    return K * (x - max(one for _, one, _ in heard))
+def of_largest(x: float, v: float, f: float, t: float, received: Heard) -> float:
+    return K * (x - max(one for _, one, _ in received))
 
 
-def of_least_pull(x: float, v: float, f: float, t: float, heard: Heard) -> float:
-    return min(K * (x - x_j) * abs(x_j) / 0.01 + B * v for _, x_j, _ in heard)
+def of_least_pull(x: float, v: float, f: float, t: float, received: Heard) -> float:
+    return min(K * (x - x_j) * abs(x_j) / 0.01 + B * v for _, x_j, _ in received)
 
 
-def of_memory_and_time(x: float, v: float, f: float, t: float, heard: Heard) -> float:
-    pulls = [(w, K * (x - x_j) + f / 4 + LIMIT * math.sin(100 * t)) for w, x_j, _ in heard]
+def of_memory_and_time(x: float, v: float, f: float, t: float, received: Heard) -> float:
+    pulls = [(w, K * (x - x_j) + f / 4 + LIMIT * math.sin(100 * t)) for w, x_j, _ in received]
     return sum(w * max(-LIMIT, min(LIMIT, pull)) for w, pull in pulls)
 
 
-def of_linear_sum(x: float, v: float, f: float, t: float, heard: Heard) -> float:
-    return sum(w * (K * (x - x_j) + B * (v - v_j)) for w, x_j, v_j in heard)
+def of_linear_sum(x: float, v: float, f: float, t: float, received: Heard) -> float:
+    return sum(w * (K * (x - x_j) + B * (v - v_j)) for w, x_j, v_j in received)
 
 
-def of_linear_mean(x: float, v: float, f: float, t: float, heard: Heard) -> float:
-    return of_linear_sum(x, v, f, t, heard) / sum(w for w, *_ in heard)
+def of_linear_mean(x: float, v: float, f: float, t: float, received: Heard) -> float:
+    return of_linear_sum(x, v, f, t, received) / sum(w for w, *_ in received)
 
 
 LIMITED = "max(-limit, min(limit, stiffness*(x - others.x) + damping*(v - others.v)))"
@@ -83,7 +83,7 @@ FORCES: dict[str, tuple[str, Force]] = {
 
 COMPONENT = """\
 component: Odd
-about: A coupling that looks at each peer by itself.
+description: A coupling that looks at each peer by itself.
 connectors: {object: Flange}
 sends: {x: sample(object.x), v: sample(der(object.x))}
 parameters:
@@ -108,7 +108,7 @@ equations:
 X = (0.01, -0.004, 0.007, -0.012)
 
 
-def scene(folder: Path, name: str, link: str) -> Model:
+def topology(folder: Path, name: str, link: str) -> Model:
     """Return two near and two far peers whose bodies pull each other."""
     (folder / "parts").mkdir(exist_ok=True)
     force, _ = FORCES[name]
@@ -136,24 +136,24 @@ couplers:
 links:
   lan: {{clock: network, {link}}}
 """
-    (folder / "scene.yaml").write_text(text, encoding="utf-8")
-    return compile_topology(folder / "scene.yaml")
+    (folder / "topology.yaml").write_text(text, encoding="utf-8")
+    return compile_topology(folder / "topology.yaml")
 
 
 Ways = Mapping[tuple[int, int], float]  # the weight of each (sender, receiver)
 COMPLETE: Ways = {(i, j): 1.0 for i in range(4) for j in range(4) if i != j}
 
 
-def by_hand(force: Force, ways: Ways, late: Late, *, zero: bool = False) -> NDArray[np.float64]:
+def by_hand(force: Force, coupling_terms: Ways, late: Late, *, zero: bool = False) -> NDArray[np.float64]:
     """Return every body's x and v at each ms; `late` says which packet counts on a way at a tick."""
 
-    def law(i: int, motion: Any, heard: Any, memory: Any) -> tuple[Any, Any, Any]:
-        weighted = [(ways[j, i], *packet[:2]) for j, packet in heard.items()]
+    def law(i: int, motion: Any, received: Any, memory: Any) -> tuple[Any, Any, Any]:
+        weighted = [(coupling_terms[j, i], *packet[:2]) for j, packet in received.items()]
         f = force(*motion[0], memory[0], memory[1] / 1000, weighted)
         return [-f], [f, memory[1] + 1], []
 
-    hears = [[j for j in range(4) if (j, i) in ways] for i in range(4)]
-    scheme = ByHand([[(0.1, 5.0, 0.0)]] * 4, hears, law, told=0, memory=2, late=late, zero=zero)
+    receives = [[j for j in range(4) if (j, i) in coupling_terms] for i in range(4)]
+    scheme = ByHand([[(0.1, 5.0, 0.0)]] * 4, receives, law, told=0, memory=2, late=late, zero=zero)
     rows = itertools.islice(course(scheme, [[(x, 0.0)] for x in X], [[0.0, 0]] * 4), int(DURATION / MS) + 1)
     return np.array([[one for motion in now.motion for body in motion for one in body] for now in rows])
 
@@ -190,7 +190,7 @@ def test_each_pair_is_what_looking_at_every_packet_gives(
 ) -> None:
     """With one delay for all, or pairs of groups with delays of their own; only who is tied is looked at."""
     _, force = FORCES[name]
-    system = scene(tmp_path, name, f"delay: {delay}" + (f", graph: {graph}" if graph else ""))
+    system = topology(tmp_path, name, f"delay: {delay}" + (f", graph: {graph}" if graph else ""))
 
     def late(i: int, j: int) -> int:
         own = delay == OWN and i // 2 != j // 2
@@ -214,22 +214,25 @@ def test_each_pair_is_what_looking_at_every_packet_gives(
 )
 def test_a_lost_packet_is_missed_by_its_pair_alone(tmp_path: Path, name: str, more: str, graph: str) -> None:
     _, force = FORCES[name]
-    system = scene(tmp_path, name, f"delay: 8 ms, {more}" + (f", graph: {graph}" if graph else ""))
+    system = topology(tmp_path, name, f"delay: 8 ms, {more}" + (f", graph: {graph}" if graph else ""))
     law = channel_law(system, system.links[0], 8 * MS)
-    ways = GRAPHS[graph]
-    late = {way: PacketSource(law, "lan", [way], seed=3).take(50)[0].tolist() for way in ways}
+    coupling_terms = GRAPHS[graph]
+    late = {
+        coupling_term: PacketSource(law, "lan", [coupling_term], seed=3).take(50)[0].tolist()
+        for coupling_term in coupling_terms
+    }
 
     def packet(i: int, j: int, tick: int) -> tuple[int, bool]:
         return effective(late[i, j], tick, newest="all" not in more)
 
-    expected = by_hand(force, ways, packet, zero="zero" in more)
+    expected = by_hand(force, coupling_terms, packet, zero="zero" in more)
     for jit in (False, True):
         check(system, expected, seed=3, jit=jit)
 
 
 def test_nobody_has_no_maximum(tmp_path: Path) -> None:
     with pytest.raises(ApcError, match=r"E801 far\[2\] hears nobody over lan: there is no max over nobody"):
-        scene(tmp_path, "max", "delay: 8 ms, graph: {arcs: [[1, 2], [2, 1], [1, 3]]}")
+        topology(tmp_path, "max", "delay: 8 ms, graph: {arcs: [[1, 2], [2, 1], [1, 3]]}")
 
 
 SOME_SEND = """\

@@ -10,16 +10,16 @@ import pytest
 
 import apc
 from apc.compiler.errors import ApcError
+from apc.simulation.initial_velocity import initial_velocity
 from apc.simulation.settings import DEFAULT, Method, Settings, check_step, parse_method
 from apc.simulation.simulation import MOST_ROWS, check_length, prepare, size_note
-from apc.simulation.strike import strike
 from apc.simulation.trajectory import Trajectory, simulate
 from tests.sites import edged
-from tests.topologies import AVERAGE, ONE_MASS, SCENES, compiled, replaced, told
+from tests.topologies import AVERAGE, ONE_MASS, TOPOLOGIES, compiled, replaced, told
 
 MS = Fraction(1, 1000)
 AVERAGE_RUN, MESH_RUN = (
-    simulate(compiled((SCENES / f"experiment-{name}.yaml").read_text(encoding="utf-8")), jit=False)
+    simulate(compiled((TOPOLOGIES / f"experiment-{name}.yaml").read_text(encoding="utf-8")), jit=False)
     for name in ("average", "mesh")
 )
 
@@ -136,7 +136,7 @@ def test_a_driven_motion_of_an_unstable_linear_topology_diverges(damping: float,
 
 @pytest.mark.parametrize("name", ["three-users-predicted", "two-users-dead-reckoning"])
 def test_the_age_of_a_packet_is_no_force_that_changes_with_time(name: str) -> None:
-    system, _ = strike(apc.compile(SCENES / f"{name}.yaml"))
+    system, _ = initial_velocity(apc.compile(TOPOLOGIES / f"{name}.yaml"))
     found = simulate(system, duration=Fraction(1), jit=False).summary
     assert (found.verdict, found.driven_until) == ("decays", 0.0)
 
@@ -232,7 +232,8 @@ def test_signals_are_chosen_by_pattern_and_are_those_of_a_whole_run(
         replaced(AVERAGE, ("user: {count: 3}", "left: {count: 2, set: {cube.x: 1 cm}}\n  right: {count: 1}"))
     )
     found, whole = (
-        simulate(system, duration=Fraction(1, 20), signals=asked, jit=False) for asked in (patterns, [])
+        simulate(system, duration=Fraction(1, 20), signals=requested, jit=False)
+        for requested in (patterns, [])
     )
     assert [one.name for one in found.signals] == names
     for name in names:
@@ -240,10 +241,10 @@ def test_signals_are_chosen_by_pattern_and_are_those_of_a_whole_run(
 
 
 def test_the_public_function_plays_a_file_with_other_numbers(tmp_path: Path) -> None:
-    path = tmp_path / "scene.yaml"
+    path = tmp_path / "topology.yaml"
     path.write_text(AVERAGE, encoding="utf-8")
-    asked = {"user.device.x": "2 mm"}
-    found = apc.simulate(path, duration="4 ms", set=asked, signals=["device.x"], jit=False)
+    requested = {"user.device.x": "2 mm"}
+    found = apc.simulate(path, duration="4 ms", params=requested, signals=["device.x"], jit=False)
     assert isinstance(found, apc.Trajectory)
     assert found.values.shape == (5, 3)
     assert (found.values[0] == 0.002).all()
@@ -282,14 +283,14 @@ def test_a_method_is_read_with_its_step_exact_or_refused_in_one_line(text: str, 
         assert told(parse_method, text) == [f"--method: {meant}"]
 
 
-def test_a_step_that_the_scene_has_no_room_for_is_refused() -> None:
+def test_a_step_that_the_topology_has_no_room_for_is_refused() -> None:
     system = compiled(AVERAGE)
     assert told(check_step, system, Method("rk4", step=2 * MS), MS, MS) == [
-        "scene.yaml: E913 the step of rk4 wants at most the period of the fastest clock, 1 ms, "
+        "topology.yaml: E913 the step of rk4 wants at most the period of the fastest clock, 1 ms, "
         "got 2 ms. Write: --method rk4:1ms"
     ]
-    [said] = told(check_step, system, Method("rk4", step=MS / 10**7), MS, MS)
-    assert said.startswith("scene.yaml: E913 the step of rk4 wants at least 1e-06 ms,")
+    [printed] = told(check_step, system, Method("rk4", step=MS / 10**7), MS, MS)
+    assert printed.startswith("topology.yaml: E913 the step of rk4 wants at least 1e-06 ms,")
     for method in (Method("rk4", step=MS), DEFAULT):
         check_step(system, method, MS, MS)
 
@@ -297,7 +298,7 @@ def test_a_step_that_the_scene_has_no_room_for_is_refused() -> None:
 def test_a_run_is_as_long_as_is_said_and_no_longer_than_anyone_waits() -> None:
     system = compiled(AVERAGE)
     assert told(simulate, system) == [
-        "scene.yaml: E877 the scene says no duration. Write: experiment: {duration: 3 s}  "
+        "topology.yaml: E877 the topology says no duration. Write: experiment: {duration: 3 s}  "
         '(or --duration "3 s")'
     ]
     with pytest.raises(ApcError, match=r"E877 the duration wants more than 0 s, got -1 s"):
@@ -305,8 +306,8 @@ def test_a_run_is_as_long_as_is_said_and_no_longer_than_anyone_waits() -> None:
     longest = MOST_ROWS * MS  # a row a tick
     check_length(system, longest)
     check_length(system, longest / 10, runs=10)
-    wanted = r'E915 the duration wants at most 1e\+06 s: .* Write: --duration "1e\+06 s"'
-    with pytest.raises(ApcError, match=wanted):
+    requested = r'E915 the duration wants at most 1e\+06 s: .* Write: --duration "1e\+06 s"'
+    with pytest.raises(ApcError, match=requested):
         check_length(system, longest + 1)
     with pytest.raises(ApcError, match=r"at most 100000 s in each of 10 runs: .*got 200000 s"):
         check_length(system, longest / 5, runs=10)

@@ -1,4 +1,4 @@
-"""Parts and scenes whose limits are known by a formula, for searches along one number."""
+"""Parts and topologies whose limits are known by a formula, for searches along one number."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.topologies import compiled, library
 # x⁺ = e^{gT} x − p x(d ticks ago), p = pull (e^{gT} − 1)/g, which is pull·T where nothing grows.
 LATE = """\
 component: Late
-about: A position that grows by itself and is pulled back by what it was.
+description: A position that grows by itself and is pulled back by what it was.
 connectors: {a: Flange}
 parameters: {pull: {unit: 1/s, min: 0}, growth: {unit: 1/s}, clock: clock, delay: {unit: s, min: 0}}
 variables: {x: {unit: m, start: 0 m}}
@@ -24,7 +24,7 @@ equations:
 # All together: x⁺ = (1 − p) x + p x(d packets ago); at p = 1 all its eigenvalues are on the circle at once.
 FOLLOWER = """\
 component: Follower
-about: A position that follows the mean of the others'.
+description: A position that follows the mean of the others'.
 connectors: {a: Flange}
 parameters: {pull: {unit: 1/s, min: 0}, clock: clock, link: link}
 sends: {x: sample(x)}
@@ -37,7 +37,7 @@ equations:
 # A spring whose stiffness depends on a setting by a shape; a copy of the part for each shape.
 SPRING = """\
 component: NAME
-about: A spring whose stiffness depends on a setting.
+description: A spring whose stiffness depends on a setting.
 connectors: {a: Flange, b: Flange}
 parameters:
   low: {unit: N/m, min: 0}

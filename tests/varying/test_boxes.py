@@ -16,10 +16,10 @@ import apc
 from apc.__main__ import run
 from apc.compiler.compiled import Channel
 from apc.compiler.errors import ApcError
-from apc.frame.instance import prepare
-from apc.moments.traces import trace_radius
-from tests.bruteforce import Scene
-from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, compiled, library, replaced
+from apc.frame.numeric_model import prepare
+from apc.mean_square.periodic_delays import trace_radius
+from tests.bruteforce import TopologySource
+from tests.topologies import AVERAGE, MESH, ONE_MASS, TOPOLOGIES, compiled, library, replaced
 from tests.truths import text_of
 
 LIMIT = 1096.410868365630  # tests.reference: the largest stable K_T at K_C = 1000
@@ -36,13 +36,13 @@ SQUARED = replaced(
     ("peers:", "parameters: {kt: 500 N/m, unit: 2 N/m}\npeers:"),
     ("stiffness: 500 N/m", "stiffness: kt*kt/unit/(peers + 247)"),
 )
-DIFFERENT = text_of(Scene(users=({"device": 0.1}, {"device": 0.2}, {"device": 0.15})))
+DIFFERENT = text_of(TopologySource(users=({"device": 0.1}, {"device": 0.2}, {"device": 0.15})))
 COLUMN = replaced(AVERAGE, ("{count: 3}", "{set: {device.mass: [0.1 kg, 0.2 kg, 0.15 kg]}}"))
 ROOT_OF = (LIMIT * 500) ** 0.5  # kt²/500 is the limit
 
 
 def following(formula: str) -> str:
-    """Return the scene with a stiffness that follows kt by a formula."""
+    """Return the topology with a stiffness that follows kt by a formula."""
     return replaced(
         AVERAGE,
         ("peers:", "parameters: {kt: 500 N/m}\npeers:"),
@@ -81,8 +81,12 @@ UNSTABLE = [
 @pytest.mark.parametrize("place", range(len(PROVED)))
 def test_a_box_is_proved_and_every_point_of_it_is_stable(place: int) -> None:
     text, box = PROVED[place]
-    found = apc.prove_box(compiled(text), box)
-    assert (found.stable, found.verdict, found.open_share) == (True, "stable up to a common translation", 0.0)
+    found = apc.robust_stability(compiled(text), box)
+    assert (found.stable, found.verdict, found.undecided_fraction) == (
+        True,
+        "stable up to a common translation",
+        0.0,
+    )
     generator = np.random.default_rng(place)
     for _ in range(3):
         point = {}
@@ -90,15 +94,15 @@ def test_a_box_is_proved_and_every_point_of_it_is_stable(place: int) -> None:
             share = Fraction(float(generator.choice([0.0, 1.0, 0.3, 0.77])))
             unit = "" if one.unit == "1" else f" {one.unit}"
             point[one.free.label] = f"{one.low + share * (one.high - one.low)}{unit}"
-        assert apc.analyze(compiled(text), set=point).stable
+        assert apc.analyze(compiled(text), params=point).stable
 
 
 @pytest.mark.parametrize(("text", "box", "limit"), UNSTABLE)
 def test_a_box_beyond_the_limit_is_unstable_at_a_point(text: str, box: dict[str, str], limit: float) -> None:
-    found = apc.prove_box(compiled(text), box)
-    [point], [name] = found.point, box
+    found = apc.robust_stability(compiled(text), box)
+    [point], [name] = found.counterexample, box
     assert found.stable is False and point > limit
-    assert apc.analyze(compiled(text), set={name: f"{point!r} N/m"}).stable is False
+    assert apc.analyze(compiled(text), params={name: f"{point!r} N/m"}).stable is False
     assert "proved unstable at" in str(found)
 
 
@@ -108,7 +112,7 @@ def test_cells_as_small_as_their_distance_from_the_limit_are_never_wrong(
     centre: float, exponent: int
 ) -> None:
     low, high = (LIMIT * (1 + centre + side * 10.0**exponent) for side in (-1, 1))
-    found = apc.prove_box(compiled(AVERAGE), {"coordination.stiffness": f"{low!r} N/m:{high!r} N/m"})
+    found = apc.robust_stability(compiled(AVERAGE), {"coordination.stiffness": f"{low!r} N/m:{high!r} N/m"})
     if high < LIMIT * (1 - 1e-9):
         assert found.stable is not False
     else:
@@ -118,24 +122,24 @@ def test_cells_as_small_as_their_distance_from_the_limit_are_never_wrong(
 
 def test_what_can_not_be_proved_is_left_open_and_says_where() -> None:
     """At K_T = 0 nothing ties the copies: no box that holds this point is stable in the same sense."""
-    found = apc.prove_box(compiled(AVERAGE), {"coordination.stiffness": "0 N/m:200 N/m"}, cells=100)
+    found = apc.robust_stability(compiled(AVERAGE), {"coordination.stiffness": "0 N/m:200 N/m"}, cells=100)
     assert (found.stable, found.verdict) == (None, "undecided")
-    assert 0 < found.open_share < 0.1 and 0 < found.point[0] < 20
+    assert 0 < found.undecided_fraction < 0.1 and 0 < found.counterexample[0] < 20
     assert max(len(line) for line in str(found).splitlines()) <= 80
-    assert found.to_dict()["open_around"] == list(found.point)
+    assert found.to_dict()["open_around"] == list(found.counterexample)
     loose = replaced(
         *(AVERAGE, ("damping: 5 N*s/m", "damping: 0 N*s/m"), ("damping: 5 N*s/m", "damping: 0 N*s/m")),
         ("500 N/m", "0 N/m"),
     )
-    assert apc.prove_box(compiled(loose), {"contact.stiffness": "±1%"}).stable is not True
+    assert apc.robust_stability(compiled(loose), {"contact.stiffness": "±1%"}).stable is not True
 
 
 @pytest.mark.whole
 def test_a_box_stands_before_the_answer_and_says_that_more_cells_may_decide_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
-    words = ["analyze", str(tmp_path / "scene.yaml"), "--box", "coordination.stiffness=100 N/m:1 N/mm"]
+    (tmp_path / "topology.yaml").write_text(AVERAGE, encoding="utf-8")
+    words = ["analyze", str(tmp_path / "topology.yaml"), "--box", "coordination.stiffness=100 N/m:1 N/mm"]
     assert run([*words, "--cells", "1"]) == 0
     text = capsys.readouterr().out
     assert text.startswith("three-users-average:\nundecided, 100 % of the box is left open (1 cell)")
@@ -145,36 +149,36 @@ def test_a_box_stands_before_the_answer_and_says_that_more_cells_may_decide_it(
 
 
 def test_a_box_over_a_delay_is_stable_where_every_delay_in_it_is() -> None:
-    luck = np.random.default_rng(4)
-    for low, high in np.sort(luck.integers(0, 36, (6, 2)) / 2000, axis=1).tolist():
-        system = apc.set_parameters(compiled(AVERAGE), {"coordination.stiffness": luck.uniform(300, 1500)})
-        found = apc.prove_box(system, {"lan.delay": (low, high + 0.0005)})
+    noise = np.random.default_rng(4)
+    for low, high in np.sort(noise.integers(0, 36, (6, 2)) / 2000, axis=1).tolist():
+        system = apc.set_parameters(compiled(AVERAGE), {"coordination.stiffness": noise.uniform(300, 1500)})
+        found = apc.robust_stability(system, {"lan.delay": (low, high + 0.0005)})
         grid = np.arange(low, high + 0.0006, 0.00025).round(7)
-        stable = [apc.analyze(system, set={"lan.delay": one}).stable for one in grid]
+        stable = [apc.analyze(system, params={"lan.delay": one}).stable for one in grid]
         assert found.stable is all(stable)
-        assert found.stable or not apc.analyze(system, set={"lan.delay": found.point[0]}).stable
+        assert found.stable or not apc.analyze(system, params={"lan.delay": found.counterexample[0]}).stable
 
 
 def changing(system: apc.Model, low: float, high: float) -> Any:
-    return apc.prove_box(system, {"lan.delay": (low, high)}).changing
+    return apc.robust_stability(system, {"lan.delay": (low, high)}).changing
 
 
 def with_delays(system: apc.Model, delays: list[float]) -> float:
-    """Return the least that a scene grows by a frame if its packets have these delays again and again."""
+    """Return the least that a topology grows by a frame if its packets have these delays again and again."""
     channel = Channel(None, None, "uniform", "newest", "hold", np.array(delays))
     recorded = replace(system, links=tuple(replace(link, channel=channel) for link in system.links))
     return trace_radius(recorded, prepare(recorded)).low
 
 
 def test_where_a_changing_delay_is_proved_harmless_no_delays_met_are_unstable() -> None:
-    luck, proved = np.random.default_rng(3), 0
+    noise, proved = np.random.default_rng(3), 0
     for _ in range(8):
-        numbers = {"coordination.stiffness": luck.uniform(200, 700), "user.count": int(luck.integers(2, 5))}
+        numbers = {"coordination.stiffness": noise.uniform(200, 700), "user.count": int(noise.integers(2, 5))}
         system = apc.set_parameters(compiled(AVERAGE), numbers)
         if (found := changing(system, 0.008, 0.02)) is not None and found.proved_to is not None:
             proved += found.proved_to == 0.02
             ends = [0.008, found.proved_to]
-            assert max(with_delays(system, luck.choice(ends, k).tolist()) for k in range(1, 9)) < 1
+            assert max(with_delays(system, noise.choice(ends, k).tolist()) for k in range(1, 9)) < 1
     assert 3 <= proved < 8
 
 
@@ -186,7 +190,7 @@ def test_delays_that_are_harmless_while_constant_are_unstable_by_turns() -> None
     assert found.unstable == (2, 5)
     assert with_delays(system, [0.008] * 2 + [0.046] * 5) == pytest.approx(1.004925, rel=1e-6)
     assert "unstable if by turns 2 packets take 8 ms and 5 46 ms" in " ".join(
-        str(apc.prove_box(system, {"lan.delay": (0.008, 0.046)})).split()
+        str(apc.robust_stability(system, {"lan.delay": (0.008, 0.046)})).split()
     )
 
 
@@ -224,9 +228,9 @@ def test_delays_that_are_harmless_while_constant_are_unstable_by_turns() -> None
     ],
 )
 def test_a_box_that_can_not_be_is_refused_in_one_message(text: str, box: str, message: str) -> None:
-    system = compiled(text) if "\n" in text else apc.compile(SCENES / f"{text}.yaml")
+    system = compiled(text) if "\n" in text else apc.compile(TOPOLOGIES / f"{text}.yaml")
     with pytest.raises(ApcError) as caught:
-        apc.prove_box(system, dict(one.split("=") for one in box.split("|")))
+        apc.robust_stability(system, dict(one.split("=") for one in box.split("|")))
     [mistake] = caught.value.mistakes
     assert f"{mistake.code} {mistake.sentence}".startswith(message)
     assert "Write: contact.stiffness: " not in str(caught.value)
@@ -235,7 +239,7 @@ def test_a_box_that_can_not_be_is_refused_in_one_message(text: str, box: str, me
 def test_a_memory_that_nobody_reads_is_no_translation_of_a_box(tmp_path: Path) -> None:
     part = """\
 component: Sum
-about: A spring, and a sum of errors that nothing reads while ki is 0.
+description: A spring, and a sum of errors that nothing reads while ki is 0.
 connectors: {a: Flange, b: Flange}
 parameters: {k: {unit: N/m}, ki: {unit: N/m}, clock: clock}
 variables: {s: {unit: m, start: 0 m}}
@@ -247,5 +251,5 @@ equations:
     text = replaced(ONE_MASS, ("peers:", "clocks: {tick: 1 ms}\npeers:"))
     text += "couplers:\n  own: {type: Sum, a: device, b: ground, k: 100 N/m, ki: 0 N/m, clock: tick}\n"
     system = compiled(text, library(tmp_path, part))
-    found = apc.prove_box(system, {"own.k": "±1%"})
+    found = apc.robust_stability(system, {"own.k": "±1%"})
     assert (found.verdict, found.stable, apc.analyze(system).verdict) == ("stable", True, "stable")

@@ -97,9 +97,9 @@ def test_an_address_at_which_no_scheduler_can_be_is_told(
 @pytest.mark.whole
 def test_a_cluster_that_is_not_there_is_told_soon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sweep_cluster, "PATIENCE_S", 0.5)
-    with socket.socket() as taken:  # a port that nobody listens at
-        taken.bind(("127.0.0.1", 0))
-        where = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
+    with socket.socket() as used:  # a port that nobody listens at
+        used.bind(("127.0.0.1", 0))
+        where = f"tcp://127.0.0.1:{used.getsockname()[1]}"
         assert told(lambda: sweep(MODEL, OVER, out=tmp_path / "r.csv", cluster=where)) == [
             f"{where}: E888 no Dask scheduler answers there within 0.5 s{FORM}"
         ]
@@ -155,17 +155,17 @@ def test_a_cluster_lost_on_the_way_keeps_what_is_finished(
 @pytest.mark.whole
 def test_a_frozen_worker_is_waited_for_aloud_and_only_so_long(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(processes, "SILENCE", 0.1)
-    heard: list[str] = []
+    received: list[str] = []
     with distributed.LocalCluster(n_workers=1, **ANYWHERE) as frozen:
         (worker,) = (one.process.process.pid for one in frozen.workers.values())
         os.kill(worker, signal.SIGSTOP)
         try:
-            waiting = Patience(0.3, heard.append)
+            waiting = Patience(0.3, received.append)
             (message,) = told(lambda: sweep(MODEL, OVER, cluster=frozen.scheduler_address, patience=waiting))
         finally:
             os.kill(worker, signal.SIGCONT)
     waited = "no result from the processes that compute for {} s; still waiting"
-    assert heard == [waited.format(s) for s in (0.1, 0.2)]
+    assert received == [waited.format(s) for s in (0.1, 0.2)]
     assert message == (
         "sweep: E889 no result from the processes that compute for 0.3 s: they are stuck, or a part takes "
         'longer. Write: --patience "0.6 s"'

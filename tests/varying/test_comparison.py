@@ -15,7 +15,7 @@ import apc
 from apc.__main__ import run
 from apc.comparison.comparison import Scheme, SchemeComparison
 from apc.compiler.errors import ApcError
-from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, compiled, replaced
+from tests.topologies import AVERAGE, MESH, ONE_MASS, TOPOLOGIES, compiled, replaced
 
 LOSSLESS = replaced(AVERAGE, ("delay: 8 ms}", "delay: 8 ms, loss: 0 %}"))
 LOSSY = replaced(AVERAGE, ("delay: 8 ms}", "delay: 8 ms, loss: 10 %}"))
@@ -60,13 +60,15 @@ def scheme(text: str) -> Scheme:
 )
 def test_each_number_is_that_of_its_own_command(text: str) -> None:
     system, found = compiled(text), scheme(text)
-    assert found.analysis == apc.analyze(system) and found.network == apc.judge_network(system)
+    assert found.analysis == apc.analyze(system) and found.network == apc.mean_square_stability(system)
     assert found.stiffness == apc.critical(system, "coordination.stiffness")
     assert found.delay is None or found.delay == apc.critical(system, "lan.delay")
     assert found.loss is None or found.loss == apc.critical(system, "lan.loss")
-    if found.feel is not None:
-        felt = apc.feel(system, found.feel.frequency_hz.tolist())
-        assert np.array_equal(found.feel.impedance, felt.impedance) and found.feel.at == felt.at
+    if found.transparency is not None:
+        used = apc.transparency(system, found.transparency.frequency_hz.tolist())
+        assert (
+            np.array_equal(found.transparency.impedance, used.impedance) and found.transparency.at == used.at
+        )
 
 
 @pytest.mark.whole
@@ -78,7 +80,7 @@ def test_the_verdict_is_of_the_network_nominal_or_with_passive_hands_as_asked() 
     assert nominal.delay == apc.critical(system, "lan.delay", criterion="nominal")
     system = compiled(AVERAGE)
     (found,) = apc.compare([system], criterion="passive").schemes
-    assert found.passive == apc.passive_hands(system)
+    assert found.passive == apc.absolute_stability(system)
     assert found.verdict == "unstable with some passive hands"
     assert found.stiffness == apc.critical(system, "coordination.stiffness", criterion="passive")
 
@@ -89,9 +91,9 @@ def test_a_scheme_that_is_not_linear_is_judged_in_time_beside_its_linearization(
     system = compiled(f"{BOUNCING}experiment: {{duration: 3 s}}\n")
     found = apc.compare([system, compiled(AVERAGE)])
     (one, linear) = found.schemes
-    assert one.analysis is not None and one.analysis.linearized and linear.played is None
+    assert one.analysis is not None and one.analysis.linearized and linear.simulated is None
     played = apc.simulate(system)
-    assert one.played is not None and one.played.to_dict() == played.to_dict()
+    assert one.simulated is not None and one.simulated.to_dict() == played.to_dict()
     words = str(found).splitlines()
     place = words.index("     in time                            played")
     settled = f"decays, settling time {played.summary.settled:.3g} s"
@@ -107,13 +109,13 @@ def test_a_scheme_that_is_not_linear_is_judged_in_time_beside_its_linearization(
 @pytest.mark.parametrize(
     ("experiment", "message"),
     [
-        ("", "apc simulate: the scene says no duration."),  # what to write is for that command
+        ("", "apc simulate: the topology says no duration."),  # what to write is for that command
         ("experiment: {duration: 1e12 s}\n", "apc simulate: the duration wants at most 1e+06 s"),
     ],
 )
 def test_what_is_not_played_says_why(experiment: str, message: str) -> None:
     found = scheme(BOUNCING + experiment)
-    assert found.played is None and dict(found.missing)["played"].startswith(message)
+    assert found.simulated is None and dict(found.missing)["simulated"].startswith(message)
     assert "in time" not in str(compared(AVERAGE, MESH))
 
 
@@ -122,25 +124,25 @@ def test_a_scheme_that_refuses_has_its_place_and_says_why(tmp_path: Path) -> Non
     files = []
     for name, text in (("free", AVERAGE), ("held", replaced(AVERAGE, ("links:", ARM)))):
         (tmp_path / name).mkdir()
-        files.append(str(tmp_path / name / "scene.yaml"))
+        files.append(str(tmp_path / name / "topology.yaml"))
         Path(files[-1]).write_text(text, encoding="utf-8")
     out = tmp_path / "found.json"
     assert run(["compare", *files, "--hands", "held", "--set", "hand.mass=0.2 kg", "--out", str(out)]) == 0
     one, other = json.loads(out.read_text(encoding="utf-8"))["schemes"]
     assert one["analysis"] is not None and not one["refused"]
-    assert (other["analysis"], other["stiffness"], other["feel"], other["stable"]) == (None,) * 4
+    assert (other["analysis"], other["stiffness"], other["transparency"], other["stable"]) == (None,) * 4
     assert (other["verdict"], other["refused"]) == ("refused", "--hands held: user has a hand already, arm.")
 
 
 @pytest.mark.whole
 def test_a_hand_feels_where_it_is_asked_to() -> None:
-    planar = SCENES / "planar-users.yaml"
+    planar = TOPOLOGIES / "planar-users.yaml"
     (one,) = apc.compare([planar], at="user[2].device.x[1]").schemes
-    assert one.feel is not None and one.feel.at == "user[2].device.x[1]"
-    assert apc.compare([planar]).schemes[0].feel is None
-    (proxied,) = apc.compare([SCENES / "two-users-proxies.yaml"]).schemes
-    assert proxied.feel is not None
-    assert proxied.feel.at == "left[1].device"  # which the hands are joined to, not the proxy
+    assert one.transparency is not None and one.transparency.at == "user[2].device.x[1]"
+    assert apc.compare([planar]).schemes[0].transparency is None
+    (proxied,) = apc.compare([TOPOLOGIES / "two-users-proxies.yaml"]).schemes
+    assert proxied.transparency is not None
+    assert proxied.transparency.at == "left[1].device"  # which the hands are joined to, not the proxy
 
 
 # ---- what it costs ----
@@ -156,15 +158,15 @@ def operations(function: casadi.Function) -> int:
 def test_a_tick_takes_its_arithmetic_and_one_operation_for_each_number_heard() -> None:
     """Position and velocity of two others are four; what is evaluated pair by pair counts once a pair."""
     arcs = "delay: 8 ms, graph: {arcs: [[1, 2], [1, 3], [2, 1]]}}"  # two hear the first, nobody hears two
-    for text, heard in ((AVERAGE, 2), (MESH, 2), (replaced(AVERAGE, ("delay: 8 ms}", arcs)), 1)):
+    for text, received in ((AVERAGE, 2), (MESH, 2), (replaced(AVERAGE, ("delay: 8 ms}", arcs)), 1)):
         effort = scheme(text).effort
-        tick = operations(compiled(text).kinds[0].clocks[0].tick)
-        assert (effort.clock, effort.operations) == ("haptic", tick + 2 * heard)
+        tick = operations(compiled(text).peer_types[0].clocks[0].tick)
+        assert (effort.clock, effort.operations) == ("haptic", tick + 2 * received)
     pairs = replaced(MESH, ("FullMesh", "SaturatedMesh"), ("stiffness: 500", "limit: 9 N, stiffness: 500"))
-    (clock,) = compiled(pairs).kinds[0].clocks
-    (heard,) = clock.receives
-    assert heard.edge is not None
-    total = operations(clock.tick) + 2 * (1 + operations(heard.edge))
+    (clock,) = compiled(pairs).peer_types[0].clocks
+    (received,) = clock.receives
+    assert received.edge is not None
+    total = operations(clock.tick) + 2 * (1 + operations(received.edge))
     assert scheme(pairs).effort.operations == total
 
 
@@ -217,7 +219,8 @@ def test_the_stiffness_is_of_the_coupler_that_hears_others_or_of_what_it_follows
         (
             [TWO_SPRINGS],
             [],
-            "scene.yaml: E941 has 2 numbers that could be compared as its stiffness: coordination.stiffness, "
+            "topology.yaml: E941 has 2 numbers that could be compared as its stiffness: "
+            "coordination.stiffness, "
             "leash.stiffness. Write: --over coordination.stiffness",
         ),
         (
@@ -232,7 +235,7 @@ def test_the_stiffness_is_of_the_coupler_that_hears_others_or_of_what_it_follows
         ),
     ],
 )
-def test_a_name_that_is_missing_or_serves_no_scene_is_told(
+def test_a_name_that_is_missing_or_serves_no_topology_is_told(
     texts: list[str], over: list[str], message: str
 ) -> None:
     with pytest.raises(ApcError) as caught:
@@ -248,9 +251,9 @@ def test_a_cell_that_cant_be_had_says_why_below_its_dash() -> None:
     found = compared(SHAKING, LOSSY, ONE_MASS)
     missing = [dict(one.missing) for one in found.schemes]
     assert [sorted(one) for one in missing] == [
-        ["feel", "loss"],
+        ["transparency", "loss"],
         ["delay"],
-        ["delay", "feel", "loss", "stiffness"],
+        ["delay", "transparency", "loss", "stiffness"],
     ]
     assert missing[0]["loss"] == "no packet can get lost; loss: 0 % written to lan lets its loss be varied"
     assert missing[1]["delay"].startswith("apc critical lan.delay: lan.delay can't be varied in mean square")
@@ -268,7 +271,7 @@ def test_schemes_that_differ_in_more_than_their_coupling_are_told_of_and_what_is
         "their frames differ, and with them what a spectral radius is of: 8 ms, 10 ms",
         "some are judged in mean square over the network as it is, some with every packet on time",
     )
-    assert found.left_out == (
+    assert found.limitations == (
         "3: left out: packet loss (10 %) of lan; here every packet takes the nominal 8 ms",
     )
     assert str(found).splitlines()[1].startswith("  of a link that is, or becomes, unreliable: ")
@@ -278,7 +281,7 @@ def test_schemes_that_differ_in_more_than_their_coupling_are_told_of_and_what_is
 
 
 @pytest.fixture
-def scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def topologies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.chdir(tmp_path)
     Path("average.yaml").write_text(AVERAGE, encoding="utf-8")
     Path("mesh.yaml").write_text(MESH, encoding="utf-8")
@@ -286,11 +289,13 @@ def scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 @pytest.mark.whole
-def test_a_table_has_a_row_a_scheme(scenes: list[str]) -> None:
-    assert run(["compare", *scenes, "--out", "out.csv"]) == 0
+def test_a_table_has_a_row_a_scheme(topologies: list[str]) -> None:
+    assert run(["compare", *topologies, "--out", "out.csv"]) == 0
     with Path("out.csv").open(encoding="utf-8") as file:
         row = list(csv.DictReader(file))[1]
     assert float(row["stiffness [N/m]"]) == apc.critical(compiled(MESH), "coordination.stiffness").value
     assert row["delay parameter"] == "lan.delay"
-    felt = [float(row[f"impedance at 10 Hz {part} [N*s/m]"]) for part in ("real", "imaginary")]
-    assert complex(*felt) == pytest.approx(complex(apc.feel(compiled(MESH), 10.0).impedance[0]), rel=1e-12)
+    used = [float(row[f"impedance at 10 Hz {part} [N*s/m]"]) for part in ("real", "imaginary")]
+    assert complex(*used) == pytest.approx(
+        complex(apc.transparency(compiled(MESH), 10.0).impedance[0]), rel=1e-12
+    )

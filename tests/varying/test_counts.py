@@ -1,4 +1,4 @@
-"""The number of peers as a number like others: set, it gives the scene that compiles with it."""
+"""The number of peers as a number like others: set, it gives the topology that compiles with it."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ EDGES = "{edges: [[1, 2], [2, 3]]}"
 
 
 def plain(system: Model) -> tuple[object, ...]:
-    """Return what a scene is made of and how it moves."""
+    """Return what a topology is made of and how it moves."""
     groups = [(group.name, group.count) for group in system.groups]
     found = apc.analyze(system)
-    modes = [(one.eigenvalue, one.multiplicity, one.shape) for one in found.modes]
+    modes = [(one.eigenvalue, one.multiplicity, one.family) for one in found.modes]
     return groups, apc.parameters(system).rows, found.peers, found.spectral_radius, modes
 
 
@@ -72,7 +72,7 @@ def test_so_it_is_with_groups_and_with_counts_that_follow_from_numbers() -> None
         (
             NAMED,
             "user.n=4",
-            "E622 user.count is one number of the scene, and depends on what is set for user. "
+            "E622 user.count is one number of the topology, and depends on what is set for user. "
             "Write: the same without the group, or a group with a set of its own",
         ),
     ],

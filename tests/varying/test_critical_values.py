@@ -18,20 +18,20 @@ import apc
 from apc.__main__ import run
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
-from apc.eigen.balls import precision
-from apc.vary.critical_values import Critical
-from apc.vary.crossing import ESTIMATE, SingleSegment, SmoothSegment, Verdict, search
-from apc.vary.line import one_by_one
-from apc.vary.margins import Margin
+from apc.eigen.ball_arithmetic import precision
+from apc.parameter_studies.critical_values import Critical
+from apc.parameter_studies.crossing import ESTIMATE, SingleSegment, SmoothSegment, Verdict, search
+from apc.parameter_studies.margins import Margin
+from apc.parameter_studies.parameter_path import pointwise
 from apc.verdict import NO_PROOF
 from tests.bench import random_scans
-from tests.bruteforce import Scene, as_ball, frame_matrices, frame_matrix
-from tests.topologies import AVERAGE, MESH, ROOT, SCENES, compiled, replaced, wall
+from tests.bruteforce import TopologySource, as_ball, frame_matrices, frame_matrix
+from tests.topologies import AVERAGE, MESH, ROOT, TOPOLOGIES, compiled, replaced, wall
 from tests.truths import STORED
 from tests.varying.closed_forms import followers, late, sprung
 
 HARD = ROOT / "tests" / "hard"
-LIMIT = 1096.410868365630  # tests.reference, of the paper's scene
+LIMIT = 1096.410868365630  # tests.reference, of the paper's topology
 STIFFNESS = "coordination.stiffness"
 PRESSED = replaced(
     AVERAGE,
@@ -55,18 +55,18 @@ DIFFERENT = replaced(
 )
 
 
-def scene(text: str) -> Model:
-    """Return the scene of a text, or by its name."""
+def topology(text: str) -> Model:
+    """Return the topology of a text, or by its name."""
     if "\n" in text:
         return compiled(text)
-    path = SCENES / f"{text}.yaml"
+    path = TOPOLOGIES / f"{text}.yaml"
     return apc.compile(path if path.exists() else HARD / f"{text}.yaml")
 
 
 def stable_at(system: Model, found: Critical | Margin, value: Fraction) -> bool | None:
     """Return the verdict of an analysis with the number that was searched at a value."""
     unit = "" if found.unit == "1" else f" {found.unit}"
-    return apc.analyze(system, set={found.parameter: f"{value}{unit}"}).stable
+    return apc.analyze(system, params={found.parameter: f"{value}{unit}"}).stable
 
 
 def check(system: Model, found: Critical, values: Sequence[Fraction] = ()) -> None:
@@ -95,7 +95,7 @@ def test_an_integrator_pulled_back_late_is_stable_up_to_its_closed_form(ticks: i
     (one,) = found.crossings
     assert one.value == pytest.approx(limit, rel=1e-12) and one.stable_side == "below"
     assert one.frequency_hz == pytest.approx(500 / (2 * ticks + 1), rel=1e-9)
-    assert one.error <= 1e-9 * limit and found.whole and found.value == one.value
+    assert one.error <= 1e-9 * limit and found.complete and found.value == one.value
 
 
 @pytest.mark.parametrize("ticks", [1, 8, pytest.param(64, marks=pytest.mark.whole)])
@@ -173,7 +173,9 @@ def test_a_delay_that_stands_in_a_force_moves_the_force_as_well() -> None:
             *("kt", LIMIT, 1e-9),
         ),
         # The half width of the cube, 20 mm: beyond it a device moves freely, which is one motion more.
-        pytest.param(*(scene("experiment-average"), "left.device.x", -0.02, 1e-12), marks=pytest.mark.whole),
+        pytest.param(
+            *(topology("experiment-average"), "left.device.x", -0.02, 1e-12), marks=pytest.mark.whole
+        ),
         # The contact closes where its half width is how far the device begins from the cube.
         pytest.param(
             compiled(replaced(PRESSED, ("-10 mm", "-15 mm"), (", side: left", ""), ("1000 N/m", "3000 N/m"))),
@@ -188,24 +190,24 @@ def test_what_a_number_reaches_by_other_ways_has_its_known_value(
 ) -> None:
     found = apc.critical(system, name, upper="40 mm" if "width" in name else None)
     (one,) = found.crossings
-    assert one.value == pytest.approx(value, abs=off) and found.enters
+    assert one.value == pytest.approx(value, abs=off) and found.has_effect
     if name != "kt":
-        assert "the scene is not linear" in str(found)
+        assert "the topology is not linear" in str(found)
 
 
 def test_the_error_holds_against_the_full_map_in_50_digits() -> None:
     """At value ± error the eigenvalue of all peers' own map lies on either side of the circle."""
     found = apc.critical(compiled(AVERAGE), STIFFNESS)
     assert found.value is not None and found.error is not None and found.error < 1e-12 * found.value
-    assert str(found.crossings[0].proof).startswith("proved") and found.whole
+    assert str(found.crossings[0].proof).startswith("proved") and found.complete
     assert "no narrower" in str(replace(found, crossings=(replace(found.crossings[0], error=200.0),)))
     mode = np.exp(2j * np.pi * found.crossings[0].frequency_hz * 0.008)
     sizes = []
     with precision(200):
         for sign in (-1, 1):
             k_t = flint.arb(found.value) + sign * flint.arb(found.error)
-            beside = Scene(kt=k_t, kc=flint.arb(1000))  # type: ignore[arg-type] # a scene of balls
-            rows = frame_matrix(beside, number=as_ball, exp=lambda value: value.exp())
+            alongside = TopologySource(kt=k_t, kc=flint.arb(1000))  # type: ignore[arg-type] # a topology of balls
+            rows = frame_matrix(alongside, number=as_ball, exp=lambda value: value.exp())
             matrix = flint.acb_mat([[flint.acb(entry.mid()) for entry in row] for row in rows])
             values = matrix.eig(algorithm="approx")
             sizes.append(abs(min(values, key=lambda value: abs(complex(value.mid()) - mode))).mid())
@@ -216,11 +218,11 @@ def test_the_error_holds_against_the_full_map_in_50_digits() -> None:
 def test_a_long_delay_has_the_crossing_of_all_peers_by_hand(frames: int) -> None:
     """The spectral radius of the full map, a packet a state, is 1 between the ends of the error."""
     delay = Fraction(8 * frames, 1000)
-    found = apc.critical(compiled(AVERAGE), STIFFNESS, set={"lan.delay": f"{delay} s"})
+    found = apc.critical(compiled(AVERAGE), STIFFNESS, params={"lan.delay": f"{delay} s"})
     assert found.value is not None and found.error is not None and found.error < 1e-9 * found.value
 
     def largest(k_t: float) -> float:
-        sizes = np.abs(np.linalg.eigvals(frame_matrices(Scene(kt=k_t, comm=delay), 1)[0]))
+        sizes = np.abs(np.linalg.eigvals(frame_matrices(TopologySource(kt=k_t, comm=delay), 1)[0]))
         return float(np.sort(sizes)[-2])  # all can move together
 
     aside = 1e-6 * found.value
@@ -272,25 +274,25 @@ ALONG = {
 @pytest.mark.few(4)
 @pytest.mark.parametrize("name", ALONG)
 def test_the_verdict_along_a_scan_is_what_analyses_say(name: str) -> None:
-    text, parameter, asked, values, count = ALONG[name]
-    system = scene(text)
-    found = apc.critical(system, parameter, **asked)
+    text, parameter, requested, values, count = ALONG[name]
+    system = topology(text)
+    found = apc.critical(system, parameter, **requested)
     assert found.crossings and (not count or len(found.crossings) == count)
     assert found.value in [one.value for one in found.crossings]
-    check(apc.set_parameters(system, asked.get("set", {})), found, values)
+    check(apc.set_parameters(system, requested.get("set", {})), found, values)
 
 
-def test_how_many_users_is_answered_as_each_scene_alone_would() -> None:
+def test_how_many_users_is_answered_as_each_topology_alone_would() -> None:
     found = apc.critical(compiled(MESH), "user.count", lower="2", upper="40")
     assert {str(one.proof) for one in found.crossings} == {"both judged"}
     ends = [int(one.boundary) for one in found.crossings]
-    alone = [apc.analyze(compiled(MESH), set={"user.count": str(count)}).stable for count in range(2, 41)]
+    alone = [apc.analyze(compiled(MESH), params={"user.count": str(count)}).stable for count in range(2, 41)]
     expected = [alone[0] is (sum(end < count for end in ends) % 2 == 0) for count in range(2, 41)]
-    assert ends and expected == alone and found.looked <= 39
+    assert ends and expected == alone and found.evaluations <= 39
 
 
-FIRST = [SCENES / "finger.yaml"]
-OTHERS = sorted({*SCENES.glob("*.yaml"), *HARD.glob("*.yaml")} - {*FIRST})
+FIRST = [TOPOLOGIES / "finger.yaml"]
+OTHERS = sorted({*TOPOLOGIES.glob("*.yaml"), *HARD.glob("*.yaml")} - {*FIRST})
 
 
 @pytest.mark.parametrize(
@@ -313,7 +315,7 @@ def test_every_crossing_that_is_answered_is_one_between_two_analyses(path: Path)
 
 
 @pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.whole)])
-def test_no_crossing_is_invented_and_none_is_missed_in_random_scenes(seed: int) -> None:
+def test_no_crossing_is_invented_and_none_is_missed_in_random_topologies(seed: int) -> None:
     """Against eigenvalues of all peers' matrix on a grid and beside each crossing."""
     tally = random_scans.run(2, seed=seed)
     assert tally.wrong == [] and tally.scans == 2
@@ -331,7 +333,7 @@ def test_a_link_delay_jumps_where_a_packet_comes_a_tick_later() -> None:
     assert f"stable with lan.delay up to {1000 * first.value:g} ms\n" in str(found)
     assert "jump, stable at it, stable below it" in str(found)
     row = next(one for one in apc.margins(moved).rows if one.parameter == "lan.delay")
-    assert (row.value, row.factor, row.kind) == (first.value, 1.0, "jump")
+    assert (row.value, row.gain_margin, row.kind) == (first.value, 1.0, "jump")
 
 
 @pytest.mark.parametrize(("name", "value"), [("device.x", -0.02), ("contact.half_width", 0.01)])
@@ -348,17 +350,17 @@ def test_where_a_contact_closes_the_radius_jumps_at_the_geometry(name: str, valu
     assert one.stable_at is at
 
 
-def test_jumps_of_a_scene_within_a_part_in_10_13_of_its_boundary_are_exact() -> None:
+def test_jumps_of_a_topology_within_a_part_in_10_13_of_its_boundary_are_exact() -> None:
     assert STORED["boundary-inside-13"]["spectral_radius"].startswith("0.9999999999")
     found = apc.critical(HARD / "boundary-inside-13.yaml", "lan.delay", upper="16 ms")
     assert [(one.value, one.error) for one in found.crossings] == [(0.002, 0.0), (0.007, 0.0)]
-    assert found.whole and not found.left_open
+    assert found.complete and not found.undecided
 
 
 @pytest.mark.parametrize("low", [0, 14])
 def test_where_a_search_of_delays_begins_is_looked_at_by_itself(low: int) -> None:
     """A packet due at a tick is heard at it, and one a microsecond later at the next."""
-    system = apc.set_parameters(scene("star-lecture"), {STIFFNESS: "873.3965451925634 N/m"})
+    system = apc.set_parameters(topology("star-lecture"), {STIFFNESS: "873.3965451925634 N/m"})
     found = apc.critical(system, "lecture.delay", lower=f"{low} ms", upper="18 ms")
     at, above = (stable_at(system, found, Fraction(low, 1000) + more) for more in (0, Fraction(1, 10**6)))
     assert at is not above
@@ -369,18 +371,18 @@ def test_where_a_search_of_delays_begins_is_looked_at_by_itself(low: int) -> Non
 def test_stretches_of_which_no_analysis_decides_are_said_to_be_left_open() -> None:
     """Every eigenvalue of those who move together is on the circle, exactly, as soon as packets are late."""
     found = apc.critical(followers(2, 1000.0), "lan.delay", upper="3 ms")
-    assert not found.whole and found.left_open[-1] == (0.002, 0.003)
+    assert not found.complete and found.undecided[-1] == (0.002, 0.003)
     assert "the verdict is left open from" in " ".join(str(found).split())
-    assert found.to_dict()["left_open"] == [list(one) for one in found.left_open]
+    assert found.to_dict()["undecided"] == [list(one) for one in found.undecided]
 
 
 def test_the_frequency_is_that_of_the_motion_that_decides() -> None:
     [one, *_] = apc.critical(compiled(AVERAGE), "contact.stiffness").crossings
-    mode = apc.analyze(compiled(AVERAGE), set={"contact.stiffness": f"{one.value!r} N/m"}).modes[0]
+    mode = apc.analyze(compiled(AVERAGE), params={"contact.stiffness": f"{one.value!r} N/m"}).modes[0]
     assert one.frequency_hz == pytest.approx(mode.frequency_hz, rel=1e-6)
     # Eight ticks make a frame: a sign that changes at each, (−1)⁸ = 1, is no common translation.
     found = apc.critical(
-        scene("experiment-average"), "coordination.damping", lower="100 N*s/m", upper="300 N*s/m"
+        topology("experiment-average"), "coordination.damping", lower="100 N*s/m", upper="300 N*s/m"
     )
     assert [one.frequency_hz for one in found.crossings] == pytest.approx([500], rel=1e-9)
 
@@ -390,36 +392,41 @@ def test_the_frequency_is_that_of_the_motion_that_decides() -> None:
 
 def test_no_crossing_is_an_answer_in_words() -> None:
     found = apc.critical(compiled(AVERAGE), STIFFNESS, upper="900 N/m")
-    assert (found.value, found.error, found.stable_side, found.scanned) == (None, None, None, (0.0, 900.0))
-    assert str(found.verdict) == "stable at every value scanned" and found.enters
+    assert (found.value, found.error, found.stable_side, found.searched_to) == (
+        None,
+        None,
+        None,
+        (0.0, 900.0),
+    )
+    assert str(found.verdict) == "stable at every value scanned" and found.has_effect
     above = apc.critical(compiled(AVERAGE), STIFFNESS, lower="1200 N/m", upper="2000 N/m")
     assert str(above.verdict) == "unstable at every value scanned"
     # A wave impedance of 0 divides by zero: the least value looked at is above it.
-    waves = apc.set_parameters(scene("two-users-waves"), {"lan.delay": "72 ms"})
+    waves = apc.set_parameters(topology("two-users-waves"), {"lan.delay": "72 ms"})
     found = apc.critical(waves, "coordination.impedance", upper="1 N*s/m")
-    assert str(found.verdict) == "stable at every value scanned" and found.scanned[0] > 0
+    assert str(found.verdict) == "stable at every value scanned" and found.searched_to[0] > 0
     idle = apc.critical(compiled(AVERAGE), "cube.x")
-    assert not idle.enters and idle.value is None
-    said = " ".join(str(idle).split())
-    assert "stable whatever its value: nothing that decides stability depends on it" in said
+    assert not idle.has_effect and idle.value is None
+    printed = " ".join(str(idle).split())
+    assert "stable whatever its value: nothing that decides stability depends on it" in printed
     apart = apc.set_parameters(wall(0.1, 1.0, 0.0, 100.0), {"device.x": "-1 mm", "it.x": "-1 mm"})
-    said = " ".join(str(apc.critical(apart, "it.stiffness")).split())
-    assert "where the scene starts: there nothing depends on this number" in said
+    printed = " ".join(str(apc.critical(apart, "it.stiffness")).split())
+    assert "where the topology starts: there nothing depends on this number" in printed
 
 
 def test_a_delay_where_what_is_heard_at_the_start_decides_is_refused() -> None:
     text = replaced(MESH, ("type: FullMesh", "type: SaturatedMesh, limit: 3 N"))
-    with pytest.raises(ApcError, match="E845 how the scene moves hangs on what is heard at the start"):
+    with pytest.raises(ApcError, match="E845 how the topology moves hangs on what is heard at the start"):
         apc.critical(compiled(text), "contact.delay")
 
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    (tmp_path / "topology.yaml").write_text(AVERAGE, encoding="utf-8")
 
 
-ORDER = "apc critical: E841 the command wants a parameter or delay, then the scene, got "
+ORDER = "apc critical: E841 the command wants a parameter or delay, then the topology, got "
 
 
 @pytest.mark.parametrize(
@@ -433,10 +440,13 @@ ORDER = "apc critical: E841 the command wants a parameter or delay, then the sce
         ("contact.stiffness|--lower|9 N/m|--upper|3 N/m", "E842 the range of contact.stiffness wants"),
         ("contact.stiffness|--lower|-5 N/m", "E843 a limit of contact.stiffness wants at least 0"),
         (
-            "scene.yaml|lan.delay",
-            f"{ORDER}scene.yaml, then lan.delay. Write: apc critical lan.delay scene.yaml\n",
+            "topology.yaml|lan.delay",
+            f"{ORDER}topology.yaml, then lan.delay. Write: apc critical lan.delay topology.yaml\n",
         ),
-        ("scene.yaml", f"{ORDER}scene.yaml alone. Write: apc critical contact.stiffness scene.yaml\n"),
+        (
+            "topology.yaml",
+            f"{ORDER}topology.yaml alone. Write: apc critical contact.stiffness topology.yaml\n",
+        ),
     ],
 )
 def test_a_mistake_is_one_message(words: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -497,9 +507,9 @@ class Known(SingleSegment):
         stable = None if abs(radius - 1) <= self.band else radius < 1
         return Verdict(stable, radius, self.band, (), NO_PROOF)
 
-    def stretches(self) -> Iterator[SmoothSegment]:
+    def smooth_segments(self) -> Iterator[SmoothSegment]:
         points = np.array([0.0, 1.0, 10.0, 50.0, 100.0])
-        look = partial(one_by_one, self.judge)
+        look = partial(pointwise, self.judge)
         yield SmoothSegment(Fraction(0), Fraction(100), points, 1.0, look, self.judge, slow=True)
 
 
@@ -511,10 +521,10 @@ def test_a_crossing_on_an_end_of_a_cell_is_held_from_both_sides() -> None:
 
 def test_an_end_that_stands_alone_is_no_crossing() -> None:
     found = search(Known(lambda at: 0.5 if at == 0 else 2.0 + at))
-    assert (found.edges, found.stable, found.alone) == ((), (False,), (0.0,))
+    assert (found.edges, found.stable, found.isolated) == ((), (False,), (0.0,))
     # The same at the other end; and a crossing next to an end is one.
     found = search(Known(lambda at: 2.0 if at == 100 else 0.5))
-    assert (found.edges, found.stable, found.alone) == ((), (True,), (100.0,))
+    assert (found.edges, found.stable, found.isolated) == ((), (True,), (100.0,))
     (one,) = search(Known(lambda at: 0.9 + at)).edges
     assert one.value == pytest.approx(0.1, rel=1e-10)
 
@@ -565,4 +575,4 @@ def test_a_critical_value_over_long_delays_is_as_close_as_its_analyses() -> None
     assert found.value == pytest.approx(1032.600987, abs=1e-5)
     assert found.error < 1e-6 * found.value
     for factor, stable in ((1 - 1e-6, True), (1 + 1e-6, False)):
-        assert apc.analyze(model, set={"pd.stiffness": factor * found.value}).stable is stable
+        assert apc.analyze(model, params={"pd.stiffness": factor * found.value}).stable is stable

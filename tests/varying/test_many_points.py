@@ -14,10 +14,10 @@ import pytest
 import apc
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
-from apc.eigen.balls import precision
-from apc.vary.many import Analyses
+from apc.eigen.ball_arithmetic import precision
+from apc.parameter_studies.batch_analysis import Analyses
 from tests.paper_limit import BITS, truth
-from tests.topologies import AVERAGE, MESH, OSCILLATOR, ROOT, SCENES, compiled, replaced, told
+from tests.topologies import AVERAGE, MESH, OSCILLATOR, ROOT, TOPOLOGIES, compiled, replaced, told
 
 
 def as_alone(system: Model, given: Mapping[str, Any], points: Any = None) -> Analyses:
@@ -36,13 +36,13 @@ def as_alone(system: Model, given: Mapping[str, Any], points: Any = None) -> Ana
         for name, values in zip(given, listed, strict=True):
             settings[name] = f"{float(values[point])!r} {units[name]}".removesuffix(" 1")
         try:
-            one = apc.analyze(system, set=settings)
+            one = apc.analyze(system, params=settings)
         except ApcError as error:
             assert found.verdict.ravel()[point] == f"error: {error.mistakes[0].code}"
             assert found.message.ravel()[point] == error.mistakes[0].sentence
             continue
-        said = found.verdict.ravel()[point], found.rigid_modes.ravel()[point]
-        assert said == (one.verdict, one.rigid_modes)
+        printed = found.verdict.ravel()[point], found.rigid_modes.ravel()[point]
+        assert printed == (one.verdict, one.rigid_modes)
         assert abs(radii[point] - one.spectral_radius) <= errors[point] + one.spectral_radius_error
         # A defective cluster, split by itself alone, costs a stack more.
         assert errors[point] <= 8 * one.spectral_radius_error + 1e-15
@@ -54,9 +54,9 @@ def as_alone(system: Model, given: Mapping[str, Any], points: Any = None) -> Ana
     return found
 
 
-EVERY_SCENE = sorted(
+EVERY_TOPOLOGY = sorted(
     path
-    for path in (*SCENES.glob("*.yaml"), *(ROOT / "tests" / "hard").glob("*.yaml"))
+    for path in (*TOPOLOGIES.glob("*.yaml"), *(ROOT / "tests" / "hard").glob("*.yaml"))
     if path.stem
     not in ("million-peers", "non-commensurate", "chain-of-masses", "nearly-defective", "high-rate-ratio")
 )
@@ -64,7 +64,7 @@ EVERY_SCENE = sorted(
 
 @pytest.mark.few(4)
 @pytest.mark.parametrize("points", [2, 6])
-@pytest.mark.parametrize("path", EVERY_SCENE, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", EVERY_TOPOLOGY, ids=lambda path: path.stem)
 def test_every_point_is_as_an_analysis_of_its_own_says(path: Path, points: int) -> None:
     system = apc.compile(path)
     rows = apc.parameters(system).rows
@@ -101,7 +101,7 @@ def test_where_a_stiffness_of_zero_frees_a_motion_it_is_counted() -> None:
     )
     assert set(found.rigid_modes.ravel().tolist()) == {1, 3, 4, 6}
     # An arm of stiffness 0 frees all.
-    as_alone(apc.compile(SCENES / "star-lecture.yaml"), {"arm.stiffness": np.array([0.0, 100.0])})
+    as_alone(apc.compile(TOPOLOGIES / "star-lecture.yaml"), {"arm.stiffness": np.array([0.0, 100.0])})
 
 
 def test_whole_turns_in_a_frame_are_counted() -> None:
@@ -174,7 +174,7 @@ def test_no_point_beside_a_double_eigenvalue_has_a_far_wider_bound() -> None:
 def test_the_result_is_a_table_a_text_and_plain_data() -> None:
     pytest.importorskip("pandas")
     values = ["500 N/m", "2 kN/m", "-1 N/m"]
-    found = apc.analyze_many(SCENES / "three-users-average.yaml", {"contact.stiffness": values})
+    found = apc.analyze_many(TOPOLOGIES / "three-users-average.yaml", {"contact.stiffness": values})
     table = found.to_dataframe()
     assert list(table.columns) == [
         *("contact.stiffness [N/m]", "verdict", "spectral_radius", "spectral_radius_error", "rigid_modes"),

@@ -12,8 +12,8 @@ import pytest
 import apc
 from apc.__main__ import run
 from apc.compiler.compiled import Model
-from apc.vary.margins import Margin
-from tests.topologies import AVERAGE, SCENES, compiled, replaced
+from apc.parameter_studies.margins import Margin
+from tests.topologies import AVERAGE, TOPOLOGIES, compiled, replaced
 from tests.varying.test_critical_values import HARD, PRESSED, stable_at
 
 SAMPLED = "stiffness: 1000 N/m, clock: haptic, delay: 1 ms"
@@ -50,10 +50,10 @@ def rows_of(system: Model) -> dict[str, Margin]:
 def holds(system: Model, one: Margin) -> None:
     """Assert that analyses decide otherwise on both sides of a margin."""
     assert one.value is not None and one.error is not None
-    assert one.value > one.present and one.error <= 1e-6 * one.value
+    assert one.value > one.current and one.error <= 1e-6 * one.value
     aside = max(2 * one.error, 1e-8 * one.value)
     assert [stable_at(system, one, Fraction(one.value + side * aside)) for side in (-1, 1)] == [True, False]
-    assert one.factor == (one.value / one.present if one.present else None)
+    assert one.gain_margin == (one.value / one.current if one.current else None)
 
 
 def test_every_stiffness_damping_and_delay_of_a_coupler_has_a_row() -> None:
@@ -62,13 +62,13 @@ def test_every_stiffness_damping_and_delay_of_a_coupler_has_a_row() -> None:
         *("contact.delay", "coordination.delay", "lan.delay"),
     ]
     assert all(
-        one.value is not None or one.scanned > one.present for one in rows_of(compiled(AVERAGE)).values()
+        one.value is not None or one.searched_to > one.current for one in rows_of(compiled(AVERAGE)).values()
     )
 
 
 @pytest.mark.few(2)
 @pytest.mark.parametrize(
-    ("scene", "names"),
+    ("topology", "names"),
     [
         (AVERAGE, ["contact.stiffness", "contact.damping", "coordination.damping", "contact.delay"]),
         (PRESSED, ["contact.delay"]),
@@ -85,8 +85,8 @@ def test_every_stiffness_damping_and_delay_of_a_coupler_has_a_row() -> None:
     ],
     ids=["average", "pressed", "dead reckoning", "12 ms", "30 ms", "50 ms", "different"],
 )
-def test_a_margin_lies_between_two_analyses(scene: str, names: Sequence[str]) -> None:
-    system = compiled(scene) if "\n" in scene else apc.compile(HARD / f"{scene}.yaml")
+def test_a_margin_lies_between_two_analyses(topology: str, names: Sequence[str]) -> None:
+    system = compiled(topology) if "\n" in topology else apc.compile(HARD / f"{topology}.yaml")
     rows = rows_of(system)
     for name in names:
         assert not rows[name].note
@@ -99,11 +99,11 @@ def test_a_delay_without_a_margin_is_stable_as_far_as_it_was_scanned() -> None:
     row = rows_of(system)["coordination.delay"]
     assert row.value is None
     for share in (0.3, 0.6, 0.9):
-        assert apc.analyze(system, set={row.parameter: f"{share * row.scanned} s"}).stable
+        assert apc.analyze(system, params={row.parameter: f"{share * row.searched_to} s"}).stable
 
 
-def test_a_scene_that_is_not_stable_has_no_margins_and_says_so() -> None:
-    found = apc.margins(compiled(AVERAGE), set={"coordination.stiffness": "2000 N/m"})
+def test_a_topology_that_is_not_stable_has_no_margins_and_says_so() -> None:
+    found = apc.margins(compiled(AVERAGE), params={"coordination.stiffness": "2000 N/m"})
     assert found.rows == () and "not stable" in str(found)
 
 
@@ -111,7 +111,7 @@ def test_a_scene_that_is_not_stable_has_no_margins_and_says_so() -> None:
 def test_a_delay_is_scanned_far_enough_or_said_not_to_be() -> None:
     text = replaced(AVERAGE, (SAMPLED, SAMPLED.replace("1 ms", "0.13 ms")))
     for one in rows_of(compiled(text)).values():
-        assert (one.value is not None or one.scanned >= 1.5 * one.present) and one.note == ""
+        assert (one.value is not None or one.searched_to >= 1.5 * one.current) and one.note == ""
     # 0.95 ms and 1 ms meet at every twentieth of a millisecond.
     found = apc.margins(compiled(replaced(text, ("network: 8 ms", "network: 0.95 ms"))))
     row = next(one for one in found.rows if one.parameter == "lan.delay")
@@ -128,8 +128,8 @@ def test_a_links_delay_that_no_way_has_is_no_margin() -> None:
     )
     rows = {row.parameter for row in apc.margins(compiled(text)).rows}
     assert {"lan.delays.one.two", "lan.delays.two.one"} <= rows and "lan.delay" not in rows
-    one_way = replaced(text, ("two: {one: 9 ms}", "two: {one: 8 ms}"), ("one: {two: 16 ms}, ", ""))
-    assert "lan.delay" in {row.parameter for row in apc.margins(compiled(one_way)).rows}
+    one_direction = replaced(text, ("two: {one: 9 ms}", "two: {one: 8 ms}"), ("one: {two: 16 ms}, ", ""))
+    assert "lan.delay" in {row.parameter for row in apc.margins(compiled(one_direction)).rows}
 
 
 def test_of_very_large_systems_delays_are_said_not_to_be_looked_for() -> None:
@@ -145,10 +145,10 @@ def test_in_passing_what_takes_long_is_named_with_the_option_that_asks_for_it(
 ) -> None:
     """Two users 100 ms apart: 400 packets on their way, in whose matrices a delay takes some 20 seconds."""
     text = replaced(hasty("100 ms", "30 N/m"), ("1000 N/m", "100 N/m"))
-    (tmp_path / "scene.yaml").write_text(text, encoding="utf-8")
-    assert run(["analyze", str(tmp_path / "scene.yaml")]) == 0
+    (tmp_path / "topology.yaml").write_text(text, encoding="utf-8")
+    assert run(["analyze", str(tmp_path / "topology.yaml")]) == 0
     text = capsys.readouterr().out
-    assert "not looked for in passing in so large a scene (apc analyze --margins does)" in " ".join(
+    assert "not looked for in passing in so large a topology (apc analyze --margins does)" in " ".join(
         text.split()
     )
     assert max(map(len, text.splitlines())) <= 80
@@ -158,12 +158,12 @@ def test_in_passing_what_takes_long_is_named_with_the_option_that_asks_for_it(
 def test_margins_are_those_of_the_function_and_left_out_where_they_are_not_wanted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = str(tmp_path / "scene.yaml")
+    path = str(tmp_path / "topology.yaml")
     Path(path).write_text(AVERAGE.replace("delay: 8 ms}", "delay: 8 ms, loss: 1 %}"), "utf-8")
     assert run(["analyze", path, "--no-margins"]) == 0
     assert "margins not looked for: they were not wanted" in capsys.readouterr().out
     text = str(apc.margins(compiled(AVERAGE)))
     assert "none found up to" in text and max(map(len, text.splitlines())) <= 80
     for words in ([], ["--margins"]):
-        assert run(["analyze", str(SCENES / "three-users-average.yaml"), *words]) == 0
+        assert run(["analyze", str(TOPOLOGIES / "three-users-average.yaml"), *words]) == 0
         assert text.rstrip() in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""What is kept from one answer to the next never tells of another scene: each is as in a process alone."""
+"""What is kept from one answer to the next never tells of another topology: each is as in a process alone."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.topologies import AVERAGE, ROOT, compiled, replaced
 
 OTHER = "user: {count: 2}\n  other: {count: 1, set: {device.mass: 0.3 kg}}"
 # Each changes one thing that what is kept hangs on: a number, a time, how many, who hears whom, a law.
-SCENES: tuple[tuple[str, dict[str, str]], ...] = (
+TOPOLOGIES: tuple[tuple[str, dict[str, str]], ...] = (
     (AVERAGE, {}),
     (AVERAGE, {"coordination.stiffness": "700 N/m"}),
     (AVERAGE, {"coordination.stiffness": "0 N/m"}),
@@ -31,15 +31,15 @@ SCENES: tuple[tuple[str, dict[str, str]], ...] = (
 DEEP, FIRST = (0, 1, 3, 5, 7), (5,)
 
 
-def scene(place: int) -> Model:
-    text, change = SCENES[place]
+def topology(place: int) -> Model:
+    text, change = TOPOLOGIES[place]
     return apc.set_parameters(compiled(text), change)
 
 
 def answers(place: int) -> str:
-    """Return everything that is told of a scene, every digit of it."""
-    system = scene(place)
-    listed = [repr(apc.analyze(system)), repr(apc.conventions(system))]
+    """Return everything that is told of a topology, every digit of it."""
+    system = topology(place)
+    listed = [repr(apc.analyze(system)), repr(apc.event_order(system))]
     if place in DEEP:
         many = apc.analyze_many(system, {"contact.stiffness": [300.0, 700.0, 1500.0]})
         listed += [repr(many.to_dict()), repr(apc.margins(system)), repr(apc.sensitivities(system))]
@@ -48,16 +48,17 @@ def answers(place: int) -> str:
 
 @pytest.mark.whole
 @pytest.mark.parametrize(
-    "place", [pytest.param(k, marks=[] if k in FIRST else [pytest.mark.whole]) for k in range(len(SCENES))]
+    "place",
+    [pytest.param(k, marks=[] if k in FIRST else [pytest.mark.whole]) for k in range(len(TOPOLOGIES))],
 )
-def test_a_scene_after_others_is_told_as_it_is_alone(place: int) -> None:
+def test_a_topology_after_others_is_told_as_it_is_alone(place: int) -> None:
     """Others are asked for first, in either order, and of other texts of as many states."""
     program = f"from tests.varying.test_nothing_is_kept import answers; print(answers({place}))"
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     ran = subprocess.run(
         [sys.executable, "-c", program], cwd=ROOT, check=True, capture_output=True, text=True, env=environment
     )
-    for others in (range(len(SCENES)), reversed(range(len(SCENES)))):
+    for others in (range(len(TOPOLOGIES)), reversed(range(len(TOPOLOGIES)))):
         for other in others:
-            apc.analyze(scene(other))
+            apc.analyze(topology(other))
         assert answers(place) == ran.stdout.removesuffix("\n")

@@ -10,8 +10,8 @@ import pytest
 import apc
 from apc.analysis.analysis import analyze
 from apc.compiler.compiled import Model
-from apc.frame.names import ParameterRef
-from apc.vary.timing_values import system_with_delay
+from apc.frame.parameter_names import ParameterRef
+from apc.parameter_studies.timing_values import system_with_delay
 from tests.topologies import AVERAGE, compiled
 from tests.varying.closed_forms import built
 
@@ -37,7 +37,7 @@ def pulled(delay_ms: int = 0, clocks: str = "", other: str = "", delay: str = ""
     )
 
 
-def beside(period: str) -> Model:
+def alongside(period: str) -> Model:
     """Return the same beside a second one that stays, and decides nothing."""
     other = "  that: {type: Late, pull: 1 Hz, growth: 0 Hz, clock: other, delay: 0 ms}\n"
     return pulled(0, f", other: {period}", other)
@@ -53,7 +53,7 @@ def test_one_clock_has_the_largest_period_of_the_closed_form(delay_ms: int) -> N
 
 @pytest.mark.parametrize("period", ["1 ms", "3 ms"])
 def test_beside_another_clock_the_error_is_the_gap_between_periods(period: str) -> None:
-    system = beside(period)
+    system = alongside(period)
     found = apc.critical(system, "tick.period")
     (one,) = found.crossings
     assert abs(one.value - 2 / PULL) <= one.error < 1e-3 * one.value and one.kind == "period"
@@ -71,7 +71,7 @@ def test_the_textbook_wall_with_passive_hands_has_its_longest_period() -> None:
 
 
 def test_periods_of_too_long_frames_are_refused_by_name() -> None:
-    system = beside("1 ms")
+    system = alongside("1 ms")
     with pytest.raises(apc.ApcError, match=r"E844 periods of tick\.period from .* make frames of more than"):
         apc.critical(system, "tick.period", lower="2.00011 ms", upper="2.00012 ms")
 
@@ -80,7 +80,7 @@ def test_a_region_over_a_period_is_that_of_the_closed_form() -> None:
     # Stable where pull·T < 2: of pull 50 to 200 Hz and T 5 to 25 ms.
     # ∫ min(2/p, 25 ms) − 5 ms dp = 30·20 ms + ∫_80^200 (2/p − 5 ms) dp.
     truth = 30 * 0.02 + 2 * math.log(200 / 80) - 120 * 0.005
-    for system, most in ((pulled(0), 1e-6), (beside("1 ms"), 0.03)):
+    for system, most in ((pulled(0), 1e-6), (alongside("1 ms"), 0.03)):
         found = apc.region(system, x="tick.period=5 ms:25 ms", y="it.pull=50 Hz:200 Hz")
         assert abs(found.stable_area - truth) <= most * truth
 
@@ -116,11 +116,11 @@ def test_a_simple_ratio_of_two_clocks_is_not_taken_for_all_periods_near_it() -> 
     assert 0.0135 < first.value < 0.0137
     assert "13.5" in str(apc.critical(model, "haptic.period")).splitlines()[0]
     assert all(abs(one.value - 0.014) < 1e-4 for one in others)
-    assert apc.analyze(model, set={"haptic.period": "13.9 ms"}).spectral_radius == pytest.approx(
+    assert apc.analyze(model, params={"haptic.period": "13.9 ms"}).spectral_radius == pytest.approx(
         1.0281386716, abs=1e-9
     )
 
 
 def test_an_upper_end_below_the_first_value_of_a_scan_is_kept() -> None:
     found = apc.critical(pulled(), "tick.period", upper="0.05 ms")
-    assert found.scanned[0] < found.scanned[1] <= 0.05e-3
+    assert found.searched_to[0] < found.searched_to[1] <= 0.05e-3

@@ -16,13 +16,13 @@ import apc
 from apc.__main__ import run
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
-from apc.present.region_picture import stable_outlines
+from apc.output.region_picture import stable_outlines
 from apc.regions.boundary import relative_to
 from apc.regions.curves import between, tangents
 from apc.regions.stable_region import Region
 from tests.paper_limit import limit as limit_of
 from tests.reference import CONTACT_LIMITS
-from tests.topologies import AVERAGE, MESH, ROOT, SCENES, compiled, replaced
+from tests.topologies import AVERAGE, MESH, ROOT, TOPOLOGIES, compiled, replaced
 
 Floats = NDArray[np.float64]
 
@@ -32,14 +32,14 @@ TOLERANCE = 1e-9
 
 
 @cache
-def scene(name: str) -> Model:
-    folders = (SCENES, ROOT / "tests" / "scenes", ROOT / "tests" / "hard")
+def topology(name: str) -> Model:
+    folders = (TOPOLOGIES, ROOT / "tests" / "small_topologies", ROOT / "tests" / "hard")
     return apc.compile(next(path for one in folders if (path := one / f"{name}.yaml").exists()))
 
 
 @cache
 def paper() -> Region:
-    return apc.region(scene("three-users-average"), x=X, y=Y)
+    return apc.region(topology("three-users-average"), x=X, y=Y)
 
 
 def random_points(found: Region, count: int, seed: int = 7) -> list[list[float]]:
@@ -50,7 +50,7 @@ def random_points(found: Region, count: int, seed: int = 7) -> list[list[float]]
 def stable(system: Model, found: Region, x: float, y: float) -> bool | None:
     values = zip((found.x, found.y), (x, y), strict=True)
     settings = {axis.free.label: f"{value!r} {axis.unit}".removesuffix(" 1") for axis, value in values}
-    return apc.analyze(system, set=settings).stable
+    return apc.analyze(system, params=settings).stable
 
 
 def true_error(found: Region, every: int) -> float:
@@ -152,7 +152,7 @@ def test_a_region_made_by_construction_has_its_curves_and_its_area(name: str) ->
 @pytest.mark.whole
 def test_a_boundary_that_rounding_puts_anywhere_is_refused() -> None:
     with pytest.raises(ApcError, match=KEEPS):
-        apc.region(scene("high-rate-ratio"), x=X, y=Y)
+        apc.region(topology("high-rate-ratio"), x=X, y=Y)
 
 
 def test_ends_where_modes_meet_are_the_corner_and_a_cusp_is_followed_to_its_tangent() -> None:
@@ -180,7 +180,7 @@ def test_the_papers_boundary_is_right_to_one_part_in_a_billion() -> None:
 
 
 def test_a_mean_of_three_allows_twice_the_gain_of_their_sum() -> None:
-    other = apc.region(scene("three-users-mesh"), x=X, y="coordination.stiffness=5 N/m:1500 N/m")
+    other = apc.region(topology("three-users-mesh"), x=X, y="coordination.stiffness=5 N/m:1500 N/m")
     assert paper().stable_area / other.stable_area == pytest.approx(2, rel=1e-9)
     for x, y in other.curves[0].points[1:-1:20].tolist():
         assert [paper().contains(x, 2 * y * (1 + side)) for side in (-1e-8, 1e-8)] == [True, False]
@@ -188,12 +188,12 @@ def test_a_mean_of_three_allows_twice_the_gain_of_their_sum() -> None:
 
 def test_the_contact_alone_limits_the_region_where_nothing_coordinates() -> None:
     zeros = ("contact.stiffness=0 N/m:3000 N/m", "coordination.stiffness=0 N/m:3000 N/m")
-    [curve] = apc.region(scene("three-users-average"), x=zeros[0], y=zeros[1]).curves
+    [curve] = apc.region(topology("three-users-average"), x=zeros[0], y=zeros[1]).curves
     assert curve.points[0] == pytest.approx([CONTACT_LIMITS[0][1], 0], abs=1e-3) and curve.points[-1, 0] == 0
 
 
 def test_nearer_to_a_curve_than_its_error_the_eigenvalues_decide_and_outside_nobody() -> None:
-    limit = apc.critical(scene("three-users-average"), "coordination.stiffness").value
+    limit = apc.critical(topology("three-users-average"), "coordination.stiffness").value
     assert limit is not None
     assert [paper().contains(1000.0, limit * (1 + side)) for side in (-1e-11, 1e-11)] == [True, False]
     with pytest.raises(ApcError, match=r"E904 a point wants contact\.stiffness in 10 to 3000 N/m"):
@@ -206,7 +206,7 @@ def test_with_damping_and_no_delay_the_mean_allows_1_51_to_1_76_times_as_much(st
     given |= dict.fromkeys(("contact.delay", "coordination.delay", "lan.delay"), "0 ms")
     given |= {"contact.stiffness": f"{stiffness} N/m"}
     mean, total = (
-        apc.critical(scene(f"three-users-{name}"), "coordination.stiffness", set=given).value
+        apc.critical(topology(f"three-users-{name}"), "coordination.stiffness", params=given).value
         for name in ("average", "mesh")
     )
     assert mean is not None and total is not None and 1.51 < mean / total < 1.76
@@ -214,7 +214,7 @@ def test_with_damping_and_no_delay_the_mean_allows_1_51_to_1_76_times_as_much(st
 
 # ---- any plane ----
 
-APART = ("contact.half_width=25 mm:35 mm", "contact.stiffness=100 N/m:5000 N/m")
+SEPARATE = ("contact.half_width=25 mm:35 mm", "contact.stiffness=100 N/m:5000 N/m")
 BOTH = ("contact.stiffness=100 N/m:5000 N/m", "coordination.stiffness=100 N/m:5000 N/m")
 DELAYED = ("contact.delay=0.5 ms:1.5 ms", "contact.stiffness=500 N/m:3000 N/m")
 FURTHER = ("contact.delay=0 ms:3 ms", "contact.stiffness=10 N/m:4000 N/m")
@@ -246,7 +246,7 @@ PLANES = {
     # One motion of all and one of some have the same eigenvalue.
     "a shared eigenvalue": ("experiment-average", *BOTH, {"contact.half_width": "40 mm"}),
     # A device begins 30 mm from the middle of the cube, and holds nothing of one that is narrower.
-    "begins apart or touching": ("experiment-average", *APART, {}),
+    "begins apart or touching": ("experiment-average", *SEPARATE, {}),
     "looks at each sender": ("three-users-scheduled", "contact.stiffness=10 N/m:4000 N/m", Y, {}),
 }
 
@@ -254,7 +254,7 @@ PLANES = {
 @cache
 def plane(name: str) -> tuple[Model, Region]:
     text, x, y, settings = PLANES[name]
-    system = apc.set_parameters(compiled(text) if "\n" in text else scene(text), settings)
+    system = apc.set_parameters(compiled(text) if "\n" in text else topology(text), settings)
     return system, apc.region(system, x=x, y=y)
 
 
@@ -287,7 +287,7 @@ def test_what_is_inside_is_what_an_analysis_calls_stable_and_curves_are_as_near_
 
 
 @pytest.mark.whole
-def test_where_a_scene_begins_apart_a_straight_line_parts_the_motions() -> None:
+def test_where_a_topology_begins_apart_a_straight_line_parts_the_motions() -> None:
     _, found = plane("begins apart or touching")
     assert "holds near its start values only" in str(found)
     straight = [curve for curve in found.curves if not curve.smooth]
@@ -299,7 +299,7 @@ def test_where_a_scene_begins_apart_a_straight_line_parts_the_motions() -> None:
 
 
 def limit(settings: Mapping[str, str], name: str) -> float:
-    found = apc.critical(scene("three-users-average"), name, set=settings).value
+    found = apc.critical(topology("three-users-average"), name, params=settings).value
     assert found is not None
     return found
 
@@ -317,7 +317,7 @@ def test_the_curves_of_a_computational_delay_meet_its_critical_values() -> None:
 
 def test_over_a_link_the_boundary_is_a_staircase_at_the_critical_values() -> None:
     coordination = "coordination.stiffness=500 N/m:2000 N/m"
-    found = apc.region(scene("three-users-average"), x="lan.delay=2 ms:5 ms", y=coordination)
+    found = apc.region(topology("three-users-average"), x="lan.delay=2 ms:5 ms", y=coordination)
     [curve] = found.curves
     assert not curve.smooth and curve.error <= 1e-12 and curve.mode == "difference"
     # A packet that arrives between two ticks is heard at the second.
@@ -331,28 +331,32 @@ def test_over_a_link_the_boundary_is_a_staircase_at_the_critical_values() -> Non
 @pytest.mark.whole
 def test_a_staircase_that_another_mode_takes_over_is_a_curve_a_mode() -> None:
     tall = "coordination.stiffness=500 N/m:3000 N/m"
-    found = apc.region(scene("three-users-average"), x="lan.delay=0 ms:40 ms", y=tall)
+    found = apc.region(topology("three-users-average"), x="lan.delay=0 ms:40 ms", y=tall)
     assert {curve.mode for curve in found.curves} == {"difference", "common"}
 
 
 @pytest.mark.whole
 def test_over_two_times_the_boundary_is_known_to_a_cell() -> None:
     found = apc.region(
-        scene("three-users-average"),
+        topology("three-users-average"),
         x="contact.delay=0.5 ms:3 ms",
         y="coordination.delay=0 ms:2 ms",
-        set={"coordination.stiffness": "900 N/m"},
+        params={"coordination.stiffness": "900 N/m"},
     )
     assert found.stepped and found.curves and found.curves[0].mode == "difference"
     assert "right to a cell only" in str(found) and max(map(len, str(found).splitlines())) <= 80
 
 
 def test_a_region_over_counts_has_steps_at_each_counts_critical_value() -> None:
-    mesh = scene("three-users-mesh")
+    mesh = topology("three-users-mesh")
     found = apc.region(mesh, x="user.count=2:6", y="coordination.stiffness=10 N/m:3000 N/m")
     for count in range(2, 7):
         crossings = apc.critical(
-            mesh, "coordination.stiffness", set={"user.count": str(count)}, lower="10 N/m", upper="3000 N/m"
+            mesh,
+            "coordination.stiffness",
+            params={"user.count": str(count)},
+            lower="10 N/m",
+            upper="3000 N/m",
         ).crossings
         assert crossings
         for one in crossings:
@@ -404,7 +408,7 @@ KEEPS = "E905 in part of the rectangle some motion neither grows nor dies out"
             AVERAGE.partition("studies:")[0],
             None,
             None,
-            "E901 the scene has no studies: region:, so that --x must",
+            "E901 the topology has no studies: region:, so that --x must",
         ),
     ],
 )
@@ -428,7 +432,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def said(folder: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+def printed(folder: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
     """Return what runs `apc region` and returns what it prints."""
 
     def region(*words: str) -> str:
@@ -438,15 +442,15 @@ def said(folder: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]
     return region
 
 
-def test_text_fits_a_terminal_and_json_is_the_contract(said: Callable[..., str]) -> None:
-    text = said("--x", X, "--y", Y)
+def test_text_fits_a_terminal_and_json_is_the_contract(printed: Callable[..., str]) -> None:
+    text = printed("--x", X, "--y", Y)
     assert text.startswith("three-users-average: the stable region has a boundary in one piece\n")
     assert "difference  10.83 to 26.12" in text and max(map(len, text.splitlines())) <= 80
     for span, words in (("10 N/m:50", "stable in the whole"), ("4000 N/m:5000", "stable nowhere inside the")):
         axes = [one.replace("10 N/m:3000", span) for one in (X, Y)]
-        assert f"{words} rectangle" in said("--x", axes[0], "--y", axes[1])
-    document = json.loads(said("--json"))
-    # The axes of the scene's own studies.
+        assert f"{words} rectangle" in printed("--x", axes[0], "--y", axes[1])
+    document = json.loads(printed("--json"))
+    # The axes of the topology's own studies.
     assert document["x"] == {"parameter": "contact.stiffness", "unit": "N/m", "range": [0.0, 5000.0]}
     assert document["y"]["range"] == [0.0, 1500.0] and document["stable_area"] > 0
     [curve] = document["boundary"]
@@ -455,22 +459,22 @@ def test_text_fits_a_terminal_and_json_is_the_contract(said: Callable[..., str])
 
 
 @pytest.mark.whole
-def test_several_scenes_and_settings_are_panels(said: Callable[..., str]) -> None:
+def test_several_topologies_and_settings_are_panels(printed: Callable[..., str]) -> None:
     words = ("--x", X, "--y", Y, "--compare", "others/mesh.yaml")
-    document = json.loads(said(*words, "--vary", "lan.delay=0,8 ms", "--json"))
+    document = json.loads(printed(*words, "--vary", "lan.delay=0,8 ms", "--json"))
     assert [panel["panel"] for panel in document["panels"]] == ["lan.delay=0 ms", "lan.delay=8 ms"]
     areas = [[one["stable_area"] for one in panel["regions"]] for panel in document["panels"]]
     assert areas[1][0] == pytest.approx(paper().stable_area, rel=1e-9) and areas[1][0] > areas[1][1]
     # At equal effective gain the mean and the sum are one curve.
-    text = said(*words, "--normalize")
-    document = json.loads(said(*words, "--normalize", "--json"))
+    text = printed(*words, "--normalize")
+    document = json.loads(printed(*words, "--normalize", "--json"))
     mean, total = (one["stable_area"] for one in document["panels"][0]["regions"])
     assert 2 * total == pytest.approx(mean, rel=1e-9) and "y counts 2 times" in text
 
 
-def test_an_overlay_is_told_with_its_source_and_is_its_formula(said: Callable[..., str]) -> None:
+def test_an_overlay_is_told_with_its_source_and_is_its_formula(printed: Callable[..., str]) -> None:
     laid = "colgate:K=contact.stiffness,B=contact.damping,b=device.damping,T=haptic.period"
-    text = said("--x", X, "--y", "device.damping=0.1 N*s/m:5 N*s/m", "--overlay", laid, "--json")
+    text = printed("--x", X, "--y", "device.damping=0.1 N*s/m:5 N*s/m", "--overlay", laid, "--json")
     [line] = json.loads(text)["panels"][0]["overlays"]
     assert "Colgate" in line["label"]
     points = np.array(line["points"])  # b > K T/2 + |B|
@@ -479,9 +483,9 @@ def test_an_overlay_is_told_with_its_source_and_is_its_formula(said: Callable[..
 
 @pytest.mark.whole
 def test_tables_and_pictures_are_written_by_their_suffix_and_the_same_each_time(
-    said: Callable[..., str],
+    printed: Callable[..., str],
 ) -> None:
-    said("--x", X, "--y", Y, "--out", "region.csv")
+    printed("--x", X, "--y", Y, "--out", "region.csv")
     with Path("region.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     [curve] = paper().curves
@@ -494,7 +498,7 @@ def test_tables_and_pictures_are_written_by_their_suffix_and_the_same_each_time(
     pytest.importorskip("matplotlib")
     heads = {"a.svg": b"<?xml", "b.svg": b"<?xml"}
     for name, head in heads.items():
-        said("--x", X, "--y", Y, "--compare", "others/mesh.yaml", "--out", name)
+        printed("--x", X, "--y", Y, "--compare", "others/mesh.yaml", "--out", name)
         assert head in Path(name).read_bytes()[:200]
     assert Path("a.svg").read_bytes() == Path("b.svg").read_bytes()
 
@@ -530,7 +534,7 @@ def test_what_can_not_be_is_one_message_and_exit_code_1(
 
 @pytest.mark.parametrize("name", ["island", "hole"])
 def test_the_drawn_outlines_enclose_the_stable_area(name: str) -> None:
-    found = apc.region(scene(name), x="u=0 N/m:1000 N/m", y="v=0 N/m:1000 N/m")
+    found = apc.region(topology(name), x="u=0 N/m:1000 N/m", y="v=0 N/m:1000 N/m")
     area = 0.0
     for outline in stable_outlines(found):
         x, y = np.concatenate([outline, outline[:1]]).T

@@ -9,11 +9,11 @@ import pytest
 
 import apc
 from apc.compiler.compiled import Model
-from apc.vary.sensitivity import Sensitivities
+from apc.parameter_studies.sensitivity import Sensitivities
 from tests.bench.sensitivity_truth import check_sensitivities, run
-from tests.topologies import AVERAGE, MESH, SCENES, compiled, library, replaced
+from tests.topologies import AVERAGE, MESH, TOPOLOGIES, compiled, library, replaced
 
-NAMES = sorted(path.stem for path in SCENES.glob("*.yaml") if path.stem != "template")
+NAMES = sorted(path.stem for path in TOPOLOGIES.glob("*.yaml") if path.stem != "template")
 GRAPH = ("delay: 8 ms}", "delay: 8 ms, graph: {edges: [[1, 2, 0.3], [1, 3, 0.3], [2, 3, 0.5]]}}")
 OWN = ("link: lan}", "link: lan, delays: own}")
 GROUPS = replaced(
@@ -40,7 +40,7 @@ SETTLING = [
     ("0.0012563506546329", "0.0011384141", "0.01866965", "0.0101767", "0", "11.29332081"),
 ]
 
-SCENE = {
+TOPOLOGY = {
     "average": AVERAGE,
     "mesh": MESH,
     "a damped contact": replaced(AVERAGE, ("contact:      {", "contact:      {damping: 1 N*s/m, ")),
@@ -63,15 +63,15 @@ def rates(found: Sensitivities) -> dict[str, float | None]:
 
 
 @pytest.mark.few(5)
-@pytest.mark.parametrize("name", SCENE)
-def test_every_derivative_is_that_of_the_scene_in_320_bits(name: str) -> None:
-    found = apc.sensitivities(compiled(SCENE[name]))
+@pytest.mark.parametrize("name", TOPOLOGY)
+def test_every_derivative_is_that_of_the_topology_in_320_bits(name: str) -> None:
+    found = apc.sensitivities(compiled(TOPOLOGY[name]))
     assert found.rows or found.note
-    assert check_sensitivities(compiled(SCENE[name]), found) == ""
+    assert check_sensitivities(compiled(TOPOLOGY[name]), found) == ""
 
 
 @pytest.mark.parametrize("seed", [3, pytest.param(5, marks=pytest.mark.whole)])
-def test_every_derivative_and_frequency_of_random_scenes_is_right(seed: int) -> None:
+def test_every_derivative_and_frequency_of_random_topologies_is_right(seed: int) -> None:
     assert run(3, seed=seed) == []
 
 
@@ -93,16 +93,16 @@ def changed(system: Model, every: int) -> str:
             continue
         unit = "" if rows[0].unit == "1" else f" {rows[0].unit}"
         low, high = (
-            apc.analyze(system, set={name: f"{rows[0].value * (1 + side)!r}{unit}"}).spectral_radius
+            apc.analyze(system, params={name: f"{rows[0].value * (1 + side)!r}{unit}"}).spectral_radius
             for side in (-1e-3, 1e-3)
         )
-        up, down, said = (high - radius) / 1e-3, (radius - low) / 1e-3, [row.relative for row in rows]
+        up, down, printed = (high - radius) / 1e-3, (radius - low) / 1e-3, [row.relative for row in rows]
         # The largest of those that share the radius decides on either side.
-        off = abs((up + down) / 2 - said[0])
+        off = abs((up + down) / 2 - printed[0])
         if len(found.active) > 1:
-            off = max(abs(up - max(said)), abs(down - min(said)))
-        if not off <= 2e-3 * max(map(abs, said)) + 2e-6 + abs(up - down):
-            return f"{name}: {said}, but {down} and {up}"
+            off = max(abs(up - max(printed)), abs(down - min(printed)))
+        if not off <= 2e-3 * max(map(abs, printed)) + 2e-6 + abs(up - down):
+            return f"{name}: {printed}, but {down} and {up}"
     return ""
 
 
@@ -110,7 +110,7 @@ def changed(system: Model, every: int) -> str:
 @pytest.mark.parametrize("every", [3, 1])
 @pytest.mark.parametrize("name", NAMES)
 def test_a_row_says_what_setting_its_name_does(name: str, every: int) -> None:
-    assert changed(apc.compile(SCENES / f"{name}.yaml"), every) == ""
+    assert changed(apc.compile(TOPOLOGIES / f"{name}.yaml"), every) == ""
 
 
 def test_where_the_radius_is_large_it_is_differentiated_all_the_same() -> None:
@@ -120,7 +120,7 @@ def test_where_the_radius_is_large_it_is_differentiated_all_the_same() -> None:
 
 
 @pytest.mark.whole
-def test_a_scene_linearized_within_its_limits_is_the_linear_one() -> None:
+def test_a_topology_linearized_within_its_limits_is_the_linear_one() -> None:
     """Inside of its limits a saturated mesh is a mesh."""
     text = replaced(GROUPS, ("AveragePosition", "FullMesh"))
     bent = replaced(text, ("FullMesh,", "SaturatedMesh, limit: 2 N,"))
@@ -135,7 +135,7 @@ def test_equal_groups_have_an_active_set_and_no_single_gradient() -> None:
     assert len(found.active) == 2 and "share the radius" in found.note
     told = sorted(row.derivative for row in found.rows if row.parameter == "one.contact.stiffness")
     low, here, high = (
-        apc.analyze(compiled(EQUAL), set={"one.contact.stiffness": f"{1000 + side} N/m"}).spectral_radius
+        apc.analyze(compiled(EQUAL), params={"one.contact.stiffness": f"{1000 + side} N/m"}).spectral_radius
         for side in (-1e-3, 0, 1e-3)
     )
     assert [(here - low) / 1e-3, (high - here) / 1e-3] == pytest.approx(told, rel=1e-4, abs=1e-9)
@@ -143,7 +143,7 @@ def test_equal_groups_have_an_active_set_and_no_single_gradient() -> None:
 
 def test_a_damping_of_nothing_has_the_derivative_of_what_it_adds_up_with() -> None:
     """A finger's tip and the device it holds move as one: their dampings act as their sum, at 0 too."""
-    found = {row.parameter: row for row in apc.sensitivities(apc.compile(SCENES / "finger.yaml")).rows}
+    found = {row.parameter: row for row in apc.sensitivities(apc.compile(TOPOLOGIES / "finger.yaml")).rows}
     nothing, whole = found["finger.tip.damping"], found["device.damping"]
     assert nothing.value == 0 and nothing.derivative == pytest.approx(whole.derivative, rel=1e-7)
 
@@ -176,7 +176,7 @@ def test_what_would_move_a_motion_left_out_is_named_and_not_differentiated(tmp_p
     """An integrator nobody reads stands still where its leak is 1, and nowhere else."""
     part = """\
 component: Integrator
-about: Adds up where it is.
+description: Adds up where it is.
 connectors: {a: Flange}
 parameters: {kp: {unit: N/m}, ki: {unit: N/m}, leak: {unit: 1}, clock: clock}
 variables: {s: {unit: m, start: 0 m}, f: {unit: N}}
@@ -201,9 +201,9 @@ couplers:
     assert check_sensitivities(system, found) == ""
     analysis = apc.analyze(system)
     assert (analysis.verdict, analysis.rigid_modes, analysis.translations) == ("stable", 1, 0)
-    assert analysis.unfelt == ("p.s",) and "Nothing ties" not in str(analysis)
+    assert analysis.unobservable == ("p.s",) and "Nothing ties" not in str(analysis)
     # Without the spring the device translates, and the integrator adds up where to: no drift.
-    loose = apc.analyze(system, set={"p.kp": "0 N/m"})
+    loose = apc.analyze(system, params={"p.kp": "0 N/m"})
     assert (loose.verdict, loose.stable, loose.translations) == ("stable up to a common translation", True, 1)
-    felt = apc.analyze(system, set={"p.ki": "1 N/m"})
-    assert (felt.rigid_modes, felt.unfelt) == (0, ())
+    used = apc.analyze(system, params={"p.ki": "1 N/m"})
+    assert (used.rigid_modes, used.unobservable) == (0, ())

@@ -22,13 +22,13 @@ import pytest
 
 import apc
 from apc.__main__ import run
-from apc.compiler import seal
+from apc.compiler import signing
 from apc.sweeps.resumable_sweep import Sweep, sweep
 from tests.sweeping import CHEAP, alive, children, parts, start, start_waiting, wait_for_parts
-from tests.topologies import AVERAGE, ONE_MASS, SCENES, compiled, told
+from tests.topologies import AVERAGE, ONE_MASS, TOPOLOGIES, compiled, told
 
 WALL = compiled(CHEAP)
-MODEL = compiled(ONE_MASS)  # the cheapest of scenes, for what is about files and processes
+MODEL = compiled(ONE_MASS)  # the cheapest of topologies, for what is about files and processes
 OVER = {"device.mass": "1 kg:2 kg:26", "device.damping": "1,2,3,4,5 N*s/m"}
 WORDS = [word for name, values in OVER.items() for word in ("--over", f"{name}={values}")]
 
@@ -70,7 +70,7 @@ def test_every_row_is_the_analysis_of_its_point() -> None:
     points = [(500, 0), (500, 8), (4000, 0), (4000, 8)]  # the last axis turns fastest
     for place, (stiffness, delay) in enumerate(points):
         settings = {"contact.stiffness": f"{stiffness} N/m", "lan.delay": f"{delay} ms"}
-        expected = apc.analyze(compiled(AVERAGE), set=settings)
+        expected = apc.analyze(compiled(AVERAGE), params=settings)
         row = [column[place] for column in found.columns]
         assert row[:2] == [stiffness, delay / 1000]
         verdict, radius, error, rigid, frequency, damping, message = row[2:]
@@ -84,7 +84,7 @@ def test_every_row_is_the_analysis_of_its_point() -> None:
 
 def test_a_walls_verdict_turns_at_its_known_limit_and_searches_and_mean_squares_are_swept() -> None:
     # m = 0.1 kg, b = 5 N·s/m, T = 1 ms: 3378.939 N/m at a delay of 1 ms, to the digits printed.
-    found = apc.sweep(WALL, {"it.stiffness": "3378.9,3378.98 N/m"}, jobs=1, set={"it.delay": "1 ms"})
+    found = apc.sweep(WALL, {"it.stiffness": "3378.9,3378.98 N/m"}, jobs=1, params={"it.delay": "1 ms"})
     assert list(found.column("verdict")) == ["stable", "unstable"]
     found = apc.sweep(WALL, {"it.delay": "0,1 ms"}, of="critical:it.stiffness", jobs=1)
     assert found.headings[1:] == ("verdict", "value [N/m]", "error [N/m]", "crossings", "proof", "message")
@@ -92,10 +92,10 @@ def test_a_walls_verdict_turns_at_its_known_limit_and_searches_and_mean_squares_
     assert values[1] == pytest.approx(3378.939, abs=5e-4) and values[0] > values[1]
     assert found.column("error [N/m]")[1] < 1e-6
     assert list(found.column("verdict")) == ["stable below the value"] * 2
-    model = apc.compile(SCENES / "lossy-average.yaml")
+    model = apc.compile(TOPOLOGIES / "lossy-average.yaml")
     [error] = apc.sweep(model, {"lan.loss": "20 %"}, jobs=1).column("mean_square_radius_error")
-    judged = apc.judge_network(model, set={"lan.loss": "20 %"})
-    assert judged is not None and error == judged.error < 1e-6
+    decided = apc.mean_square_stability(model, params={"lan.loss": "20 %"})
+    assert decided is not None and error == decided.error < 1e-6
 
 
 @pytest.mark.whole
@@ -271,8 +271,8 @@ def test_a_part_that_is_not_as_it_was_written_is_computed_again(
     (tmp_path / "own").write_text("mine", encoding="utf-8")
     DAMAGES[damage](last)
     found = small(out=target, jobs=1)
-    again = "part 1 was damaged, or written by somebody else, and is computed again"
-    assert found.notes == (again, "64 points were there already")
+    repeated = "part 1 was damaged, or written by somebody else, and is computed again"
+    assert found.notes == (repeated, "64 points were there already")
     assert target.read_bytes() == whole and not last.parent.exists()
     assert (tmp_path / "own").read_text(encoding="utf-8") == "mine"
 
@@ -283,7 +283,7 @@ def test_what_another_user_computed_is_computed_again(
 ) -> None:
     target = tmp_path / "r.csv"
     with monkeypatch.context() as theirs:
-        theirs.setattr(seal, "_folder", lambda: tmp_path / "theirs")
+        theirs.setattr(signing, "_folder", lambda: tmp_path / "theirs")
         assert len(interrupted(target, 130)) == 3
     found = small(out=target, jobs=1)
     assert not any("already" in note for note in found.notes) and target.read_bytes() == whole
@@ -294,7 +294,7 @@ def test_without_a_place_for_a_secret_a_process_takes_up_what_it_wrote_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").touch()
-    monkeypatch.setattr(seal, "_folder", lambda: tmp_path / "file" / "cache")
+    monkeypatch.setattr(signing, "_folder", lambda: tmp_path / "file" / "cache")
     interrupted(tmp_path / "r.csv")
     assert small(out=tmp_path / "r.csv", jobs=1).notes == ("128 points were there already",)
 
@@ -302,23 +302,23 @@ def test_without_a_place_for_a_secret_a_process_takes_up_what_it_wrote_itself(
 @pytest.mark.whole
 def test_sweeps_of_one_target_and_what_others_put_beside_leave_each_other_alone(tmp_path: Path) -> None:
     target = tmp_path / "r.csv"
-    kept = interrupted(target)
-    notes = [kept[0].parent / name for name in ("notes.txt", ".hidden", "part-x", "manifest.json")]
+    stored = interrupted(target)
+    notes = [stored[0].parent / name for name in ("notes.txt", ".hidden", "part-x", "manifest.json")]
     for path in notes:
         path.write_text("mine", encoding="utf-8")
     other = sweep(MODEL, {"device.mass": "1 kg:2 kg:20"}, out=target, jobs=1)
     assert not other.notes and other.points == 20
-    assert set(kept) < set(kept[0].parent.iterdir())
+    assert set(stored) < set(stored[0].parent.iterdir())
     assert small(out=target, jobs=1).notes == ("128 points were there already",)
-    assert sorted(kept[0].parent.iterdir()) == sorted(notes)
+    assert sorted(stored[0].parent.iterdir()) == sorted(notes)
     assert {path.read_text() for path in notes} == {"mine"}
 
 
-@pytest.mark.parametrize("kind", ["file", "link"])
-def test_what_is_no_folder_in_its_place_is_refused_and_stays(tmp_path: Path, kind: str) -> None:
+@pytest.mark.parametrize("peer_type", ["file", "link"])
+def test_what_is_no_folder_in_its_place_is_refused_and_stays(tmp_path: Path, peer_type: str) -> None:
     folder = tmp_path / "w.csv.parts"
     (tmp_path / "other").mkdir()
-    folder.write_text("thesis", encoding="utf-8") if kind == "file" else folder.symlink_to("other")
+    folder.write_text("thesis", encoding="utf-8") if peer_type == "file" else folder.symlink_to("other")
     (message,) = told(lambda: small(out=tmp_path / "w.csv", jobs=1))
     assert message.startswith(f"{folder}: E885 is there and is no folder")
     assert list((tmp_path / "other").iterdir()) == []
@@ -419,11 +419,11 @@ def test_a_terminal_sees_progress_and_a_file_does_not(
     command = [sys.executable, "-m", "apc", "sweep", "mass.apc", *WORDS, "--out", "r.csv", "--jobs", "1"]
     with subprocess.Popen(command, cwd=folder, stderr=slave, stdout=subprocess.PIPE, text=True):
         os.close(slave)
-        seen = b""
+        observed = b""
         while chunk := _read(master):
-            seen += chunk
+            observed += chunk
     os.close(master)
-    assert b"130 of 130 points" in seen
+    assert b"130 of 130 points" in observed
     monkeypatch.chdir(folder)
     capsys.readouterr()
     assert run(["sweep", "mass.apc", *WORDS, "--out", "s.csv", "--jobs", "1", "--json"]) == 0

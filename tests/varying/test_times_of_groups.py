@@ -57,14 +57,14 @@ def written(text: str, delay: str) -> str:
 @pytest.mark.parametrize("delay", ["0 ms", "1.5 ms", "20 ms"])
 def test_set_without_a_group_is_one_value_for_all_groups(text: str, delay: str) -> None:
     there = apc.analyze(compiled(written(text, delay)))
-    here = apc.analyze(compiled(text), set={NAME: delay})
+    here = apc.analyze(compiled(text), params={NAME: delay})
     assert here.spectral_radius == pytest.approx(there.spectral_radius, rel=1e-12)
     assert here.verdict == there.verdict
 
 
 def test_analyze_and_critical_have_the_values_of_a_simulation_of_their_own() -> None:
     system = compiled(TWO)
-    assert apc.analyze(system, set={NAME: "20 ms"}).spectral_radius == pytest.approx(RADIUS, rel=1e-12)
+    assert apc.analyze(system, params={NAME: "20 ms"}).spectral_radius == pytest.approx(RADIUS, rel=1e-12)
     assert apc.critical(system, NAME).value == pytest.approx(LIMIT, rel=1e-6)
     assert apc.critical(compiled(EVERY), NAME).value == pytest.approx(LIMIT, rel=1e-6)
 
@@ -75,7 +75,7 @@ def test_a_group_that_is_set_too_has_its_own_value_in_any_order() -> None:
     text = replaced(TWO, ("delay: 0 ms", "delay: 20 ms"), ("delay: 1 ms", "delay: 3 ms"))
     truth = apc.analyze(compiled(text)).spectral_radius
     for some in itertools.permutations(pairs):
-        assert apc.analyze(system, set=dict(some)).spectral_radius == pytest.approx(truth, rel=1e-12)
+        assert apc.analyze(system, params=dict(some)).spectral_radius == pytest.approx(truth, rel=1e-12)
 
 
 def test_the_commands_that_set_vary_or_play_a_delay_agree(
@@ -93,7 +93,7 @@ def test_the_commands_that_set_vary_or_play_a_delay_agree(
     assert run(["sweep", "t.yaml", "--over", f"{NAME}=20 ms:25 ms:2", "--out", "s.csv"]) == 0
     assert float(Path("s.csv").read_text().splitlines()[1].split(",")[2]) == pytest.approx(RADIUS, rel=1e-12)
     for file, setting in (("t.yaml", ["--set", f"{NAME}=20 ms"]), ("both.yaml", [])):
-        words = [file, *setting, "--strike", "a", "--duration", "0.2 s", "--out", f"{file}.csv"]
+        words = [file, *setting, "--impulse", "a", "--duration", "0.2 s", "--out", f"{file}.csv"]
         assert run(["simulate", *words]) == 0
     here, there = (np.loadtxt(f"{name}.csv", delimiter=",", skiprows=1) for name in ("t.yaml", "both.yaml"))
     np.testing.assert_allclose(here, there, rtol=1e-9, atol=1e-12)
@@ -130,13 +130,15 @@ def test_the_delay_of_a_pair_is_a_number_of_its_own_in_every_command(tmp_path: P
     system = compiled(text)
     there = compiled(replaced(text, ("delay: 2 ms, delays", "delay: 8 ms, delays")))
     truth = apc.analyze(there).spectral_radius
-    assert apc.analyze(system, set={"lan.delay": "8 ms"}).spectral_radius == pytest.approx(truth, rel=1e-12)
+    assert apc.analyze(system, params={"lan.delay": "8 ms"}).spectral_radius == pytest.approx(
+        truth, rel=1e-12
+    )
     for name, value in (("lan.delay", "8 ms"), ("lan.delays.a.b", "4 ms")):
         path = tmp_path / f"{name}.csv"
         apc.sweep(there, {name: [value, "40 ms"]}, out=path)
         radius = float(path.read_text().splitlines()[1].split(",")[2])
         assert radius == pytest.approx(truth, rel=1e-12), name
-    assert apc.critical(system, "lan.delays.a.b", set={"lan.delay": "8 ms"}).value == pytest.approx(
+    assert apc.critical(system, "lan.delays.a.b", params={"lan.delay": "8 ms"}).value == pytest.approx(
         apc.critical(there, "lan.delays.a.b").value, rel=1e-9
     )
 
@@ -156,7 +158,9 @@ def test_a_group_without_a_delay_of_its_own_is_refused_with_the_setting_to_write
     assert hint in " ".join(capsys.readouterr().err.split())
     pasted = compiled(replaced(TWO, ("a: {count: 1}", hint[1:-1])))
     truth = apc.analyze(compiled(replaced(TWO, ("delay: 0 ms", "delay: 20 ms")))).spectral_radius
-    assert apc.analyze(pasted, set={f"a.{NAME}": "20 ms"}).spectral_radius == pytest.approx(truth, rel=1e-12)
+    assert apc.analyze(pasted, params={f"a.{NAME}": "20 ms"}).spectral_radius == pytest.approx(
+        truth, rel=1e-12
+    )
 
 
 def test_a_clock_and_a_link_keep_their_own_names_and_the_answer_names_what_they_do_not_reach(
@@ -172,5 +176,5 @@ def test_a_clock_and_a_link_keep_their_own_names_and_the_answer_names_what_they_
     there = replaced(
         text, ("haptic: 1 ms", "haptic: 0.5 ms"), ("{clock: network, delay: 2", "{clock: network, delay: 8")
     )
-    here = apc.analyze(compiled(text), set={"haptic.period": "0.5 ms", "lan.delay": "8 ms"})
+    here = apc.analyze(compiled(text), params={"haptic.period": "0.5 ms", "lan.delay": "8 ms"})
     assert here.spectral_radius == pytest.approx(apc.analyze(compiled(there)).spectral_radius, rel=1e-12)

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 import apc
-from apc.frame.names import ParameterRef
-from apc.moments.changing_delay import loop_gain
-from apc.present.tuning_output import panels_of
-from apc.tuning.demands import read_against, read_demands
-from apc.tuning.front import front
+from apc.frame.parameter_names import ParameterRef
+from apc.mean_square.time_varying_delay import loop_gain
+from apc.output.tuning_output import panels_of
+from apc.tuning.pareto_front import pareto_front
+from apc.tuning.specification import read_tradeoff, read_tuning_spec
 from tests.commands import Cli, write
-from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced, told, wall
+from tests.topologies import AVERAGE, MESH, TOPOLOGIES, compiled, replaced, told, wall
 from tests.varying.test_boxes import with_delays
 
 K, B, CONTACT, MASS = "coordination.stiffness", "coordination.damping", "contact.stiffness", "device.mass"
@@ -36,14 +36,14 @@ def test_one_gain_is_the_critical_value_and_two_the_peak_of_the_region(
     model = apc.set_parameters(compiled(text), values)
     one, two = (apc.tune(model, free, maximize=K) for free in (RANGE, RANGE | {CONTACT: (10.0, 5000.0)}))
     critical = apc.critical(model, K).value
-    assert critical is not None and abs(one.best - critical) <= one.error + 1e-10 * critical
-    assert one.proved and two.proved and 0 <= one.best - one.value <= 1e-3 * one.best
-    # A part in a million higher the scene is stable at no stiffness of the contact, as much lower at some.
+    assert critical is not None and abs(one.optimum - critical) <= one.error + 1e-10 * critical
+    assert one.proved and two.proved and 0 <= one.optimum - one.value <= 1e-3 * one.optimum
+    # A part in a million higher the topology is stable at no stiffness of the contact, as much lower at some.
     apart = np.geomspace(1e-9, 1.0, 400)
-    beside = two.gains[1].best * (1 + np.concatenate([-apart, [0.0], apart]))
-    contact = np.concatenate([np.clip(beside, 10.0, 5000.0), np.linspace(10.0, 5000.0, 2000)])
+    alongside = two.gains[1].optimum * (1 + np.concatenate([-apart, [0.0], apart]))
+    contact = np.concatenate([np.clip(alongside, 10.0, 5000.0), np.linspace(10.0, 5000.0, 2000)])
     for share in (-1e-6, 1e-6):
-        found = apc.analyze_many(model, {CONTACT: contact}, set={K: two.best * (1 + share)})
+        found = apc.analyze_many(model, {CONTACT: contact}, params={K: two.optimum * (1 + share)})
         assert (found.stable == True).any() == (share < 0)  # noqa: E712 -- None where it is left open
 
 
@@ -55,25 +55,25 @@ def test_gains_bear_all_that_they_have_to_and_none_on_a_grid_bear_it_better() ->
     typed = {one.parameter: float(one.value) for one in found.gains}
     stiffness, damping = np.meshgrid(np.arange(1.01, 2.0, 0.1) * found.value, np.linspace(0, 50, 51))
     bears = np.ones(stiffness.shape, dtype=bool)
-    assert found.proved and len(found.proofs) == 5 and found.bounded
+    assert found.proved and len(found.proofs) == 5 and found.bound_cells
     for peers, mass in itertools.product(range(2, 7), (0.08, 0.09, 0.12)):
         at = {"user.count": peers, MASS: mass}
-        bears &= apc.analyze_many(model, {K: stiffness, B: damping}, set=at).stable.astype(bool)
-        assert apc.analyze(model, set=at | typed).stable
+        bears &= apc.analyze_many(model, {K: stiffness, B: damping}, params=at).stable.astype(bool)
+        assert apc.analyze(model, params=at | typed).stable
     assert not bears.any()
-    for one in found.binding:
+    for one in found.active:
         where = {label: value for label, value, _ in one.where}
-        best = {gain.parameter: gain.best for gain in found.gains}
+        best = {gain.parameter: gain.optimum for gain in found.gains}
         assert where[MASS] in (0.08, 0.12)
-        assert apc.analyze(model, set=where | best).spectral_radius == pytest.approx(1, abs=1e-9)
+        assert apc.analyze(model, params=where | best).spectral_radius == pytest.approx(1, abs=1e-9)
 
 
 def test_what_binds_may_lie_inside_a_range() -> None:
     model, over = compiled(AVERAGE), {"user.count": "2:5", MASS: "±20%"}
     found = apc.tune(model, {K: (10.0, 5000.0), B: (0.0, 50.0)}, maximize=K, over=over)
-    best = {gain.parameter: gain.best for gain in found.gains}
+    best = {gain.parameter: gain.optimum for gain in found.gains}
     masses = {MASS: np.linspace(0.08, 0.12, 81)}
-    radii = apc.analyze_many(model, masses, set=best | {"user.count": 2}).spectral_radius
+    radii = apc.analyze_many(model, masses, params=best | {"user.count": 2}).spectral_radius
     assert 0 < int(np.argmax(radii)) < 80
     assert radii.max() == pytest.approx(1, abs=1e-6)  # of a grid, beside the worst point
 
@@ -85,7 +85,7 @@ def test_with_passive_hands_the_limit_is_colgates(damping: float, virtual: float
     """b > K T/2 + B, and a delay t of the force adds K t."""
     model, free = wall(0.1, damping, delay, 100.0, virtual), {"it.stiffness": (1.0, 5000.0)}
     found = apc.tune(model, free, maximize="it.stiffness", criterion="passive")
-    assert found.best == pytest.approx((damping - virtual) / (0.0005 + delay), rel=1e-8)
+    assert found.optimum == pytest.approx((damping - virtual) / (0.0005 + delay), rel=1e-8)
     assert found.proved
 
 
@@ -103,37 +103,41 @@ links: {lan: {clock: network, delay: 40 ms}}
 def test_a_damping_beside_which_hands_get_any_force_for_nothing_stays_at_zero() -> None:
     """k (40 ms + 1.5 ms, half a tick of either clock) < b, where no velocity is sampled."""
     found = apc.tune(compiled(PAIR), {K: (1.0, 500.0), B: (0.0, 20.0)}, maximize=K, criterion="passive")
-    assert abs(found.best - 2 / 0.0415) <= found.error < 1e-4
+    assert abs(found.optimum - 2 / 0.0415) <= found.error < 1e-4
     assert found.gains[1].value == 0 and found.proved
 
 
 def test_a_front_is_the_best_of_a_gain_for_each_bound_on_what_is_felt() -> None:
     model = compiled(AVERAGE)
-    demands = read_demands(model, [f"{K}=10 N/m:7000 N/m"], maximize=K)
-    found = apc.front(model, RANGE, "feel.impedance at 5 Hz", maximize=K, points=3)
-    felt = [abs(apc.feel(model, 5.0, set={K: one.value}).impedance[0]) for one in found.designs]
-    assert [one.felt for one in found.designs] == pytest.approx(felt, rel=1e-9)
-    assert all(np.diff([(one.felt, one.value) for one in found.designs], axis=0).ravel() > 0)
+    demands = read_tuning_spec(model, [f"{K}=10 N/m:7000 N/m"], maximize=K)
+    found = apc.pareto_front(model, RANGE, "impedance at 5 Hz", maximize=K, points=3)
+    used = [abs(apc.transparency(model, 5.0, params={K: one.value}).impedance[0]) for one in found.designs]
+    assert [one.transparency for one in found.designs] == pytest.approx(used, rel=1e-9)
+    assert all(np.diff([(one.transparency, one.value) for one in found.designs], axis=0).ravel() > 0)
     assert found.designs[-1].value == apc.tune(model, RANGE, maximize=K).value
-    asked = apc.tune(model, RANGE, maximize=K, subject=[f"feel.impedance at 5 Hz < {felt[1] * 1.001} N*s/m"])
-    assert asked.value == pytest.approx(found.designs[1].value, rel=5e-3)
+    requested = apc.tune(
+        model, RANGE, maximize=K, constraint=[f"impedance at 5 Hz < {used[1] * 1.001} N*s/m"]
+    )
+    assert requested.value == pytest.approx(found.designs[1].value, rel=5e-3)
     with pytest.raises(apc.ApcError, match="E996"):
-        front(model, demands, read_against("feel.error at 1 Hz"))  # which is least where it is stiffest
+        pareto_front(
+            model, demands, read_tradeoff("coordination_error at 1 Hz")
+        )  # which is least where it is stiffest
 
 
 # What is to be best, whether large, and what it is with a stiffness.
 AIMS: dict[str, tuple[bool, Callable[[apc.Transparency, float], float]]] = {
-    "feel.error at 1 Hz": (False, lambda felt, _: abs(felt.error_per_force[0])),
-    "feel.impedance at 5 Hz": (True, lambda felt, _: abs(felt.impedance[1])),
-    "feel.error_h2": (False, lambda felt, _: felt.h2[0].error_m or np.nan),
-    "feel.error_hinf": (
+    "coordination_error at 1 Hz": (False, lambda used, _: abs(used.coordination_error[0])),
+    "impedance at 5 Hz": (True, lambda used, _: abs(used.impedance[1])),
+    "coordination_error_h2": (False, lambda used, _: used.h2[0].error_m or np.nan),
+    "coordination_error_hinf": (
         False,
-        lambda felt, _: max(one.sampled_data.norm for one in felt.hinf if one.of == "error"),
+        lambda used, _: max(one.sampled_data.norm for one in used.hinf if one.of == "error"),
     ),
-    "feel.damping - 0.01*coordination.stiffness": (
+    "damping - 0.01*coordination.stiffness": (
         False,
-        lambda felt, stiffness: (
-            felt.low_frequency.damping - 0.01 * stiffness if felt.low_frequency else np.nan
+        lambda used, stiffness: (
+            used.low_frequency.damping - 0.01 * stiffness if used.low_frequency else np.nan
         ),
     ),
 }
@@ -148,21 +152,21 @@ def test_what_is_felt_is_no_better_with_any_gains_of_a_grid(aim: str) -> None:
     sums, sign = [], -1 if larger else 1
     for stiffness, damping in (typed, *itertools.product(np.linspace(10, 5000, 4), np.linspace(0, 50, 4))):
         at = {K: float(stiffness), B: float(damping)}
-        if apc.analyze(model, set=at).stable:
-            sums.append(sign * worth(apc.feel(model, [1.0, 5.0], set=at), stiffness))
+        if apc.analyze(model, params=at).stable:
+            sums.append(sign * worth(apc.transparency(model, [1.0, 5.0], params=at), stiffness))
     assert sums[0] <= sign * found.value  # what is typed keeps what is said
-    assert found.proved == (aim != "feel.error_hinf")  # which is right to an error, and not bounded
-    assert sign * found.best <= min(sums[1:]) + 1e-4 * abs(found.best)  # where a descent ends
+    assert found.proved == (aim != "coordination_error_hinf")  # which is right to an error, and not bounded
+    assert sign * found.optimum <= min(sums[1:]) + 1e-4 * abs(found.optimum)  # where a descent ends
 
 
 def test_where_nothing_moves_nothing_limits_gains() -> None:
-    scene = apc.with_hands(apc.compile(str(SCENES / "teleoperation-pair.yaml")), "clamped")
-    found = apc.tune(scene, RANGE | {B: (0.0, 50.0)}, maximize=K)
-    assert found.proved and found.value == RANGE[K][1] and not found.binding
-    assert apc.critical(scene, "wan.delay").value is None
-    assert found.plot().get_xlabel().startswith(K)  # of the scene as it is
+    topology = apc.with_hands(apc.compile(str(TOPOLOGIES / "teleoperation-pair.yaml")), "clamped")
+    found = apc.tune(topology, RANGE | {B: (0.0, 50.0)}, maximize=K)
+    assert found.proved and found.value == RANGE[K][1] and not found.active
+    assert apc.critical(topology, "wan.delay").value is None
+    assert found.plot().get_xlabel().startswith(K)  # of the topology as it is
     with pytest.raises(apc.ApcError, match="E996 nothing moves"):
-        panels_of(scene, 1)
+        panels_of(topology, 1)
 
 
 def test_motions_die_out_no_faster_with_any_gains_of_a_grid() -> None:
@@ -171,23 +175,25 @@ def test_motions_die_out_no_faster_with_any_gains_of_a_grid() -> None:
     assert found.proved and found.value == apc.tune(compiled(AVERAGE), free, minimize="spectral_radius").value
     stiffness, damping = np.meshgrid(np.linspace(10, 5000, 200), np.linspace(0, 50, 100))
     radii = apc.analyze_many(compiled(AVERAGE), {K: stiffness, B: damping}).spectral_radius
-    assert found.best < radii.min() < found.best * 1.01  # a grid that is this coarse
+    assert found.optimum < radii.min() < found.optimum * 1.01  # a grid that is this coarse
     assert found.error < 1e-6
     # Of a descent that ended on its way nobody knows how far the best is.
     assert "±" in str(found) and "±" not in str(replace(found, error=math.inf))
     typed = {one.parameter: float(one.value) for one in found.gains}
-    assert apc.analyze(compiled(AVERAGE), set=typed).spectral_radius < found.value
+    assert apc.analyze(compiled(AVERAGE), params=typed).spectral_radius < found.value
 
 
 def test_what_is_asked_beside_stability_is_kept_and_what_time_leaves_open_is_said() -> None:
     model = compiled(AVERAGE)
-    found = apc.tune(model, RANGE, maximize=K, subject=["decay=60 dB in 2 s"], over={MASS: "±20%"})
+    found = apc.tune(model, RANGE, maximize=K, constraint=["decay=60 dB in 2 s"], over={MASS: "±20%"})
     masses = {MASS: np.linspace(0.08, 0.12, 41)}
-    for value, kept in ((found.value, True), (1.01 * found.value, False)):
-        radii = apc.analyze_many(model, masses, set={K: value}).spectral_radius
-        assert found.proved and (radii.max() < 10 ** (-60 / 20 * 0.008 / 2)) == kept
-    felt = apc.tune(model, RANGE, maximize=K, subject=["feel.impedance at 5 Hz < 15 N*s/m"])
-    assert abs(apc.feel(model, 5.0, set={K: felt.best}).impedance[0]) == pytest.approx(15, rel=1e-6)
+    for value, stored in ((found.value, True), (1.01 * found.value, False)):
+        radii = apc.analyze_many(model, masses, params={K: value}).spectral_radius
+        assert found.proved and (radii.max() < 10 ** (-60 / 20 * 0.008 / 2)) == stored
+    used = apc.tune(model, RANGE, maximize=K, constraint=["impedance at 5 Hz < 15 N*s/m"])
+    assert abs(apc.transparency(model, 5.0, params={K: used.optimum}).impedance[0]) == pytest.approx(
+        15, rel=1e-6
+    )
     late = apc.tune(model, RANGE, maximize=K, over={"user.count": "2:9"}, seconds=0.0)
     assert not late.proved and "it is not proved" in " ".join(str(late).split())
 
@@ -200,7 +206,7 @@ def test_what_the_study_asks_is_written_into_the_topology(cli: Cli) -> None:
     assert ran.code == 0 and "it is proved" in " ".join(ran.out.split()), ran.err
     model = apc.compile("out.yaml")
     for loss in (0.01, 0.1):
-        verdict = apc.judge_network(model, set={"lan.loss": loss})
+        verdict = apc.mean_square_stability(model, params={"lan.loss": loss})
         assert verdict is not None and verdict.stable
     robust = cli(f"critical {K} out.yaml --over user.count=2:3")
     assert f"is the largest {K} found" in " ".join(robust.out.split()), robust.err
@@ -228,15 +234,15 @@ def test_a_range_of_a_delay_is_of_constant_delays_and_changing_ones_are_reported
     assert with_delays(apc.set_parameters(model, {K: found.value}), by_turns) == pytest.approx(
         1.001684, rel=1e-6
     )
-    asked = apc.tune(model, {K: "100 N/m:340 N/m"}, maximize=K, subject=["delay=changing"])
-    ((_, proved),) = asked.changing
-    assert asked.proved and 180 < asked.value < 313.67 and proved.proved_to == 0.06
-    assert "packet; it is proved" in " ".join(str(asked).split())
-    luck, stable = np.random.default_rng(5), apc.set_parameters(model, {K: asked.value})
-    assert max(with_delays(stable, luck.uniform(0.02, 0.06, 6).tolist()) for _ in range(5)) < 1
+    requested = apc.tune(model, {K: "100 N/m:340 N/m"}, maximize=K, constraint=["delay=changing"])
+    ((_, proved),) = requested.changing
+    assert requested.proved and 180 < requested.value < 313.67 and proved.proved_to == 0.06
+    assert "packet; it is proved" in " ".join(str(requested).split())
+    noise, stable = np.random.default_rng(5), apc.set_parameters(model, {K: requested.value})
+    assert max(with_delays(stable, noise.uniform(0.02, 0.06, 6).tolist()) for _ in range(5)) < 1
     assert with_delays(stable, by_turns) < 1
     # A part in fifty higher nothing is proved.
-    more = apc.set_parameters(model, {K: 1.02 * asked.value})
+    more = apc.set_parameters(model, {K: 1.02 * requested.value})
     assert loop_gain(more, ParameterRef("lan.delay"), Fraction("0.02"), Fraction("0.06")) > 1
 
 
@@ -250,6 +256,8 @@ def test_what_cannot_be_asked_is_refused() -> None:
     assert refused({"coordination.stifness": "1 N/m:5 N/m"}).endswith(f"Write: {K}")
     assert refused(good, over={"user.count": "9:2"}).endswith("Write: user.count=2:9")
     assert refused(good, maximize=MASS).endswith(f"Write: --maximize {K}")
-    assert refused(good, subject=["decay=fast"]).startswith("--subject: E996")
-    message = refused(good, subject=["delay = changing"])
-    assert message.startswith("--subject: E996") and message.endswith('Write: --over "lan.delay=8 ms:20 ms"')
+    assert refused(good, constraint=["decay=fast"]).startswith("--constraint: E996")
+    message = refused(good, constraint=["delay = changing"])
+    assert message.startswith("--constraint: E996") and message.endswith(
+        'Write: --over "lan.delay=8 ms:20 ms"'
+    )

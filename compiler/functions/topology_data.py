@@ -1,0 +1,427 @@
+"""Parameters, groups and communication graphs of a compiled model: all except its functions.
+
+Takes: `Topology`, and the peer types with their functions. Gives: `Timings`; `used_links`, `check_links`,
+`used_clocks`; `compiled_groups`, `with_rounded`; `all_parameters`, `followers_of`.
+Guarantees: periods, phases and delays stay exact; dependent values have their formulas.
+Does not: write functions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from fractions import Fraction
+from graphlib import TopologicalSorter
+from itertools import islice
+
+import numpy as np
+
+from apc.compiler.compiled import (
+    PEERS,
+    Channel,
+    Clock,
+    Formula,
+    Group,
+    Link,
+    Loss,
+    PairDelay,
+    Parameter,
+    PeerColumn,
+    PeerType,
+    Timing,
+    count_of,
+    group_count,
+)
+from apc.compiler.components.component import ComponentVariable
+from apc.compiler.components.component import NumberParameter as NumberParameter
+from apc.compiler.equations.connections import ZERO
+from apc.compiler.equations.flatten import FlatPeerType, HoldCrossing
+from apc.compiler.errors import ApcError, Diagnostic, Mistakes, SourceLocation
+from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND
+from apc.compiler.language.evaluation import evaluate, formula_of
+from apc.compiler.language.expression import Expr, Name, format_expression
+from apc.compiler.language.unit_text import format_dimension
+from apc.compiler.language.values import ScalarValue, renamed
+from apc.compiler.peer_counts import COUNT_ABOUT, received_sums, with_received
+from apc.compiler.topology.groups import GroupDeclaration
+from apc.compiler.topology.links import PROBABILITIES
+from apc.compiler.topology.topology import Topology
+from apc.compiler.wording import enumerated
+
+NO_DELAY = "no delay"
+Path = tuple[str, ...]  # a name, between its dots
+
+
+class Timings:
+    """The periods, phases and delays that the model refers to, each once."""
+
+    def __init__(self, topology: Topology) -> None:
+        self.topology = topology
+        self._values = {f"{clock.name}.period": clock.period for clock in topology.clocks}
+        self._values |= {
+            f"{part.name}.{name}": value for part in topology.parts for name, value in part.values
+        }
+        self._result: dict[str, Timing] = {}
+
+    @property
+    def result(self) -> tuple[Timing, ...]:
+        """All timings in use, in the order of first use."""
+        return tuple(self._result.values())
+
+    def use(self, name: str, value: ScalarValue) -> str:
+        """Register a timing and return its name."""
+        self._result.setdefault(name, Timing(name, value.number, _formula(value.expression)))
+        return name
+
+    def delay(self, hold: HoldCrossing, peer_type: FlatPeerType) -> str:
+        """Register the delay of a hold: none, a parameter of a part, or an expression over such."""
+        if hold.delay == ZERO:
+            return self.use(NO_DELAY, ScalarValue(ZERO.value, SECOND, None, SourceLocation("")))
+
+        def number(parts: Path) -> Fraction:
+            return Fraction(self.topology.peers) if parts == (PEERS,) else self._result[".".join(parts)].value
+
+        tree = renamed(
+            hold.delay, lambda parts: parts if parts == (PEERS,) else self._parameter(parts, peer_type)
+        )
+        if isinstance(tree, Name):
+            return format_expression(tree)
+        value = Fraction(evaluate(tree, number, SourceLocation(self.topology.name)))
+        name = f"delay of {hold.variable}" + (f" at {peer_type.name}" if peer_type.delays else "")
+        return self.use(name, ScalarValue(value, SECOND, tree, hold.location))
+
+    def _parameter(self, parts: Path, peer_type: FlatPeerType) -> Path:
+        """Register a delay parameter, under the group's name if it sets its own; return its name's parts.
+
+        What a group's own number depends on is its own as well, if it has one of that name.
+        """
+        name, local = ".".join(parts), dict(peer_type.delays)
+        if name not in local:
+            self.use(name, self._values[name])
+            return parts
+        tree = local[name].expression
+        if tree is not None:
+            tree = renamed(
+                tree, lambda texts: self._parameter(texts, peer_type) if ".".join(texts) in local else texts
+            )
+        return tuple(
+            self.use(f"{peer_type.groups[0]}.{name}", replace(local[name], expression=tree)).split(".")
+        )
+
+
+def used_links(topology: Topology, peer_types: Sequence[PeerType], timings: Timings) -> tuple[Link, ...]:
+    """Return the links with at least one receiver.
+
+    Parameters
+    ----------
+    topology, peer_types
+        All links, and their receivers.
+    timings
+        Collects the delays of the links in use.
+    """
+    received = {
+        receive.link for peer_type in peer_types for clock in peer_type.clocks for receive in clock.receives
+    }
+    links = []
+    for link in (link for link in topology.links if link.name in received):
+        pairs = ((delay, f"{link.name}.delays.{delay.sender}.{delay.receiver}") for delay in link.delays)
+        delays = tuple(
+            PairDelay(topology_delay.sender, topology_delay.receiver, timings.use(name, topology_delay.delay))
+            for topology_delay, name in pairs
+        )
+        delay, channel, related = timings.use(f"{link.name}.delay", link.delay), None, link.channel
+        if related is not None:
+            loss = Loss(*(name for name, _ in related.loss)) if related.loss else None
+            jitter = None if related.jitter is None else timings.use(f"{link.name}.jitter", related.jitter)
+            channel = Channel(
+                loss, jitter, related.distribution, related.reorder, related.on_loss, related.trace
+            )
+        links.append(Link(link.name, link.clock, delay, link.graph, delays, channel))
+    return tuple(links)
+
+
+def used_clocks(
+    topology: Topology, peer_types: Sequence[PeerType], links: Sequence[Link], timings: Timings
+) -> tuple[Clock, ...]:
+    """Return the clocks that something ticks with.
+
+    Parameters
+    ----------
+    topology
+        The topology, all of its clocks.
+    peer_types, links
+        The peer types with their clocks.
+    timings
+        Collects the periods and phases in use.
+    """
+    used = {link.clock for link in links} | {
+        clock.clock for peer_type in peer_types for clock in peer_type.clocks
+    }
+    return tuple(
+        Clock(
+            clock.name,
+            timings.use(f"{clock.name}.period", clock.period),
+            timings.use(f"{clock.name}.phase", clock.phase),
+            clock.period.location.line,
+            clock.period.location.column,
+        )
+        for clock in topology.clocks
+        if clock.name in used
+    )
+
+
+def check_links(topology: Topology, peer_types: Sequence[PeerType], indices: Sequence[int]) -> None:
+    """Refuse a link that cannot provide the values its receivers need.
+
+    Parameters
+    ----------
+    topology, peer_types
+        The links, and their senders and receivers.
+    indices
+        The index of each group's peer type.
+
+    Raises
+    ------
+    ApcError
+        E215 a link over which only some peers send a value: receivers would miss those of the others. E801 a
+        graph, given arc by arc, without senders to a peer with a mean, maximum or minimum.
+    """
+    mistakes = Mistakes()
+    for link in topology.links:
+        sent = [
+            (peer_type.name, send.channels)
+            for peer_type in peer_types
+            for send in peer_type.sends
+            if send.link == link.name
+        ]
+        every = [channel for _, channels in sent for channel in channels]
+        missing = ((name, text) for text in every for name, channels in sent if text not in channels)
+        for name, channel in islice(missing, 1):
+            message = f"{channel} travels over {link.name}, and those of {name} send other values over it"
+            hint = "a link of its own for what only some groups send"
+            mistakes.add("E215", link.location, message, hint=hint)
+    mistakes.raise_if_any()
+    groups, counts = topology.groups, [group.count for group in topology.groups]
+    for link in (link for link in topology.links if link.graph.shape == "arcs"):  # else all have senders
+        owner = np.repeat(np.arange(len(groups)), counts)
+        used = [_timings(peer_types[index], link.name) for index in indices]
+        sends = [any(send.link == link.name for send in peer_types[index].sends) for index in indices]
+        senders, receivers = link.graph.arcs.T
+        asking = np.flatnonzero(np.array(used, dtype=bool)[owner])
+        deaf = np.setdiff1d(asking, receivers[np.array(sends)[owner[senders]]])
+        if not deaf.size:
+            continue
+        first = [(int(owner[index]), index) for index in deaf[:3]]
+        names = [f"{groups[k].name}[{index - sum(counts[:k]) + 1}]" for k, index in first]
+        if len(deaf) > len(names):
+            names.append(f"{len(deaf) - len(names)} more")
+        receive = f"{enumerated(names)} {'hears' if len(deaf) == 1 else 'hear'} nobody over {link.name}"
+        message = f"{receive}: there is no {used[first[0][0]]} over nobody"
+        hint = f"an arc to {'each' if len(deaf) > 1 else names[0]} in its graph"
+        receiving = np.bincount(owner[deaf], minlength=len(groups)) < counts
+        if not receiving.all() and receiving.any():
+            others = [group.name for group, receives in zip(groups, receiving, strict=True) if receives]
+            hint += f", or at: [{', '.join(others)}] in what uses {link.name}"
+        mistakes.add("E801", link.location, message, hint=hint)
+    mistakes.raise_if_any()
+
+
+def _timings(peer_type: PeerType, link: str) -> str:
+    """Return a reduction of a peer type over a link that is undefined without senders, if any."""
+    operators = (
+        receive.operator for clock in peer_type.clocks for receive in clock.receives if receive.link == link
+    )
+    return next((text for text in operators if text in ("mean", "max", "min")), "")
+
+
+def compiled_groups(
+    topology: Topology,
+    peer_types: Sequence[PeerType],
+    indices: Sequence[int],
+    links: Sequence[Link],
+    timings: Timings,
+) -> tuple[Group, ...]:
+    """Return the groups with their numbers of senders; a setting that is a timing depends on that timing.
+
+    Parameters
+    ----------
+    topology
+        The topology.
+    peer_types, indices
+        The peer types, and the index of each group's.
+    links
+        The links in use.
+    timings
+        The timings of the schedule.
+
+    Raises
+    ------
+    ApcError
+        E215 a graph some of whose peers send nothing.
+    """
+    exact = {timing.name for timing in timings.result}
+    declared = _declared(topology)
+    groups, declared = [], _declared(topology)
+    for group, index in zip(topology.groups, indices, strict=True):
+        values = []
+        for name, value in group.values:
+            timing = f"{group.name}.{name}"
+            local = replace(value, expression=Name(tuple(timing.split(".")))) if timing in exact else value
+            values.append(_of_part(name, local, declared))
+        columns = tuple(PeerColumn(name, numbers) for name, numbers in group.columns)
+        groups.append(Group(group.name, group.count, index, tuple(values), columns))
+    for link in (link for link in topology.links if link.graph.shape != "complete"):
+        sending = [any(send.link == link.name for send in peer_type.sends) for peer_type in peer_types]
+        silent = [group.name for group in groups if not sending[group.peer_type]]
+        if silent and any(count_of(link.name) in peer_type.parameters for peer_type in peer_types):
+            message = (
+                f"the graph of {link.name} joins all peers, and those of {silent[0]} send nothing over it"
+            )
+            raise ApcError(Diagnostic("E215", link.location, message))
+    return with_received(groups, peer_types, links)
+
+
+def with_rounded(topology: Topology, peer_type: PeerType, links: Sequence[Link]) -> PeerType:
+    """Return a peer type with the rounded counts of senders marked.
+
+    Raises
+    ------
+    ApcError
+        E217 different sums of weights that are equal in floats.
+    """
+    locations = {link.name: link.location for link in topology.links}
+    rounded = []
+    for link in links:
+        if count_of(link.name) in peer_type.parameters and link.graph.shape == "arcs":
+            values = set(received_sums(link, topology.peers).tolist())
+            if len(set(map(float, values))) < len(values):
+                message = (
+                    f"what two peers hear over {link.name} adds up to sums that doubles can't tell apart"
+                )
+                raise ApcError(
+                    Diagnostic("E217", locations[link.name], message, hint="weights of at most 15 digits")
+                )
+            if any(Fraction(float(value)) != value for value in values):
+                rounded.append((peer_type.parameters.index(count_of(link.name)), tuple(sorted(values))))
+    return replace(peer_type, rounded=tuple(rounded))
+
+
+# ---- numbers by name ----
+
+
+def _named(
+    name: str,
+    value: ScalarValue,
+    description: str = "",
+    minimum: Fraction | float | None = None,
+    maximum: Fraction | float | None = None,
+    *,
+    exclusive_minimum: bool = False,
+) -> Parameter:
+    """Return a number as a parameter."""
+    unit, formula = format_dimension(value.dimension), _formula(value.expression)
+    least, most = (None if item is None else float(item) for item in (minimum, maximum))
+    return Parameter(
+        name,
+        unit,
+        float(value.number),
+        formula,
+        least,
+        exclusive_minimum,
+        most,
+        description=description,
+        exact=value.number,
+        display_unit=value.unit if value.unit != "1" else "",
+    )
+
+
+def _declared(topology: Topology) -> dict[str, NumberParameter | ComponentVariable]:
+    """Return by whole name what declares each number and start value of the parts."""
+    result: dict[str, NumberParameter | ComponentVariable] = {}
+    for part in topology.parts:
+        for declared in (part.component.variables, part.component.numbers):
+            result |= {f"{part.name}.{item.name}": item for item in declared}
+    return result
+
+
+def _of_part(
+    name: str, value: ScalarValue, all_declared: Mapping[str, NumberParameter | ComponentVariable]
+) -> Parameter:
+    """Return a parameter or start value of a part, with its bounds and its description."""
+    declared = all_declared[name]
+    if isinstance(declared, ComponentVariable):
+        return _named(name, value, f"start value: {declared.description}")
+    least, most = declared.minimum, declared.maximum
+    return _named(
+        name, value, declared.description, least, most, exclusive_minimum=declared.exclusive_minimum
+    )
+
+
+def all_parameters(
+    topology: Topology, peer_types: Sequence[PeerType], links: Sequence[Link]
+) -> tuple[Parameter, ...]:
+    """Return every parameter of the topology: named ones, each part's, start values in use, those of links.
+
+    Parameters
+    ----------
+    topology
+        Their values.
+    peer_types, links
+        What is compiled: whose start values and counts are in use, and which links.
+    """
+    declared = _declared(topology)
+    needed = {name for peer_type in peer_types for name in peer_type.parameters}
+    used = {link.name for link in links}
+    parameters = [_named(name, value) for name, value in topology.parameters]
+    for part in topology.parts:
+        numbers = dict(part.values) | {
+            local: value for local, value in part.all_starts if f"{part.name}.{local}" in needed
+        }
+        parameters += [_of_part(f"{part.name}.{local}", value, declared) for local, value in numbers.items()]
+    for link in topology.links:
+        if count_of(link.name) in needed:  # every group has its own value
+            parameters.append(
+                Parameter(count_of(link.name), "1", float(topology.peers - 1), description=COUNT_ABOUT)
+            )
+        if link.channel is not None and link.name in used:
+            probabilities = zip(link.channel.loss, PROBABILITIES.values(), strict=False)
+            parameters += [_named(*number, description, 0, 1) for number, description in probabilities]
+    for clock in topology.clocks:
+        if (name := f"{clock.name}.period") in needed:  # by `interval`: the same number as the timing
+            description = f"from one tick of {clock.name} to the next"
+            parameters.append(_named(name, clock.period, description, 0, exclusive_minimum=True))
+    for group in topology.groups:
+        expression = None if group.counted is None else group.counted.expression
+        count = ScalarValue(Fraction(group.count), DIMENSIONLESS, expression, group.location)
+        description, most = f"number of peers of group {group.name}", _most_peers(topology, group)
+        parameters.append(_named(group_count(group.name), count, description, 1, most))
+    parameters.append(Parameter(PEERS, "1", float(topology.peers), description="number of peers"))
+    return tuple({parameter.name: parameter for parameter in parameters}.values())
+
+
+def _most_peers(topology: Topology, group: GroupDeclaration) -> float | None:
+    """Return the possible numbers of peers of a group, the others unchanged, by the component limits."""
+    counts = {group.name: group.count for group in topology.groups}
+    room = [
+        part.component.peers - sum(counts[name] for name in part.groups if name != group.name)
+        for part in topology.parts
+        if part.component.peers and group.name in part.groups
+    ]
+    return float(min(room)) if room else None
+
+
+def followers_of(
+    parameters: Sequence[Parameter], timings: Sequence[Timing], groups: Sequence[Group]
+) -> tuple[str, ...]:
+    """Return the names of all dependent parameters, each after its dependencies."""
+    numbers: list[Parameter | Timing] = [*parameters, *timings]
+    followed, names = TopologicalSorter[str](), set[str]()
+    for item in (*numbers, *(value for group in groups for value in group.values)):
+        if item.formula is not None:
+            followed.add(item.name, *item.formula.names)
+            names.add(item.name)
+    return tuple(name for name in followed.static_order() if name in names)
+
+
+def _formula(expression: Expr | None) -> Formula | None:
+    return None if expression is None else formula_of(expression)

@@ -1,0 +1,114 @@
+"""Model size: the states, delays and packets of an analysis.
+
+Takes: a `Model`.
+Gives: `model_size`, the `ModelSize`; `SubsystemSize`.
+Guarantees: the counts are those of the analysed systems; none of them is built.
+Does not: analyse.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+
+from apc.analysis.method_selection import make_plan
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError
+from apc.frame.data_age import linear_subsystems, of_single_delay
+from apc.frame.evaluation_errors import finite_equations
+from apc.frame.jacobians import edge_name
+from apc.frame.numeric_model import instance, prepare
+from apc.result import Result
+
+
+@dataclass(frozen=True, slots=True)
+class SubsystemSize:
+    """The values that one peer of a type stores from frame to frame."""
+
+    name: str
+    motion: int
+    stored: int
+    packets: int
+
+    @property
+    def states(self) -> int:
+        """The sum of all counts."""
+        return self.motion + self.stored + self.packets
+
+
+@dataclass(frozen=True, slots=True)
+class ModelSize(Result):
+    """The size of a model: `subsystems` one per peer type, `ticks` of each clock in a frame.
+
+    It is analysed by `method` as `systems`, (count, size); `refused` is the reason if there are none. `pairs`
+    names the receives that are evaluated once for each pair of peers.
+    """
+
+    shown_by = "analysis_output:model_size"
+
+    peers: int
+    frame: Fraction  # s
+    subsystems: tuple[SubsystemSize, ...]
+    ticks: tuple[tuple[str, int], ...]
+    method: str
+    systems: tuple[tuple[int, int], ...]
+    refused: str
+    pairs: tuple[str, ...]
+
+
+def model_size(system: Model) -> ModelSize:
+    """Return the size of a model from frame to frame."""
+    with finite_equations(system.origin.topology):
+        return _subsystem_size(system)
+
+
+def _subsystem_size(system: Model) -> ModelSize:
+    refused = ""
+    try:
+        prepared = prepare(system)
+    except ApcError as error:  # ages of several delays; a simulation needs no single age
+        refused = error.mistakes[0].sentence
+        prepared = prepare(system, linear_subsystems(of_single_delay(system)))
+    schedule_of = {
+        group.peer_type: schedule
+        for group, schedule in reversed(list(zip(system.groups, prepared.schedules, strict=True)))
+    }
+    subsystems = tuple(
+        SubsystemSize(
+            peer_type.name,
+            len(peer_type.states),
+            len(schedule_of[index].discrete_states),
+            sum(schedule_of[index].depths),
+        )
+        for index, peer_type in enumerate(system.peer_types)
+    )
+    method: str = ""
+    systems: tuple[tuple[int, int], ...] = ()
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):  # the sizes count here, not the values
+            plan = None if refused else make_plan(instance(system, prepared))
+        if plan is not None:
+            method, systems = plan.method, plan.systems
+    except ApcError as error:  # a model that cannot be analysed may still be simulated
+        refused = error.mistakes[0].sentence
+    frame = prepared.schedules[0].frame_s
+    return ModelSize(
+        system.peers,
+        frame,
+        subsystems,
+        tuple((clock.name, int(frame / prepared.timings[clock.period])) for clock in system.clocks),
+        method,
+        systems,
+        refused,
+        tuple(
+            dict.fromkeys(
+                receive.name
+                for peer_type in system.peer_types
+                for partition in peer_type.clocks
+                for receive in partition.receives
+                if edge_name(partition, receive)
+            )
+        ),
+    )

@@ -1,0 +1,1 @@
+"""The interactive page in the browser: sliders and results."""

@@ -1,0 +1,503 @@
+"""The figures of the page and their descriptions in words.
+
+Takes: the results of `sections`.
+Gives: `LiveText`; `RegionFigure`, `RootsFigure`, `MotionFigure`, `TransparencyFigure`; `FOCUS`.
+Guarantees: each figure has a text alternative; no information is by color alone.
+Does not: compute, or handle sliders.
+"""
+
+from __future__ import annotations
+
+from html import escape
+from typing import Any
+
+import numpy as np
+from bokeh.models import (
+    ColumnDataSource,
+    CustomJS,
+    CustomJSTickFormatter,
+    Div,
+    FixedTicker,
+    HoverTool,
+    Range1d,
+    Slider,
+    Toggle,
+)
+from bokeh.plotting import figure
+
+from apc.app.motion import MM, ROWS, AnimationFrames
+from apc.compiler.wording import counted
+from apc.output.formatting import Plain, axis_label
+
+# Colors distinct in print and for color-blind readers: Okabe and Ito, 2008; the lightest two are darkened to
+# the contrast of WCAG 2.1, 1.4.11, against white.
+BLUE, ORANGE, GREY, INK = "#0072B2", "#D55E00", "#595959", "#1a1a1a"
+COLOURS = (BLUE, ORANGE, "#009E73", "#CC79A7", "#000000", "#6A86E8", "#A87300", "#7F3C8D")
+DASHES, DASH_WORDS = (
+    ("solid", "dashed", "dotted", "dotdash"),
+    ("drawn through", "dashed", "dotted", "dash and dot"),
+)
+HEIGHT = 330
+# Margins around the unit circle and eigenvalues outside it; around bodies, as a share of their motion.
+ROUND, BEYOND, ROOM = 1.12, 1.05, 0.1
+CIRCLE = np.exp(1j * np.linspace(0, 2 * np.pi, 241))
+
+# The vertical distance of a peer's bodies on a line, as a share of that between two peers.
+STAGGER = 0.3
+# Height of a line of names, in pixels.
+LINE, BAR = 13, 48
+# Seconds that a whole motion is played in.
+SECONDS = 10
+INSTANT = """
+const time = frames.data.time
+return time.length ? time[Math.min(Math.round(tick), time.length - 1)].toFixed(3) + ' s' : ''
+"""
+# Changed in place: what is shown at an instant is this tab's, and not sent anywhere.
+SHOWING = """
+const {time, x, y, angle} = frames.data // by time, then by body, one row behind the other
+if (time.length) {
+  const k = Math.min(Math.round(slider.value), time.length - 1)
+  const count = x.length / time.length
+  for (let body = 0; body < count; body++) {
+    bodies.data.x[body] = x[k * count + body]
+    bodies.data.y[body] = y[k * count + body]
+    bodies.data.angle[body] = angle[k * count + body]
+  }
+  instant.data.x[0] = time[k]
+  bodies.change.emit()
+  instant.change.emit()
+  slider.properties.title.change.emit() // which shows the time
+}
+"""
+PLAYING = f"""
+clearInterval(window.apc_playing)
+cb_obj.label = cb_obj.active ? 'Pause' : 'Play'
+if (cb_obj.active) {{
+  window.apc_playing = setInterval(() => {{
+    const count = frames.data.time.length
+    if (count) slider.value = (Math.round(slider.value) + 1) % count
+  }}, {1000 * SECONDS} / {ROWS})
+}}
+"""
+FOCUS = """
+    :host { font: 13px/1.4 system-ui, sans-serif; color: #1a1a1a; }
+    .noUi-handle:focus-visible, button:focus-visible, select:focus-visible
+      { outline: 3px solid #0072B2; outline-offset: 1px; }
+    .bk-btn { padding: 6px 2px; } /* three of them stand side by side in a narrow window */
+    .noUi-target { border-color: #767676; margin: 0 8px; }
+    .noUi-handle { border-color: #595959; }
+    """
+STYLE = """
+    :host { font: 14px/1.45 system-ui, sans-serif; color: #1a1a1a; }
+    .bk-clearfix { display: block; min-width: 0; } /* a wide table scrolls, the page does not */
+    p { margin: 0 0 6px; } pre { font-size: 12px; overflow-x: auto; margin: 6px 0; }
+    @media (max-width: 1000px) { pre { font-size: 10.5px; } } /* 80 columns at 800 pixels */
+    strong.unstable { color: #A03C00; } strong.stable { color: #00587A; }
+    .old { opacity: .55; } .why { color: #5a2a00; }
+    summary { cursor: pointer; } summary:focus-visible { outline: 2px solid #0072B2; }
+    """
+
+
+def _plot(name: str, **settings: Any) -> Any:
+    """Return a figure as all are: as wide as its place, with few tools."""
+    plot = figure(
+        name=f"{name}-plot",
+        height=HEIGHT,
+        sizing_mode="stretch_width",
+        tools="pan,wheel_zoom,box_zoom,reset,save",
+        active_scroll=None,
+        **settings,
+    )
+    plot.toolbar.logo = None
+    plot.toolbar.autohide = True
+    plot.axis.axis_label_text_font_style = "normal"
+    plot.axis.axis_label_text_color = plot.axis.major_label_text_color = INK
+    return plot
+
+
+def _legend_below(plot: Any) -> None:
+    """Put the legend where it covers nothing."""
+    legend = plot.legend[0]
+    legend.update(orientation="horizontal", border_line_color=None, padding=0, label_text_color=INK)
+    plot.center.remove(legend)
+    plot.add_layout(legend, "above")
+
+
+class LiveText:
+    """A text of the page, which is read aloud when it changes."""
+
+    def __init__(self, name: str) -> None:
+        self.model = Div(
+            text="<p>Computing …</p>", name=name, stylesheets=[STYLE], sizing_mode="stretch_width"
+        )
+
+    def show_text(self, *lines: str) -> None:
+        """Show lines, as they are."""
+        self.model.text = "".join(f"<p>{escape(line)}</p>" for line in lines)
+
+    def verdict(self, result: Plain) -> None:
+        """Show a verdict, what limits it, and behind a lid all that `apc analyze` prints."""
+        kind = {True: "stable", False: "unstable"}.get(result["stable"], "")
+        self.model.text = (
+            f"<p><strong class='{kind}'>{escape(result['verdict'])}</strong>, spectral radius "
+            f"{result['radius']:.9g} per frame</p><p>{escape(result['limits'])}</p>"
+            + "".join(f"<p>{escape(item)}</p>" for item in result["notes"])
+            + "<details><summary>All modes</summary>"
+            f"<pre tabindex='0'>{escape(result['text'])}</pre></details>"
+        )
+
+    def table(self, text: str) -> None:
+        """Show a text with aligned columns."""
+        self.model.text = f"<pre tabindex='0'>{escape(text)}</pre>"
+
+    def nothing(self, why: str) -> None:
+        """Show the reason for a missing result."""
+        self.model.text = f"<p class='why'>{escape(why)}</p>"
+
+
+class RegionFigure:
+    """The stable region of two parameters, and where in it the model is."""
+
+    def __init__(self) -> None:
+        self.plot = _plot("region", x_range=Range1d(0, 1), y_range=Range1d(0, 1))
+        self.inside = ColumnDataSource({"xs": [], "ys": []})
+        self.boundary = ColumnDataSource({"xs": [], "ys": []})
+        self.point = ColumnDataSource({"x": [], "y": []})
+        self.plot.multi_polygons(
+            "xs",
+            "ys",
+            source=self.inside,
+            fill_color=BLUE,
+            fill_alpha=0.14,
+            hatch_pattern="/",
+            hatch_color=BLUE,
+            hatch_alpha=0.25,
+            hatch_scale=10,
+            hatch_weight=0.7,
+            line_width=0,
+            legend_label="stable",
+        )
+        self.plot.multi_line("xs", "ys", source=self.boundary, line_color=BLUE, line_width=2)
+        self.plot.scatter(
+            "x",
+            "y",
+            source=self.point,
+            size=13,
+            marker="circle_cross",
+            line_color="#000000",
+            fill_color="#ffffff",
+            line_width=2,
+            legend_label="the sliders",
+        )
+        _legend_below(self.plot)
+        self.words = LiveText("region-words")
+
+    def show(self, result: Plain) -> None:
+        """Draw a region."""
+        self.plot.visible = True
+        outlines = [np.asarray(item) for item in result["outlines"]]
+        rings = {
+            axis: [[[outline[:, n] for outline in outlines]]] if outlines else []
+            for n, axis in enumerate(("xs", "ys"))
+        }
+        self.inside.data = rings
+        self.boundary.data = {
+            "xs": [item[:, 0] for item in result["curves"]],
+            "ys": [item[:, 1] for item in result["curves"]],
+        }
+        for axis, span, which in (
+            (self.plot.xaxis, self.plot.x_range, result["x"]),
+            (self.plot.yaxis, self.plot.y_range, result["y"]),
+        ):
+            label, unit, low, high = which
+            axis.axis_label = axis_label(label, unit)
+            span.update(start=low, end=high)
+        steps = (
+            ("Between the edges of its cells the boundary is drawn straight.",) if result["stepped"] else ()
+        )
+        self.words.show_text(
+            f"Stable in {100 * result['share']:.3g} % of what is shown.", *steps, *result["notes"]
+        )
+
+    def clear(self, why: str) -> None:
+        """Show no region, and why."""
+        self.plot.visible = False
+        self.inside.data = self.boundary.data = {"xs": [], "ys": []}
+        self.words.nothing(why)
+
+    def mark(self, x: float, y: float) -> None:
+        """Mark where the model is."""
+        if self.point.data != (data := {"x": [x], "y": [y]}):
+            self.point.data = data
+
+
+class RootsFigure:
+    """Eigenvalues over the unit circle, and their paths as a slider moves."""
+
+    def __init__(self) -> None:
+        self.plot = _plot(
+            "roots",
+            x_range=Range1d(-ROUND, ROUND),
+            y_range=Range1d(-ROUND, ROUND),
+            x_axis_label="real part",
+            y_axis_label="imaginary part",
+            tooltips=[("mode", "@name"), ("eigenvalue", "@x + @y i")],
+        )
+        self.now = ColumnDataSource({"x": [], "y": [], "name": []})
+        self.path = ColumnDataSource({"x": [], "y": [], "name": []})
+        self.plot.line(CIRCLE.real, CIRCLE.imag, line_color=GREY, line_width=1.5)
+        self.plot.scatter(
+            "x", "y", source=self.path, size=3, fill_color=BLUE, line_color=None, legend_label="as it moves"
+        )
+        self.plot.scatter(
+            "x",
+            "y",
+            source=self.now,
+            size=10,
+            marker="x",
+            line_color=ORANGE,
+            line_width=2,
+            legend_label="now",
+        )
+        # As wide as high: a circle is one.
+        self.plot.update(sizing_mode="fixed", width=HEIGHT + 30, height=HEIGHT + 30)
+        _legend_below(self.plot)
+        self.words, self.path_text = LiveText("roots-words"), LiveText("way-words")
+        self.path_text.show_text("Move a slider: dots show the way the eigenvalues take.")
+
+    def show(self, result: Plain) -> None:
+        """Draw the eigenvalues of an analysis."""
+        self.now.data = {"x": result["real"], "y": result["imag"], "name": result["names"]}
+        size = BEYOND * float(np.hypot(result["real"], result["imag"]).max(initial=0.0))
+        reach = max(ROUND, size)
+        self.plot.x_range.update(start=-reach, end=reach)
+        self.plot.y_range.update(start=-reach, end=reach)
+        outside = int((np.hypot(result["real"], result["imag"]) > 1).sum())
+        self.words.show_text(
+            f"{counted(len(result['real']), 'eigenvalue')}, {outside} outside the unit circle."
+        )
+
+    def path_of(self, result: Plain) -> None:
+        """Draw where the eigenvalues go as a slider goes through all its values."""
+        self.path.data = {"x": result["real"], "y": result["imag"], "name": result["name"]}
+        self.path_text.show_text(
+            f"Dots: where they are for {result['slider']} from {result['from']} to {result['to']}."
+        )
+
+
+class MotionFigure:
+    """The response over time, and the bodies that move: played, stopped, or taken to any time."""
+
+    def __init__(self) -> None:
+        self.lines = ColumnDataSource(columns("xs", "ys", "colour", "dash", "name"))
+        self.instant = ColumnDataSource({"x": [0.0]})
+        self.frames = ColumnDataSource(columns("time", "x", "y", "angle"))
+        self.bodies = ColumnDataSource(
+            columns("x", "y", "angle", "width", "height", "bar", "name", "above", "colour")
+        )
+        self.walls = ColumnDataSource(columns("x", "top", "bottom"))
+        self.discs = ColumnDataSource(columns("x", "y", "radius"))
+        self.plot = _plot(
+            "response",
+            x_axis_label="time [s]",
+            y_axis_label="position [mm]",
+            x_range=Range1d(0, 1),
+            y_range=Range1d(0, 1),
+        )
+        self.plot.multi_line(
+            "xs", "ys", source=self.lines, line_color="colour", line_dash="dash", line_width=2
+        )
+        self.plot.vspan("x", source=self.instant, line_color="#000000", line_dash="dotted")
+        self.plot.add_tools(HoverTool(tooltips=[("", "@name")]))
+        self.stage = _plot(
+            "stage", x_axis_label="position [mm]", x_range=Range1d(0, 1), y_range=Range1d(0, 1)
+        )
+        self.rows = FixedTicker()
+        self.stage.vbar("x", 0.0, "top", "bottom", source=self.walls, line_color="#404040", line_width=4)
+        self.stage.circle(
+            "x", "y", radius="radius", source=self.discs, fill_color="#d0d0d0", line_color="#404040"
+        )
+        self.stage.rect(
+            "x",
+            "y",
+            "width",
+            "height",
+            source=self.bodies,
+            fill_color="colour",
+            fill_alpha=0.3,
+            line_color="#000000",
+        )
+        bar = {"marker": "dash", "size": "bar", "angle": "angle", "line_color": "colour", "line_width": 3}
+        self.stage.scatter("x", "y", source=self.bodies, **bar)  # along the axis of what turns
+        self.stage.scatter("x", "y", source=self.bodies, size=9, fill_color="colour", line_color="#000000")
+        self.stage.text(
+            "x",
+            "y",
+            "name",
+            source=self.bodies,
+            y_offset="above",
+            text_align="center",
+            text_baseline="bottom",
+            text_font_size="11px",
+            text_color=INK,
+        )
+        self.time = Slider(
+            start=0,
+            end=ROWS - 1,
+            step=1,
+            value=0,
+            title="time",
+            name="time",
+            tooltips=False,
+            sizing_mode="stretch_width",
+            stylesheets=[FOCUS],
+            format=CustomJSTickFormatter(args={"frames": self.frames}, code=INSTANT),
+        )
+        showing = CustomJS(
+            args={
+                "slider": self.time,
+                "frames": self.frames,
+                "bodies": self.bodies,
+                "instant": self.instant,
+            },
+            code=SHOWING,
+        )
+        self.time.js_on_change("value", showing)
+        self.frames.js_on_change("data", showing)
+        self.simulation = Toggle(label="Play", width=90, stylesheets=[FOCUS])
+        self.simulation.js_on_change(
+            "active", CustomJS(args={"slider": self.time, "frames": self.frames}, code=PLAYING)
+        )
+        self.words = LiveText("motion-words")
+
+    def show(self, motion: AnimationFrames) -> None:
+        """Draw a motion, and put the bodies where they are at the time that is shown."""
+        self._visible(True)
+        peers, names = (
+            list(dict.fromkeys(item))
+            for item in zip(*((peer, body.name) for peer, body in motion.bodies), strict=True)
+        )
+        colours = [COLOURS[peers.index(peer) % len(COLOURS)] for peer, _ in motion.bodies]
+        labels = [f"{peer}.{body.name}" for peer, body in motion.bodies]
+        x, y = motion.x, motion.y
+        self.lines.data = {
+            "xs": [motion.time for _ in labels],
+            "ys": [*x.T],
+            "colour": colours,
+            "dash": [DASHES[names.index(body.name) % len(DASHES)] for _, body in motion.bodies],
+            "name": labels,
+        }
+        planar = y is not None
+        if y is None:
+            rows = [peers.index(peer) + STAGGER * names.index(body.name) for peer, body in motion.bodies]
+            y = np.tile(rows, (len(x), 1))
+        sizes = [MM * body.radius for _, body in motion.bodies]
+        self.bodies.data = {
+            "x": x[0],
+            "y": y[0],
+            "angle": motion.angle[0],
+            "bar": [BAR if body.turning else 0 for _, body in motion.bodies],
+            "width": [2 * size for size in sizes],
+            "height": [2 * size if planar else 0.5 * (size > 0) for size in sizes],
+            "name": labels if planar else [body.name for _, body in motion.bodies],
+            # In a plane bodies may coincide, and their names would overlap.
+            "above": [-8 - (LINE if planar else 0) * index for index in range(len(labels))],
+            "colour": colours,
+        }
+        fixed = [at for _, at in motion.walls]
+        self.walls.data = {
+            "x": fixed,
+            "top": [row + 0.45 for row, _ in motion.walls],
+            "bottom": [row - 0.45 for row, _ in motion.walls],
+        }
+        self.discs.data = {
+            name: [disc[n] for disc in motion.discs] for n, name in enumerate(("x", "y", "radius"))
+        }
+        self.frames.data = {"time": motion.time, "x": x, "y": y, "angle": motion.angle}
+        reach = max(sizes)
+        low, high = min([x.min() - reach, *fixed]), max([x.max() + reach, *fixed])
+        room = ROOM * (high - low) or 1.0
+        self.plot.x_range.update(start=0.0, end=float(motion.time[-1]))
+        self.plot.y_range.update(start=float(x.min()) - room, end=float(x.max()) + room)
+        self.stage.x_range.update(start=low - room, end=high + room)
+        if planar:
+            self.stage.y_range.update(start=float(y.min()) - reach - room, end=float(y.max()) + reach + room)
+            self.stage.yaxis.axis_label = "position [mm]"
+        else:
+            self.stage.y_range.update(start=len(peers) - 0.3, end=-0.5)
+            if self.stage.yaxis[0].ticker is not self.rows:  # a document walks through all that is new to it
+                self.stage.yaxis.ticker = self.rows
+            self.rows.ticks = list(range(len(peers)))
+            self.stage.yaxis.major_label_overrides = dict(enumerate(peers))
+        slower = SECONDS / float(motion.time[-1])
+        legend = "; ".join(f"{name} {word}" for name, word in zip(names, DASH_WORDS, strict=False))
+        times = f"{max(slower, 1 / slower):.2g}"
+        pace = "as fast as it is" if times == "1" else f"{times} times {'slower' if slower > 1 else 'faster'}"
+        self.words.show_text(
+            *motion.remarks,
+            f"A colour is a peer, a kind of line a body: {legend}. Played {pace}.",
+            *([f"{motion.others} more peers are not shown."] if motion.others else []),
+        )
+
+    def clear(self, why: str) -> None:
+        """Show no motion, and why."""
+        self._visible(False)
+        self.words.nothing(why)
+
+    def _visible(self, there: bool) -> None:
+        for item in (self.stage, self.simulation, self.time, self.plot):
+            item.visible = there
+
+
+class TransparencyFigure:
+    """The impedance at a hand's device: force by velocity, over frequency."""
+
+    def __init__(self) -> None:
+        self.source = ColumnDataSource(columns("frequency", "magnitude", "phase"))
+        self.plot = _plot(
+            "transparency",
+            x_axis_type="log",
+            y_axis_type="log",
+            y_axis_label="impedance [N·s/m]",
+            x_range=Range1d(0.1, 60),
+            y_range=Range1d(1, 100),
+        )
+        self.phase = _plot(
+            "phase",
+            x_axis_type="log",
+            x_axis_label="frequency [Hz]",
+            y_axis_label="phase [°]",
+            x_range=self.plot.x_range,
+            y_range=Range1d(-180, 180),
+        )
+        self.plot.height, self.phase.height = 2 * HEIGHT // 3, HEIGHT // 2
+        for plot, column in ((self.plot, "magnitude"), (self.phase, "phase")):
+            plot.line("frequency", column, source=self.source, line_color=BLUE, line_width=2)
+            plot.add_tools(HoverTool(tooltips=[("Hz", "@frequency"), (column, f"@{column}")], mode="vline"))
+        self.phase.yaxis.ticker = [-180, -90, 0, 90, 180]
+        self.plot.yaxis.minor_tick_line_color = None  # over less than a decade they lie on each other
+        self.words = LiveText("transparency-words")
+
+    def show(self, result: Plain) -> None:
+        """Plot the transparency."""
+        self.plot.visible = self.phase.visible = True
+        self.source.data = {name: result[name] for name in ("frequency", "magnitude", "phase")}
+        f, size = result["frequency"], result["magnitude"]
+        self.plot.x_range.update(start=f[0], end=f[-1])
+        self.plot.y_range.update(start=size.min() / (1 + ROOM), end=size.max() * (1 + ROOM))
+        self.words.show_text(
+            f"At {result['at']}: {size[0]:.4g} N·s/m at {f[0]:.3g} Hz,"
+            f" {size[-1]:.4g} N·s/m at {f[-1]:.3g} Hz.",
+            *result["notes"],
+        )
+
+    def clear(self, why: str) -> None:
+        """Show no impedance, and why."""
+        self.plot.visible = self.phase.visible = False
+        self.source.data = columns("frequency", "magnitude", "phase")
+        self.words.nothing(why)
+
+
+def columns(*names: str) -> dict[str, list[Any]]:
+    """Return empty columns."""
+    return {name: [] for name in names}

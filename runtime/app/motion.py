@@ -1,0 +1,116 @@
+"""Simulation for the page: an impulse and its response, and the moving bodies.
+
+Takes: a `Model`.
+Gives: `AnimationFrames`, `motion_of`.
+Guarantees: rows are those of `simulation`, thinned to the visible resolution. A diverging motion is shown
+until it leaves the figure, with a remark.
+Does not: draw.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
+from apc.output.object_shapes import Disc, DrawnBody, heading, moves_in_plane, views_of
+from apc.simulation.initial_velocity import WATCHED, impulse_text, initial_velocity
+from apc.simulation.trajectory import simulate
+
+Floats = NDArray[np.float64]
+
+# Rows that are shown: more are not seen.
+ROWS = 300
+# In m: what moves farther than this from where it started has left the picture.
+FAR = 1.0
+MM = 1e3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AnimationFrames:
+    """The visible part of a model: times (rows,) in s, n bodies, and fixed surfaces: (row, mm), or discs.
+
+    `x`, `y` and `angle` (rows, n) are where each body is, in mm and rad; `y` is None if all move along lines,
+    one row per peer. `bodies` are their peers and initial geometry. `remarks` is the text alternative;
+    `others` is the number of peers not shown.
+    """
+
+    time: Floats
+    bodies: tuple[tuple[str, DrawnBody], ...]
+    x: Floats
+    y: Floats | None
+    angle: Floats
+    walls: tuple[tuple[int, float], ...]
+    discs: tuple[tuple[float, float, float], ...]
+    remarks: tuple[str, ...]
+    others: int
+
+
+def motion_of(system: Model, *, struck: bool) -> AnimationFrames:
+    """Play a model: as it begins, or with the first peer's device struck besides.
+
+    Parameters
+    ----------
+    system
+        The model.
+    struck
+        Whether the first peer's device is struck as it begins.
+
+    Raises
+    ------
+    ApcError
+        E983 nothing to strike or to see; those of `trajectory.simulate`.
+    """
+    planar = moves_in_plane(system)
+    views = views_of(system)
+    remarks = []
+    if struck:
+        system, subject = initial_velocity(system)
+        remarks.append(impulse_text(subject))
+    shown = tuple((view.name, body) for view in views for body in view.bodies)
+    names = [
+        [f"{peer}.{state}" for state in (body.states[0], body.states[planar], *body.turning)]
+        for peer, body in shown
+    ]
+    if not names:
+        raise ApcError(
+            Diagnostic("E983", SourceLocation(system.name), "nothing here has a position that could be shown")
+        )
+    duration = system.experiment.duration or WATCHED
+    simulated = simulate(system, duration=duration, signals=[text for name in names for text in name])
+    values, time = simulated.values, simulated.time
+    indices = [number for number, signal in enumerate(simulated.signals) if signal.unit == "m"]
+    separation = np.abs(values - values[0])[:, indices].max(axis=1) > FAR
+    if separation.any():
+        last = max(int(np.argmax(separation)), 2)
+        values, time = values[:last], time[:last]
+        remarks.append(f"Shown until something is {FAR:g} m from where it began.")
+    texts = np.unique(np.linspace(0, len(time) - 1, min(ROWS, len(time))).astype(int))
+    columns = {signal.name: index for index, signal in enumerate(simulated.signals)}
+    tracks = [values[texts][:, [columns[text] for text in name]] for name in names]
+    x, y = (np.stack([track[:, index] for track in tracks], axis=1) for index in (0, 1))
+    angle = np.stack([heading(track[:, 2:]) for track in tracks], axis=1)
+    fixed = [(row, surface) for row, view in enumerate(views) for surface in view.surfaces]
+    remarks.append(f"Motion: {simulated.summary.verdict}.")
+    return AnimationFrames(
+        time=time[texts],
+        bodies=shown,
+        x=MM * x,
+        y=MM * y if planar else None,
+        angle=angle,
+        walls=tuple(
+            (row, MM * line.offset) for row, line in fixed if not planar and not isinstance(line, Disc)
+        ),
+        discs=tuple(
+            dict.fromkeys(
+                (MM * disc.centre[0], MM * disc.centre[1], MM * disc.radius)
+                for _, disc in fixed
+                if isinstance(disc, Disc)
+            )
+        ),
+        remarks=tuple(remarks),
+        others=system.peers - len(views),
+    )

@@ -1,0 +1,84 @@
+"""A model with an external force on each device; the force holds its last set value.
+
+Takes: a `Model`. Gives: `with_external_force`, `FORCE_ON`.
+Guarantees: a zero force leaves the motion unchanged. A force set before a tick of the fastest clock acts from
+that tick on. A device with several axes has one force per axis.
+Does not: set the force.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+from typing import Any
+
+import casadi
+
+from apc.compiler.compiled import Hold, Model, Parameter, PeerType, Timing
+from apc.compiler.functions.topology_data import NO_DELAY
+from apc.frame.devices import Device, coupled_directly, find_devices, rewritten
+from apc.frame.jacobians import jacobians
+from apc.frame.parameters import resolve
+
+FORCE_ON = "force on "  # and the device
+
+
+def with_external_force(system: Model) -> Model:
+    """Return a model with a force on each device: a parameter that the fastest clock outputs.
+
+    Parameters
+    ----------
+    system
+        The model. A peer without a device, or without clocked forces, is unchanged.
+    """
+    unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
+    numbers, direct = resolve(system), coupled_directly(system.peer_types)
+    periods = {clock.name: numbers.timings[clock.period] for clock in system.clocks}
+    peer_types, added = list(system.peer_types), dict[str, Parameter]()
+    for index, group in enumerate(system.groups):
+        peer_type = system.peer_types[group.peer_type]
+        if peer_types[group.peer_type] is not peer_type or not peer_type.clocks:
+            continue
+        result = find_devices(jacobians(peer_type), numbers.parameters[index][0], unit_of, direct=direct)
+        devices = {
+            f"{FORCE_ON}{device.part}": device for device in result.values() if isinstance(device, Device)
+        }
+        fastest = min(
+            range(len(peer_type.clocks)), key=lambda number: periods[peer_type.clocks[number].clock]
+        )
+        if devices:
+            peer_types[group.peer_type] = _with_external_force(peer_type, devices, fastest)
+            added |= {name: Parameter(name, "N", 0.0, description="a force from outside") for name in devices}
+    timings = {timing.name: timing for timing in (Timing(NO_DELAY, Fraction(0)), *system.timings)}
+    return replace(
+        system,
+        peer_types=tuple(peer_types),
+        parameters=(*system.parameters, *added.values()),
+        timings=tuple(timings.values()) if added else system.timings,
+    )
+
+
+def _with_external_force(peer_type: PeerType, devices: dict[str, Device], fastest: int) -> PeerType:
+    """Return a peer type with a force on each of its devices, by name, which a clock partition puts out."""
+    before = peer_type.clocks[fastest]
+    held, local, first = len(peer_type.holds), len(peer_type.parameters), len(before.outputs)
+    holds = (Hold(name, before.clock, first + index, NO_DELAY) for index, name in enumerate(devices))
+
+    def rates(x: Any, u: Any, p: Any, t: Any) -> Any:
+        old = x, u[:held], p[:local], t
+        result = casadi.vertsplit(peer_type.derivative(*old))
+        for device, force in zip(devices.values(), casadi.vertsplit(u[held:]), strict=True):
+            result[device.velocity] += device.symbolic(*old) * force
+        return casadi.vertcat(*result)
+
+    larger = replace(
+        peer_type, parameters=(*peer_type.parameters, *devices), holds=(*peer_type.holds, *holds)
+    )
+    whole = rewritten(larger, peer_type, lambda x, p: x, rates)
+    clock, inputs = whole.clocks[fastest], whole.clocks[fastest].tick.sx_in()
+    value = casadi.vertcat(clock.tick(*inputs), inputs[-2][local:])
+    tick = casadi.Function(before.tick.name(), inputs, [value], before.tick.name_in(), before.tick.name_out())
+    units = (*clock.units, *("N" for _ in devices))
+    clock = replace(clock, tick=tick, outputs=(*clock.outputs, *devices), units=units)
+    clocks = (*whole.clocks[:fastest], clock, *whole.clocks[fastest + 1 :])
+    return replace(whole, clocks=clocks)

@@ -1,0 +1,262 @@
+"""Several peers in one C text with the packets between them; or one peer with external packets.
+
+Takes: the frame plan of all peers. Gives: `CTopology`, `c_topology`, `single_peer`; `shared`; `CVariable`.
+Guarantees: time is an integer number of quanta. Simultaneous events are ordered as in all engines: sends,
+receptions, ticks. Values are read just before an instant's ticks, as in a row of `simulate`. The random
+losses and delays are those of `simulate` for the experiment's seed, and so is the packet in effect at every
+tick.
+Does not: define the simulator interface (see `fmu`).
+
+The state is one struct, `model`, without pointers, so it can be copied. A packet with a random delay is
+stored until its arrival. It takes effect if it was sent (or, by the link's setting, arrived) after the
+present one. A lost packet counts as missing from its nominal arrival. The fixed text is in the templates
+`topology.c`, `subsystem.c`, `link.c`, `delay.c`, `channel_draw.c` and `arc.h` in this folder.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+from apc.exports.c_text import memory, parameter_units
+from apc.exports.external_force import FORCE_ON
+from apc.exports.identifiers import identifier, prefixed
+from apc.exports.peer_step import (
+    MOST_RECEIVED,
+    ExportedPeer,
+    first_packet,
+    lines_of,
+    peer_of,
+    refused,
+    subsystems_of,
+)
+from apc.network.channel import stream_key
+from apc.network.packet_schedule import ArrivalProcess, arrival_process_of
+from apc.simulation.settings import Method
+from apc.simulation.simulation import SimulationPlan
+
+MOST_ARCS = 20_000  # from peer to peer in one text: each is a number of a table
+
+
+@dataclass(frozen=True, slots=True)
+class CVariable:
+    """A readable variable: its name as in `simulate`, unit, and the member of `model` that stores it.
+
+    Its `role` is "input" or "flag" (0 or 1) for external values, equal to `start` until set; "state" or
+    "parameter" for values that are `start` at time 0 unless set before; "output".
+    """
+
+    name: str
+    unit: str
+    member: str
+    role: str = "output"
+    start: float = 0.0
+
+    @property
+    def given(self) -> bool:
+        """Whether it comes from outside."""
+        return self.role in ("input", "flag")
+
+
+@dataclass(frozen=True, slots=True)
+class CLink:
+    """A link of the model, called `name` in C: its period, phase and the channels of its packets.
+
+    `ring` packets of each peer are stored; `start` (peers, channels) are the values used before the first
+    arrives. `arcs` are (sender, receiver), grouped by receiver in order of reception; `delays` are theirs, in
+    s. `arrival_process` is None for a reliable link; otherwise `key` is its random-stream key, and up to
+    `stored` packets per pair are stored.
+    """
+
+    link: str
+    name: str
+    period: int
+    phase: int
+    channels: tuple[str, ...]
+    ring: int
+    start: tuple[tuple[float, ...], ...]
+    arcs: tuple[tuple[int, int], ...]
+    delays: tuple[Fraction, ...]
+    arrival_process: ArrivalProcess | None
+    key: tuple[int, int]
+    stored: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CTopology:
+    """A model in C. Each of `peers` is its index in `codes` and its index among the peers of that code.
+
+    Without `links` received values are external inputs.
+    """
+
+    name: str
+    quantum: Fraction
+    codes: tuple[ExportedPeer, ...]
+    peers: tuple[tuple[int, int], ...]
+    links: tuple[CLink, ...]
+    variables: tuple[CVariable, ...]
+
+
+def single_peer(plan: SimulationPlan, number: int, method: Method) -> CTopology:
+    """Return one peer with its device and external packets. Raises ApcError as `peer_of`."""
+    peer = peer_of(plan, number, method)
+    variables = []
+    for line in peer.lines:
+        for k, sender in enumerate(line.senders):
+            label, member = f"{line.link}.{sender.name}", f"in0[0].{line.name}[{k}]"
+            variables += [
+                CVariable(f"{label}.{entry.name}", entry.unit, f"{member}.{entry.member}", "input", start)
+                for entry, start in zip(line.packet, sender.start, strict=True)
+            ]
+            if line.missing:
+                flag = CVariable(f"{label}.missing", "1", f"{member}.missing", "flag")
+                variables.append(flag)
+    variables += [
+        CVariable(f"{line.link}.{entry.name}", entry.unit, f"out0[0].{line.name}.{entry.member}")
+        for line in peer.sending
+        for entry in line.packet
+    ]
+    variables += _inputs_of(peer, "peer0[0]", "")
+    variables.sort(key=lambda variable: not variable.given)
+    return CTopology(peer.identifier, peer.schedule.quantum, (peer,), ((0, 0),), (), tuple(variables))
+
+
+def _inputs_of(peer: ExportedPeer, member: str, prefix: str) -> list[CVariable]:
+    """Return the readable variables of a peer that is a member of `model`."""
+    variables = []
+    for signal in peer.signals:
+        began = ("state", peer.start[signal.index[0]]) if signal.role == "state" else ()
+        local = f"{member}.{memory(peer, signal)}"
+        if not signal.name.startswith(FORCE_ON):
+            variables.append(CVariable(prefix + signal.name, signal.unit, local, *began))
+    units = parameter_units(peer)
+    for k, index in enumerate(peer.settable):
+        name, start, local = (
+            peer.peer_type.parameters[index],
+            float(peer.parameters[index]),
+            f"{member}.p[{k}]",
+        )
+        if name.startswith(FORCE_ON):
+            name = f"{FORCE_ON}{prefix}{name.removeprefix(FORCE_ON)}"
+            variables.append(CVariable(name, "N", local, "input", start))
+        else:
+            variables.append(CVariable(prefix + name, units[name], local, "parameter", start))
+    return variables
+
+
+def c_topology(plan: SimulationPlan, method: Method) -> CTopology:
+    """Return an entire model in C.
+
+    Raises
+    ------
+    ApcError
+        E960 it has too many directed peer pairs for a text; and as `peer_of`, `arrival_process_of`.
+    """
+    system, exchange = plan.system, plan.exchange
+    total = exchange.peers * (exchange.peers - 1) if any(map(exchange.is_complete, exchange.links)) else 0
+    if max(total, exchange.peers) > MOST_ARCS:
+        message = f"{exchange.peers:,} peers hear each other on {total:,} ways; {MOST_ARCS:,} fit a text of C"
+        alone = f'--peer "{exchange.peer_name(0)}"' if exchange.peers <= MOST_RECEIVED else "fewer peers"
+        raise refused(system, message, alone)
+    first = subsystems_of(plan)
+    subsystems = [*dict.fromkeys(first)]
+    # The index of a subsystem keeps `a[1]` and `A[1]` distinct, and `a_1_link_b` of a link and a peer.
+    names = [f"site{k}_{identifier(exchange.peer_name(subsystem))}" for k, subsystem in enumerate(subsystems)]
+    codes = tuple(
+        peer_of(plan, subsystem, method, name=name) for subsystem, name in zip(subsystems, names, strict=True)
+    )
+    placed: Counter[int] = Counter()
+    peers = []
+    for number in map(subsystems.index, first):
+        peers.append((number, placed[number]))
+        placed[number] += 1
+    quantum = codes[0].schedule.quantum
+    variables = [
+        variable
+        for k, (subsystem, index) in enumerate(peers)
+        for variable in _inputs_of(codes[subsystem], f"peer{subsystem}[{index}]", f"{exchange.peer_name(k)}.")
+    ]
+    variables.sort(key=lambda variable: not variable.given)
+    links = _links(plan, quantum)
+    return CTopology(identifier(system.name), quantum, codes, tuple(peers), links, tuple(variables))
+
+
+def _links(plan: SimulationPlan, quantum: Fraction) -> tuple[CLink, ...]:
+    """Return the links of a model; times count in quanta, in s."""
+    exchange, timings = plan.exchange, plan.numbers.timings
+    used: dict[str, dict[str, None]] = {}
+    arcs: dict[str, list[tuple[int, int]]] = {}
+    for peer in range(exchange.peers):
+        for line in lines_of(plan, peer)[0]:
+            used.setdefault(line.link, {}).update(dict.fromkeys(line.channels))
+            arcs.setdefault(line.link, []).extend((sender.peer, peer) for sender in line.senders)
+    clocks = {clock.name: clock for clock in plan.system.clocks}
+    links = []
+    for name, (link, channels) in zip(prefixed("link", used), used.items(), strict=True):
+        clock = clocks[exchange.links[link].clock]
+        period, phase = (int(timings[text] / quantum) for text in (clock.period, clock.phase))
+        delays = [
+            timings[exchange.delay(link, *(exchange.group_of(number) for number in arc))]
+            for arc in arcs[link]
+        ]
+        arrival_processes = [
+            (arrival_process_of(plan.system, timings, exchange, route, quantum), route)
+            for route in plan.routes
+            if route.link == link
+        ]
+        stored = max(
+            (arrival_process.stored(route) for arrival_process, route in arrival_processes), default=0
+        )
+        latest = int(max(delays, default=Fraction(0)) / quantum)
+        links.append(
+            CLink(
+                link=link,
+                name=f"sent_{name}",
+                period=period,
+                phase=phase,
+                channels=tuple(channels),
+                ring=max(latest // period + 2, stored + 1),
+                start=tuple(first_packet(plan, link, peer, [*channels]) for peer in range(exchange.peers)),
+                arcs=tuple(arcs[link]),
+                delays=tuple(delays),
+                arrival_process=arrival_processes[0][0] if arrival_processes else None,
+                key=stream_key(link, plan.system.experiment.seed, 0),
+                stored=stored,
+            )
+        )
+    return tuple(links)
+
+
+def shared(topology: CTopology) -> dict[str, Any]:
+    """Return the data of the template `topology.c`, which executes a model together with the peers' texts.
+
+    It has `static void begin(model *m)` and `static void run(model *m, long long until)`, which executes up
+    to and including the sends of an instant.
+
+    For each subsystem the data are its code, its peers' indices, and its links, each with its line and the
+    channel index of each packet entry.
+    """
+    subsystems = []
+    for s, code in enumerate(topology.codes):
+        lines = {line.link: line for line in code.lines}
+        linked = [
+            (
+                link,
+                lines[link.link],
+                [(link.channels.index(entry.name), entry.member) for entry in lines[link.link].packet],
+            )
+            for link in topology.links
+            if link.link in lines
+        ]
+        subsystems.append(
+            (code, [peer for peer, (subsystem, _) in enumerate(topology.peers) if subsystem == s], linked)
+        )
+    return {
+        "topology": topology,
+        "subsystems": subsystems,
+        "unreliable": [link for link in topology.links if link.arrival_process],
+        "quanta": lambda link: [int(delay / topology.quantum) for delay in link.delays],
+        "first": lambda link, numbers: map([item for _, item in link.arcs].index, numbers),
+    }

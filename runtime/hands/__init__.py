@@ -1,1 +1,0 @@
-"""What hands do to a scene, and what they feel."""

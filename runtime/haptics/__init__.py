@@ -1,0 +1,1 @@
+"""Human operators: transparency, passivity and norms of a model at its devices."""

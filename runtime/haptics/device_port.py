@@ -1,0 +1,172 @@
+"""Parsing of device names and frequencies.
+
+Takes: a `Model`, texts.
+Gives: `DevicePort`, `find_port`, `next_peer`; `read_frequencies`, `check_frequencies`, `ticks_in`.
+Guarantees: no aliasing: a frequency beyond half the fastest clock rate raises an error.
+Does not: check that the named part is a device.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
+from apc.compiler.language.vectors import whole_and_index
+from apc.compiler.wording import no_more
+from apc.frame.parameters import resolve
+from apc.option_value import option_value
+
+Floats = NDArray[np.float64]
+
+# The default of the highest frequency in Hz: hands sense higher ones, and act below it.
+HIGHEST = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class DevicePort:
+    """A device: its peer, counted from 0 over all groups, and the part, "" for the only one."""
+
+    peer: int
+    part: str
+
+
+_PORT = re.compile(r"(?:(?P<group>[^.\[\]]+)\[(?P<number>[0-9]{1,9})\])?\.?(?P<part>.*)\Z")
+
+
+def find_port(system: Model, text: str, option: str) -> DevicePort:
+    """Return the device of a name such as `left[1].device`.
+
+    Parameters
+    ----------
+    system
+        The compiled model.
+    text, option
+        The name, and the option with it.
+
+    Raises
+    ------
+    ApcError
+        E936 no such peer or part.
+    """
+    counts = [group.count for group in system.groups]
+    starts = np.cumsum([0, *counts]).tolist()
+    names = [group.name for group in system.groups]
+    matched = _PORT.match(text)
+    assert matched is not None
+    group, number, local = matched["group"], matched["number"], matched["part"]
+    if group is None:
+        first, _, rest = local.partition(".")
+        if first in names:
+            group, number, local = first, "1", rest
+    states = [state.name for peer_type in system.peer_types for state in peer_type.states]
+    parts = sorted({name.rpartition(".")[0] for name in states})
+    parts += sorted({name for name in states if whole_and_index(name)[1]})  # an axis of one
+    named = local if local in parts else "device" if "device" in parts else next(iter(parts), "device")
+    example = f'{option} "{names[0]}[1].{named}"'
+    if group is not None and group not in names:
+        message = f"{option}: no group of peers is called {group[:40]}"
+        hint = nearest(group, names)
+        hint = f'{option} "{hint}[{number}].{named}"' if hint else example
+        raise ApcError(Diagnostic("E936", SourceLocation(system.origin.topology), message, hint=hint))
+    index = 0 if group is None else names.index(group)
+    peer = int(number or 1)
+    if not 1 <= peer <= counts[index]:
+        example = f'{option} "{names[index]}[{counts[index]}].{named}"'
+        message = f"{option}: {names[index]} has {counts[index]:,} peers, counted from 1; there is no {peer}"
+        raise ApcError(Diagnostic("E936", SourceLocation(system.origin.topology), message, hint=example))
+    if local and local not in parts:
+        message = f"{option}: nothing that moves is called {local[:40]}"
+        hint = f'{option} "{names[index]}[{peer}].{nearest(local, parts) or named}"'
+        raise ApcError(Diagnostic("E936", SourceLocation(system.origin.topology), message, hint=hint))
+    return DevicePort(starts[index] + peer - 1, local)
+
+
+def read_frequencies(system: Model, text: str | None, low: str, high: str | None, points: int) -> Floats:
+    """Return the frequencies of the options, in Hz: a list, or points between two limits at equal ratios.
+
+    Parameters
+    ----------
+    system
+        The compiled model.
+    text
+        Frequencies with units, separated by commas, or None.
+    low, high, points
+        The range, by default up to `HIGHEST` or half the fastest clock rate, and the number of points.
+
+    Raises
+    ------
+    ApcError
+        E935 none above 0, the lowest above the highest, or no clock; those of `option_value`.
+    """
+    if text is not None:
+        texts = [part.strip() for part in text.split(",") if part.strip()]
+        values = [
+            float(option_value("--frequencies", text, subject="frequency", unit="Hz")) for text in texts
+        ]
+        return np.array(values)
+    first = float(option_value("--from", low, subject="frequency", unit="Hz"))
+    last = min(HIGHEST, _fastest(system) / 2)
+    if high is not None:
+        last = float(option_value("--to", high, subject="frequency", unit="Hz"))
+    if not 0 < first < last:
+        message = f"from {first:.6g} Hz to {last:.6g} Hz there is nothing above 0 Hz"
+        if 0 < last <= first:
+            message = f"the span from {first:.6g} Hz to {last:.6g} Hz ends before it begins"
+        hint = '--from "0.1 Hz" --to "60 Hz"'
+        if first > 0 and high is None:
+            message = f"{first:.6g} Hz is not below {last:.6g} Hz, where it ends without --to"
+            hint = f'--from "{first:.6g} Hz" --to "{_fastest(system) / 2:.6g} Hz"'
+        raise ApcError(Diagnostic("E935", SourceLocation("--from"), message, hint=hint))
+    return np.geomspace(first, last, points)
+
+
+def _fastest(system: Model) -> float:
+    """Return the rate of the fastest clock in Hz."""
+    return float(1 / _fastest_clock(system)[0])
+
+
+def _fastest_clock(system: Model) -> tuple[Fraction, Fraction]:
+    """Return the period and phase of the fastest clock in use, in seconds."""
+    timings = resolve(system).timings
+    used = {part.clock for peer_type in system.peer_types for part in peer_type.clocks} | {
+        link.clock for link in system.links
+    }
+    clocks = [clock for clock in system.clocks if clock.name in used]
+    if not clocks:
+        message = "the topology has nothing that ticks, and what is felt is told of samples and held forces"
+        hint = "a coupler with a clock, as SampledSpringDamper"
+        raise ApcError(Diagnostic("E935", SourceLocation(system.origin.topology), message, hint=hint))
+    clock = min(clocks, key=lambda clock: timings[clock.period])
+    return timings[clock.period], timings[clock.phase]
+
+
+def next_peer(system: Model, port: DevicePort) -> int:
+    """Return the peer after one, itself if it is alone."""
+    return (port.peer + 1) % sum(group.count for group in system.groups)
+
+
+def check_frequencies(system: Model, values: Floats) -> None:
+    """Raise ApcError E935 for frequencies without a response."""
+    most = _fastest(system) / 2
+    location = SourceLocation(system.origin.topology)
+    hint = f"{no_more(most)} Hz at most"
+    if not values.size or not np.isfinite(values).all() or values.min() <= 0:
+        got = "none" if not values.size else f"{values.min():.6g} Hz"
+        raise ApcError(Diagnostic("E935", location, "a frequency", "above 0 Hz", got, "0.1 Hz"))
+    if values.max() > most:
+        message = f"{values.max():.6g} Hz is beyond half the fastest clock: samples take it for a slower one"
+        raise ApcError(Diagnostic("E935", location, message, hint=hint))
+
+
+def ticks_in(system: Model, frame: float) -> list[Fraction] | None:
+    """Return the ticks of the fastest clock in a frame, None where a frame does not begin with a tick."""
+    period, phase = _fastest_clock(system)
+    if phase % period:
+        return None
+    return [number * period for number in range(round(frame / float(period)))]

@@ -1,0 +1,207 @@
+"""The receiver memory for one sender, with packets lost or delayed at random.
+
+Takes: a channel's law whose packets are independent of each other, the times of sending and of the receiving
+ticks.
+Gives: `ReceiverMemory`, `memory_of`; `arrives`, `is_memoryless`.
+Guarantees: the smallest number of stored values that distinguishes future ticks.
+Does not: handle packet contents or receivers (see `mean_dynamics`); support channels with memory (bursts), or
+reordered packets that take effect.
+
+A packet sent at s has arrived by a tick at t with probability π(t − s), and then stays in effect unless a
+later one arrives. A future tick is therefore described by the value in effect if no more packets were sent.
+Each packet enters once, at its sending, with one random arrival time:
+
+    E_t⁺ = I_t q + (1 − I_t) E_t,    E[I_t] = π(t − s),    E[I_t I_u] = π(min(t, u) − s)
+
+Ticks of which all packets sent so far have equal and fully dependent arrivals share one value.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.frame.interval_arithmetic import UNIT_ROUNDOFF, value_of
+from apc.frame.taylor_models import arithmetic_of, entrywise
+from apc.network.channel import LATEST, PARETO_SHAPE, ChannelLaw
+
+Floats = NDArray[np.float64]
+
+# A bad state after which the next is no likelier than after a good one: p + r = 1 up to rounding.
+SAME_CHANCE = 1e-15
+
+# Roundings of a probability, relative to 1: those of its law's numbers and of erfc or a power.
+CHANCE_ROUNDINGS = 8
+
+# Of a quotient of times by a jitter, which is a float: the latest packets of a table arrive all at once.
+ROUNDED = 4e-16
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReceiverMemory:
+    """The values in effect at ticks of this frame and of later ones; `old` and `chances` by value.
+
+    Value e after all packets of a frame was `old[e]` before it, one of `count` stored from earlier frames.
+    The packet of slot k replaces it with probability `chances[e, k]`, known within `uncertainties[e, k]` and
+    its rounding. Over a cell of m parameters it changes by `moves[:, e, k]` from the center to the upper side
+    of each, all probabilities in proportion. `received` is the index of the value in effect at a tick (clock,
+    index); `stored` are the indices of the values stored for the next frame, in order.
+    """
+
+    old: NDArray[np.intp]  # (n_e,)
+    chances: Floats  # (n_e, slots)
+    uncertainties: Floats  # (n_e, slots)
+    moves: Floats  # (m, n_e, slots)
+    received: Mapping[tuple[str, int], int]
+    stored: NDArray[np.intp]  # (count,)
+
+    @property
+    def count(self) -> int:
+        """The number of values stored from frame to frame."""
+        return len(self.stored)
+
+    @property
+    def slots(self) -> int:
+        """The number of packets sent in a frame."""
+        return int(self.chances.shape[1])
+
+    def uncertain(self, slot: int) -> NDArray[np.intp]:
+        """Return the values of which it is open whether a slot's packet takes their place."""
+        local = self.chances[:, slot]
+        return np.flatnonzero((local > 0) & (local < 1))
+
+    def chance(self, slot: int) -> Floats:
+        """Return the chances (2 + m, n) of a slot's uncertain values, with their radii and over a cell."""
+        index = self.uncertain(slot)
+        local, error_bound = (
+            self.chances[index, slot],
+            self.uncertainties[index, slot] + CHANCE_ROUNDINGS * UNIT_ROUNDOFF,
+        )
+        return np.concatenate([np.stack([local, error_bound]), self.moves[:, index, slot]])
+
+    def spread(self, slot: int) -> Floats:
+        """Return the covariance (2 + m, n, n) of whether a slot's packet takes the place of uncertain values.
+
+        With its radius, and over a cell: min(π, ϖ) − π ϖ of two chances, which one is the smaller being the
+        same all over the cell.
+        """
+        chance = self.chance(slot)
+        rows, columns = chance[..., :, None], chance[..., None, :]
+        least = np.where(value_of(rows) <= value_of(columns), rows, columns)
+        return np.asarray(arithmetic_of(least).subtract(least, entrywise(rows, columns)))
+
+
+def is_memoryless(law: ChannelLaw) -> bool:
+    """Return whether packet losses are independent."""
+    return abs(law.p + law.r - 1) <= SAME_CHANCE or law.one_minus_h == law.one_minus_k or law.p == 0
+
+
+def arrives(law: ChannelLaw, delay: Fraction, elapsed: Fraction, *, strictly: bool = False) -> float:
+    """Return the probability that a packet has arrived `elapsed` seconds after it was sent.
+
+    Parameters
+    ----------
+    law
+        The channel law, memoryless.
+    delay
+        The nominal delay in seconds, exact.
+    elapsed
+        Seconds since it was sent.
+    strictly
+        Whether a simultaneous arrival counts as not arrived.
+    """
+    stored = 1 - law.mean_loss
+    if elapsed < 0 or (strictly and elapsed == 0):
+        return 0.0
+    if not law.jitter:
+        return stored if elapsed > delay or (elapsed == delay and not strictly) else 0.0
+    late = float((elapsed - delay) / Fraction(law.jitter))
+    if late >= LATEST[law.distribution] * (1 - ROUNDED):
+        return stored
+    match law.distribution:
+        case "uniform":
+            share = (late + 1) / 2
+        case "normal":
+            share = math.erfc(-late / math.sqrt(2)) / 2
+        case _:
+            offset = PARETO_SHAPE / (PARETO_SHAPE - 1)
+            tail = late * 3 / 4 + offset  # as `channel.deviates`, turned around
+            share = 1 - tail**-PARETO_SHAPE if tail > 1 else 0.0
+    return stored * min(max(share, 0.0), 1.0)
+
+
+def memory_of(
+    law: ChannelLaw,
+    delay: Fraction,
+    sent: Sequence[Fraction],
+    ticks: Mapping[tuple[str, int], Fraction],
+    frame: Fraction,
+    *,
+    strictly: bool = False,
+    lost: tuple[float, ...] = (0.0,),
+) -> ReceiverMemory:
+    """Return the receiver memory for one sender.
+
+    Parameters
+    ----------
+    law, delay
+        As for `arrives`.
+    sent, ticks
+        The sending times within a frame, and the time of each receiving tick (clock, index), in seconds.
+    frame
+        The length of a frame, in seconds.
+    strictly
+        Whether a tick misses a simultaneous arrival.
+    lost
+        The error bound of the loss probability; over a cell of parameters, then its changes from the center
+        to the upper side of each.
+    """
+    assert law.trace is None, "recorded delays leave nothing to chance"
+    ahead = math.ceil(max(Fraction(law.longest), delay) / frame) + 2
+    unit = math.lcm(*(number.denominator for number in (frame, *sent, *ticks.values())))
+    length, starts = int(frame * unit), [int(number * unit) for number in reversed(sent)]
+    chance: dict[int, float] = {}
+
+    def described(time: int) -> tuple[float, ...]:
+        """Return the probability that a tick has received each packet, newest first, of all frames."""
+        values = []
+        for back in range(ahead + 1):
+            for start in starts:
+                elapsed = time - start + back * length
+                if elapsed not in chance:
+                    chance[elapsed] = arrives(law, delay, Fraction(elapsed, unit), strictly=strictly)
+                values.append(chance[elapsed])
+        return tuple(values)
+
+    slots, instants = len(sent), sorted({int(tick * unit) for tick in ticks.values()})
+    keys: dict[tuple[float, ...], int] = {}
+    of_time: dict[int, int] = {}
+    later: list[int] = []
+    for number in range(ahead + 1):
+        for time in instants:
+            index = keys.setdefault(described(time + number * length), len(keys))
+            if number:
+                later.append(index)
+            else:
+                of_time[time] = index
+    numbers = list(dict.fromkeys(later))
+    # A value kept is called by what is known of it a frame later: of no packet of that frame yet.
+    listed = list(keys)
+    known = {listed[index][: len(listed[index]) - slots]: number for number, index in enumerate(numbers)}
+    old = [known[key[slots:]] for key in listed]
+    chances = np.array([key[:slots][::-1] for key in listed])
+    uncertainty, *moves = (value / (1 - law.mean_loss) if value else 0.0 for value in lost)
+    return ReceiverMemory(
+        old=np.array(old, np.intp),
+        chances=chances,
+        uncertainties=chances
+        * (uncertainty * (1 + 8 * UNIT_ROUNDOFF) + 4 * UNIT_ROUNDOFF * sum(map(abs, moves))),
+        moves=np.array([chances * -move for move in moves]).reshape(len(moves), *chances.shape),
+        received={tick: of_time[int(time * unit)] for tick, time in ticks.items()},
+        stored=np.array(numbers, np.intp),
+    )

@@ -1,0 +1,289 @@
+"""Statistics of a packet recording and the link parameters fitted to it.
+
+Takes: recorded delays. Gives: `LinkFit`, `fit_recording`, `fit_delays`, `Share`, `Law`.
+Guarantees: a share has a 95 % confidence interval (Clopper and Pearson 1934). `limitations` lists the
+properties of the recording that the link's keys cannot represent.
+Does not: analyze the stability of a model (see `mean_square`).
+
+Losses are netem's simple `gemodel`: all packets are lost in the bad state, none in the good state. Hence p is
+the probability of a loss after an arrival, and r that of an arrival after a loss; independent losses have r =
+1 − p. The jitter distribution selected has the smallest Kolmogorov-Smirnov distance to the recorded delays,
+with their median and quartiles.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.errors import SourceLocation
+from apc.compiler.language.ping_recordings import HALVED
+from apc.compiler.language.recordings import read_trace
+from apc.network.channel import LATEST, deviates
+from apc.result import Result
+
+Floats = NDArray[np.float64]
+
+CONFIDENCE = 0.95
+# Losses are reported as dependent if independent losses would show the same dependence in less than one
+# recording in a thousand.
+CHANCE = 1e-3
+# Times the root of their number: how far packets drawn from a distribution are from it once in a thousand
+# times.
+MISFIT = 1.95
+# The shares of packets for which a delay quantile is reported; each requires this many later packets.
+QUANTILES = (0.5, 0.95, 0.99, 0.999)
+LATER = 5
+QUARTILES = (0.25, 0.5, 0.75)
+# Points at which the distribution of a jitter is put together: an error of its distance of 1/POINTS.
+POINTS = 1 << 14
+
+
+NO_END = "no burst of losses ended within the recording: how long they last is not known"
+
+
+@dataclass(frozen=True, slots=True)
+class Share:
+    """A share of `of` packets, and the `interval` that its probability lies in."""
+
+    count: int
+    of: int
+    interval: tuple[float, float]
+
+    @property
+    def value(self) -> float:
+        """The share, 0 of none."""
+        return self.count / self.of if self.of else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Law:
+    """The keys of a link, in seconds: `delay`, `jitter` (0 if there is none) and its `distribution`.
+
+    `distance` is the largest difference between the shares of packets that it and the recording have below a
+    delay.
+    """
+
+    delay: float
+    jitter: float
+    distribution: str
+    distance: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinkFit(Result):
+    """Statistics of a packet recording; times in seconds.
+
+    `lost`, `p` (a lost packet follows one that arrived) and `r` are shares; `bursty` is
+    whether losses cluster significantly, `bursts` and `longest_burst` count them. `quantiles` has pairs
+    (share of packets, delay not exceeded); `correlation` is the lag-one autocorrelation of the delays (NaN
+    with too few packets). `reordered` is the number of reordered packets, None with an unknown interval;
+    `delays` (n,) are all, infinite for a lost packet.
+    """
+
+    shown_by: ClassVar[str] = "network_output:recording"
+
+    file: str
+    program: str
+    packets: int
+    interval: float
+    limitations: tuple[str, ...]
+    lost: Share
+    p: Share
+    r: Share
+    bursty: bool
+    bursts: int
+    longest_burst: int
+    shortest: float
+    mean: float
+    longest: float
+    std: float
+    quantiles: tuple[tuple[float, float], ...]
+    correlation: float
+    reordered: int | None
+    distribution: Law | None
+    delays: Floats
+
+
+def fit_recording(path: str | Path, interval: float | None = None) -> LinkFit:
+    """Return the statistics of a packet recording read from a file.
+
+    Parameters
+    ----------
+    path
+        A CSV file with a column `delay [ms]`, or the output of ping or `irtt client -o`.
+    interval
+        The sending interval in seconds, used if the file does not contain it.
+
+    Raises
+    ------
+    ApcError
+        E701 to E703, as for a link's `trace`.
+    """
+    trace = read_trace(Path(path), SourceLocation(str(path)))
+    between = trace.interval if interval is None else interval
+    return fit_delays(trace.delays, str(path), program=trace.program, interval=between)
+
+
+def fit_delays(delays: Floats, name: str, *, program: str = "", interval: float = math.nan) -> LinkFit:
+    """Return the statistics of recorded delays.
+
+    Parameters
+    ----------
+    delays
+        The delay of each packet (n,) in seconds, infinite for a lost packet.
+    name, program
+        The name of the recording, and the program that recorded round trips, if any.
+    interval
+        The sending interval in seconds, NaN if unknown.
+    """
+    gone = np.isinf(delays)
+    arrived = delays[~gone]
+    after, before = gone[1:], gone[:-1]
+    p = _share(after & ~before, ~before)
+    r = _share(~after & before, before)
+    lost = _share(gone, np.ones_like(gone))
+    bursty = _follow(p, r) and r.count > 0
+    correlation = _correlation(delays)
+    law = _law(arrived)
+    runs = np.diff(np.flatnonzero(np.diff(np.concatenate([[False], gone, [False]]))))[::2]
+    return LinkFit(
+        file=name,
+        program=program,
+        packets=len(delays),
+        interval=interval,
+        limitations=(
+            *_limitations(program, len(delays), law, correlation, interval),
+            *([NO_END] if gone.any() and before.any() and not r.count else []),
+        ),
+        lost=lost,
+        p=p,
+        r=r,
+        bursty=bursty,
+        bursts=len(runs),
+        longest_burst=int(runs.max(initial=0)),
+        shortest=float(arrived.min(initial=math.inf)),
+        mean=float(arrived.mean()) if len(arrived) else math.nan,
+        longest=float(arrived.max(initial=-math.inf)),
+        std=float(arrived.std(ddof=1)) if len(arrived) > 1 else math.nan,
+        quantiles=tuple(
+            (share, _quantile(arrived, share)) for share in QUANTILES if len(arrived) * (1 - share) >= LATER
+        ),
+        correlation=correlation,
+        reordered=None if math.isnan(interval) else _overtaken(delays, interval),
+        distribution=law,
+        delays=delays,
+    )
+
+
+def _limitations(
+    program: str, packets: int, law: Law | None, correlation: float, between: float
+) -> tuple[str, ...]:
+    """Return the properties that the link's keys omit or assume."""
+    remarks = [HALVED] if program else []
+    if law is None:
+        return (*remarks, "every packet was lost: nothing is known of delays")
+    if correlation:
+        remarks.append(
+            f"delays follow one another (correlation {correlation:.2f} from packet to packet), and a jitter "
+            "is drawn for each packet on its own; a trace has them as they were"
+        )
+    if law.distance > MISFIT / math.sqrt(packets):
+        remarks.append(
+            "delays are spread as none of the distributions that a jitter can have; a trace has them as they "
+            "were"
+        )
+    if not math.isnan(between):
+        remarks.append(
+            f"a packet was recorded every {between * 1e3:.4g} ms: a link sends at its own clock, and a trace "
+            "gives it a row a packet, whatever time lay between them"
+        )
+    return tuple(remarks)
+
+
+def _share(these: NDArray[np.bool_], among: NDArray[np.bool_]) -> Share:
+    """Return a share with its interval."""
+    from scipy.stats import beta
+
+    count, of = int(these.sum()), int(among.sum())
+    rest = (1 - CONFIDENCE) / 2
+    low = float(beta.ppf(rest, count, of - count + 1)) if count else 0.0
+    high = float(beta.ppf(1 - rest, count + 1, of - count)) if count < of else 1.0
+    return Share(count, of, (low, high))
+
+
+def _follow(bad: Share, good: Share) -> bool:
+    """Return whether losses cluster significantly (Fisher's exact test)."""
+    from scipy.stats import fisher_exact
+
+    table = [[good.of - good.count, good.count], [bad.count, bad.of - bad.count]]
+    return bool(fisher_exact(table, alternative="greater").pvalue < CHANCE)
+
+
+def _correlation(delays: Floats) -> float:
+    """Return the correlation of consecutive delays; 0 where it is not significant."""
+    both = np.isfinite(delays[1:]) & np.isfinite(delays[:-1])
+    first, second = delays[:-1][both], delays[1:][both]
+    if len(first) < 10 or not first.std() or not second.std():
+        return 0.0
+    value = float(np.corrcoef(first, second)[0, 1])
+    # Of independent numbers it has the standard deviation 1/√n; 3.3 of these are left once in a thousand.
+    return value if abs(value) > 3.3 / math.sqrt(len(first)) else 0.0
+
+
+def _quantile(arrived: Floats, share: float) -> float:
+    return float(np.quantile(arrived, share, method="inverted_cdf"))
+
+
+def _overtaken(delays: Floats, interval: float) -> int:
+    """Return the number of reordered packets."""
+    arrivals = np.arange(len(delays)) * interval + delays
+    soonest_later = np.minimum.accumulate(arrivals[::-1])[::-1]
+    return int(np.sum(np.isfinite(arrivals[:-1]) & (arrivals[:-1] > soonest_later[1:])))
+
+
+def _law(arrived: Floats) -> Law | None:
+    """Return the law of a jitter nearest to delays; None of none."""
+    if not len(arrived):
+        return None
+    mean, deviation = float(arrived.mean()), float(arrived.std(ddof=1)) if len(arrived) > 1 else 0.0
+    if deviation <= 1e-12 * mean:
+        return Law(mean, 0.0, "uniform", 0.0)
+    laws = []
+    # All pairs that a normal number is drawn from, and the same number twice for the others.
+    evenly = (np.arange(POINTS) + 0.5) / POINTS
+    quartiles = [_quantile(arrived, share) for share in QUARTILES]
+    for distribution in LATEST:
+        unit = _unit(distribution, evenly)
+        low, middle, high = (_quantile(unit, share) for share in QUARTILES)
+        if quartiles[2] > quartiles[0]:  # robust against a few very late packets
+            jitter = (quartiles[2] - quartiles[0]) / (high - low)
+            delay = quartiles[1] - jitter * middle
+        else:
+            jitter = deviation / float(unit.std())
+            delay = mean - jitter * float(unit.mean())
+        if delay >= 0:
+            made = np.sort(np.maximum(delay + jitter * unit, 0.0))
+            laws.append(Law(delay, jitter, distribution, _distance(np.sort(arrived), made)))
+    return min(laws, key=lambda law: law.distance)
+
+
+def _unit(distribution: str, evenly: Floats) -> Floats:
+    """Return numbers spread as a distribution's are, rising or falling."""
+    if distribution == "normal":
+        from scipy.special import ndtri
+
+        return np.asarray(ndtri(evenly), dtype=np.float64)
+    return deviates(distribution, evenly, evenly)
+
+
+def _distance(values: Floats, other: Floats) -> float:
+    """Return Kolmogorov and Smirnov's distance of two sorted samples."""
+    where = np.concatenate([values, other])
+    shares = [np.searchsorted(sample, where, side="right") / len(sample) for sample in (values, other)]
+    return float(np.abs(shares[0] - shares[1]).max())

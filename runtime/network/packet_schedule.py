@@ -1,0 +1,446 @@
+"""Reception times of all packets on unreliable links: the packet in effect at each tick and directed link.
+
+Takes: a `Model` with its parameter values, the communication graph, the frame and the quantum of its
+schedules, a seed.
+Gives: `Route`, `routes_of`; `ArrivalProcess`, `arrival_process_of`; `Timetable`, `Listener`,
+`DeliveredPackets`, `START`; `instant_of`.
+Guarantees: without loss and jitter the packet in effect at a tick equals that of `scheduling`. All clocks of
+a receiver observe the same arrivals of a directed link. The result is independent of the partition of time
+into calls. Memory use is bounded in time.
+Does not: transport values. Reliable links are not included and cost nothing here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import Link, Model, PeerType
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
+from apc.frame.communication_graph import CommunicationGraph
+from apc.memory import refuse_beyond
+from apc.network.channel import ChannelLaw, PacketSource, channel_law
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+# Largest number of directed peer pairs, each with packets in transit, and the bytes stored per pair.
+MOST_ARCS, ARC_BYTES = 2_000_000, 200
+PACKET = 100  # bytes per packet in transit, including NumPy's copies
+
+START = -1  # the "packet" before the first: the sender's start values
+
+# Arrival times are resolved to this part of a quantum; all tick times are integer quanta. A delay of an
+# integer number of quanta, given as a float of seconds, is then represented exactly.
+FINENESS = 2**20
+# The largest delay or frame in quanta: integers of their parts would overflow beyond it.
+LONGEST = 2**40
+
+
+def instant_of(seconds: float, quantum: Fraction) -> Fraction:
+    """Return the time given as a float of seconds, rounded to the resolution of arrival times."""
+    return round(Fraction(seconds) / quantum * FINENESS) * quantum / FINENESS
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Route:
+    """The samples received over one unreliable link at the ticks of one clock.
+
+    `pairs` (M, 2) are the peers (sender, receiver), counted from 0, receiver by receiver, `weights` (M,) the
+    graph's; `longest` is the link's longest time in seconds from a packet's sample to its arrival. A frame
+    has `ticks` ticks of the clock and `slots` sending slots of the link; packets are stored for `frames`
+    frames. `zero` is whether the receiver substitutes its own value for a missing sample.
+    """
+
+    link: str
+    clock: str
+    pairs: Integers
+    weights: Floats
+    longest: float
+    ticks: int
+    slots: int
+    frames: int
+    zero: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DeliveredPackets:
+    """The packets in effect at the ticks on M directed links.
+
+    `packets` (ticks, M) are the numbers of the packets in effect, counted from 0, `START` for the start
+    values. `missing` (ticks, M) marks detected losses: from the nominal arrival tick of a lost packet until a
+    packet sent after it is in effect.
+    """
+
+    packets: Integers
+    missing: Flags
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArrivalProcess:
+    """The arrival process of a route's directed links; times in quanta of `quantum` seconds.
+
+    `law` is the channel law common to all directed links except for their `delays` (M,) in seconds; `nominal`
+    (M,) are these delays in quanta. Packet k is sent at phase + k*period, tick k is at tick_phase +
+    k*tick_period. `newest` as in `Listener`.
+    """
+
+    law: ChannelLaw
+    delays: Floats
+    nominal: Integers
+    phase: int
+    period: int
+    tick_phase: int
+    tick_period: int
+    quantum: Fraction
+    newest: bool
+
+    def stored(self, route: Route) -> int:
+        """Return a bound on the packets sent before the oldest is received or counted as lost."""
+        return route.slots * (self.latest(route) // (route.ticks * self.tick_period) + 3)
+
+    def latest(self, route: Route) -> int:
+        """Return the time in quanta within which a packet of a directed link has arrived or is lost."""
+        return math.ceil(max(route.longest, float(self.delays.max(initial=0.0))) / float(self.quantum)) + 1
+
+
+def arrival_process_of(
+    system: Model,
+    timings: Mapping[str, Fraction],
+    exchange: CommunicationGraph,
+    route: Route,
+    quantum: Fraction,
+) -> ArrivalProcess:
+    """Return the arrival process of a route.
+
+    Parameters
+    ----------
+    system
+        The model, with the parameter values to use (see `overrides.apply`).
+    timings
+        Seconds by the name of the timing.
+    exchange
+        The communication graph.
+    route
+        The route.
+    quantum
+        The time step in seconds: every period, phase and delay in use is an integer multiple of it.
+
+    Raises
+    ------
+    ApcError
+        E891 a group sets its own value for a link parameter; E892 too many packets in transit, or times too
+        long for so small a quantum.
+    """
+    link = exchange.links[route.link]
+    assert link.channel is not None
+    grids = {
+        clock.name: (timings[clock.phase] / quantum, timings[clock.period] / quantum)
+        for clock in system.clocks
+    }
+    groups, of_coupling_term = _groups(exchange, route.pairs)
+    late = [timings[exchange.delay(link.name, *pair)] for pair in groups]
+    arrival_process = ArrivalProcess(
+        law=channel_law(system, link, timings[link.delay]),
+        delays=np.array([float(number) for number in late])[of_coupling_term],
+        nominal=np.array([int(number / quantum) for number in late], np.int64)[of_coupling_term],
+        phase=int(grids[link.clock][0]),
+        period=int(grids[link.clock][1]),
+        tick_phase=int(grids[route.clock][0]),
+        tick_period=int(grids[route.clock][1]),
+        quantum=quantum,
+        newest=link.channel.reorder == "newest",
+    )
+    _check_arrival_process(system, route, arrival_process)
+    return arrival_process
+
+
+def _check_arrival_process(system: Model, route: Route, arrival_process: ArrivalProcess) -> None:
+    """Refuse a model with too many packets in transit, or with times of too many quanta."""
+    latest, arcs = arrival_process.latest(route), len(route.pairs)
+    if max(latest, route.ticks * arrival_process.tick_period) > LONGEST:
+        message = (
+            f"{route.link} is unreliable, and all its times are counted in parts of "
+            f"{float(arrival_process.quantum):.6g} s, of which periods, phases and delays are whole "
+            "multiples: at most "
+            f"{LONGEST} of them"
+        )
+        raise ApcError(
+            Diagnostic(
+                "E892", SourceLocation(system.origin.topology), message, hint="periods and delays in whole µs"
+            )
+        )
+    packets = arrival_process.stored(route) * arcs
+    message = f"{packets:,} packets kept on {arcs:,} ways of {route.link}, which is unreliable,"
+    hint = "a shorter delay or jitter, fewer peers, or graph: ring"
+    refuse_beyond(
+        ARC_BYTES * arcs + PACKET * packets, "E892", SourceLocation(system.origin.topology), message, hint
+    )
+
+
+class Listener:
+    """The samples received on a set of directed links at successive ticks; time only advances."""
+
+    def __init__(
+        self, source: PacketSource, *, phase: int, period: int, delay: int, quantum: Fraction, newest: bool
+    ) -> None:
+        """Start before the first packet.
+
+        Parameters
+        ----------
+        source
+            The packets.
+        phase, period
+            Packet k of every directed link is sent at phase + k*period, in quanta.
+        delay
+            The nominal delay in quanta.
+        quantum
+            Seconds per quantum; all ticks are at integer multiples.
+        newest
+            Whether the most recently sent packet is in effect. Otherwise the most recently arrived one is (of
+            simultaneous arrivals, the one sent last).
+        """
+        self.source = source
+        self.phase = phase
+        self.period = period
+        self.delay = delay
+        self.quantum = float(quantum)
+        self.newest = newest
+        self._effective = np.full(source.arcs, START, np.int64)
+        self._gap = np.full(source.arcs, START, np.int64)  # the newest lost packets that should be there
+        # Lost packets before their nominal arrival: directed link and packet number.
+        self._due = np.zeros((2, 0), np.int64)
+        # Packets in transit: directed link, number, first tick time of reception in quanta, fraction of a
+        # quantum between arrival and that time.
+        self._in_flight = np.zeros((4, 0), np.int64)
+
+    @property
+    def stored(self) -> int:
+        """The number of packets that may still take effect or be found missing, on all directed links."""
+        return self._in_flight.shape[1] + self._due.shape[1]
+
+    def receive(self, ticks: Integers) -> DeliveredPackets:
+        """Return the packets in effect at the ticks (n,), in quanta, ascending, after all earlier ticks."""
+        if not len(ticks):
+            nothing = (0, self.source.arcs)
+            return DeliveredPackets(np.zeros(nothing, np.int64), np.zeros(nothing, np.bool_))
+        self._send_until(int(ticks[-1]))
+        arcs, numbers, observed, _ = self._in_flight
+        arrived = observed <= ticks[-1]
+        packets = self._in_effect(ticks, self._in_flight[:, arrived])
+        missing = self._gaps(ticks) > packets
+        self._effective = packets[-1].copy()
+        keep = ~arrived & (numbers > self._effective[arcs]) if self.newest else ~arrived
+        self._in_flight = self._in_flight[:, keep]
+        return DeliveredPackets(packets, missing)
+
+    def _send_until(self, tick: int) -> None:
+        """Send the packets up to a time; later packets cannot have arrived."""
+        first = self.source.used
+        count = max((tick - self.phase) // self.period + 1 - first, 0)
+        delays = self.source.take(count) / self.quantum
+        lost = ~(delays < LONGEST)
+        fine = np.rint(np.where(lost, 0.0, delays) * FINENESS).astype(np.int64)
+        arcs, numbers = np.indices(delays.shape)
+        numbers += first
+        observed = self.phase + self.period * numbers - (-fine // FINENESS)
+        before = -fine % FINENESS
+        sent = np.stack([arcs, numbers, observed, before])
+        self._due = np.concatenate([self._due, sent[:2, lost]], axis=1)
+        self._in_flight = np.concatenate([self._in_flight, sent[:, ~lost]], axis=1)
+
+    def _in_effect(self, ticks: Integers, arrived: Integers) -> Integers:
+        """Return the packets (n, M) sent last, or arrived last, of those that have arrived."""
+        arcs, numbers, observed, before = arrived
+        if self.newest:
+            return _highest(ticks, arcs, observed, numbers, self._effective)
+        order = np.lexsort((numbers, -before, observed))
+        rank = np.arange(len(order))
+        latest = _highest(ticks, arcs[order], observed[order], rank, np.full(self.source.arcs, -1))
+        return np.where(latest < 0, self._effective, np.append(numbers[order], START)[latest])
+
+    def _gaps(self, ticks: Integers) -> Integers:
+        """Return the newest lost packets (n, M) that should be there."""
+        arcs, numbers = self._due
+        when = self.phase + self.period * numbers + self.delay
+        due = when <= ticks[-1]
+        gaps = _highest(ticks, arcs[due], when[due], numbers[due], self._gap)
+        self._due, self._gap = self._due[:, ~due], gaps[-1].copy()
+        return gaps
+
+
+class Timetable:
+    """The packets of all unreliable links of a model, from time 0 on; time only goes forward."""
+
+    def __init__(
+        self,
+        routes: Sequence[Route],
+        arrival_processes: Sequence[ArrivalProcess],
+        *,
+        seed: int = 0,
+        run: int = 0,
+    ) -> None:
+        """Start at time 0.
+
+        Parameters
+        ----------
+        routes, arrival_processes
+            The unreliable links (see `routes_of`), and the arrival process of each (see
+            `arrival_process_of`).
+        seed, run
+            The seed of the experiment and the index of the run.
+        """
+        self.routes, self._noises = tuple(routes), tuple(arrival_processes)
+        self._listeners = [
+            _listen(route, arrival_process, seed, run)
+            for route, arrival_process in zip(routes, arrival_processes, strict=True)
+        ]
+        self._now = 0
+
+    def take(self, until: int) -> tuple[DeliveredPackets, ...]:
+        """Return the packets in effect at each route's ticks, from the last call until `until` in quanta."""
+        observed = []
+        for route, arrival_process, listeners in zip(self.routes, self._noises, self._listeners, strict=True):
+            phase, period = arrival_process.tick_phase, arrival_process.tick_period
+            first = -(-(self._now - phase) // period)
+            ticks = phase + period * np.arange(max(first, 0), -(-(until - phase) // period), dtype=np.int64)
+            packets = np.empty((len(ticks), len(route.pairs)), np.int64)
+            missing = np.empty(packets.shape, np.bool_)
+            for arcs, listener in listeners:
+                received = listener.receive(ticks)
+                packets[:, arcs], missing[:, arcs] = received.packets, received.missing
+            observed.append(DeliveredPackets(packets, missing))
+        self._now = until
+        return tuple(observed)
+
+
+def _listen(
+    route: Route, arrival_process: ArrivalProcess, seed: int, run: int
+) -> list[tuple[Integers, Listener]]:
+    """Return a listener per distinct delay of a route, with the indices of its directed links."""
+    pairs = []
+    for nominal in np.unique(arrival_process.nominal).tolist():
+        arcs = np.flatnonzero(arrival_process.nominal == nominal)
+        law = replace(arrival_process.law, delay=float(arrival_process.delays[arcs[0]]))
+        listener = Listener(
+            PacketSource(law, route.link, route.pairs[arcs], seed=seed, run=run),
+            phase=arrival_process.phase,
+            period=arrival_process.period,
+            delay=nominal,
+            quantum=arrival_process.quantum,
+            newest=arrival_process.newest,
+        )
+        pairs.append((arcs, listener))
+    return pairs
+
+
+def routes_of(
+    system: Model, timings: Mapping[str, Fraction], exchange: CommunicationGraph, frame_s: Fraction
+) -> tuple[Route, ...]:
+    """Return the routes: one per unreliable link and per clock that receives from it.
+
+    Parameters
+    ----------
+    system, timings, exchange
+        As in `arrival_process_of`.
+    frame_s
+        The length of a frame in seconds.
+
+    Raises
+    ------
+    ApcError
+        E891 a group sets its own value for a link parameter; E892 too many directed peer pairs.
+    """
+    unreliable = [link for link in system.links if link.channel is not None]
+    result = [_routes_over(system, timings, exchange, frame_s, link) for link in unreliable]
+    return tuple(route for routes in result for route in routes)
+
+
+def _routes_over(
+    system: Model,
+    timings: Mapping[str, Fraction],
+    exchange: CommunicationGraph,
+    frame_s: Fraction,
+    link: Link,
+) -> list[Route]:
+    """Return a link's routes: the directed links grouped by the clock of their receivers."""
+    peers, channel = exchange.peers, link.channel
+    assert channel is not None, f"{link.name} is reliable"
+    if link.graph.shape == "complete" and peers * (peers - 1) > MOST_ARCS:
+        message = (
+            f"{link.name} is unreliable, and {peers} peers that all hear each other are "
+            f"{peers * (peers - 1)} ways with packets of their own; at most {MOST_ARCS} can be followed"
+        )
+        raise ApcError(
+            Diagnostic("E892", SourceLocation(system.origin.topology), message, hint="graph: ring")
+        )
+    peer_type_of = np.repeat([group.peer_type for group in system.groups], np.diff(exchange.starts))
+    pairs, weights = exchange.arcs(link.name)
+    order = np.lexsort((pairs[:, 0], pairs[:, 1]))  # receiver by receiver
+    pairs, weights = pairs[order], weights[order]
+    sends = np.array(
+        [any(send.link == link.name for send in peer_type.sends) for peer_type in system.peer_types]
+    )
+    used = {}
+    for clock in system.clocks:
+        receives = np.array([_receives(peer_type, link.name, clock.name) for peer_type in system.peer_types])
+        arcs = sends[peer_type_of[pairs[:, 0]]] & receives[peer_type_of[pairs[:, 1]]]
+        if arcs.any():
+            used[clock.name] = pairs[arcs], weights[arcs]
+    groups = {pair for some, _ in used.values() for pair in _groups(exchange, some)[0]}
+    delays = {timings[exchange.delay(link.name, *pair)] for pair in groups}
+    longest = max((channel_law(system, link, delay).longest for delay in delays), default=0.0)
+    periods = {clock.name: timings[clock.period] for clock in system.clocks}
+    return [
+        Route(
+            link=link.name,
+            clock=clock,
+            pairs=some,
+            weights=local,
+            longest=longest,
+            ticks=int(frame_s / periods[clock]),
+            slots=int(frame_s / periods[link.clock]),
+            # A packet is received at most one tick after it arrives, and a clock ticks in every frame.
+            frames=math.ceil(longest / float(frame_s)) + 1,
+            zero=channel.on_loss == "zero",
+        )
+        for clock, (some, local) in used.items()
+    ]
+
+
+def _receives(peer_type: PeerType, link: str, clock: str) -> bool:
+    ticking = [partition for partition in peer_type.clocks if partition.clock == clock]
+    return any(receive.link == link for partition in ticking for receive in partition.receives)
+
+
+def _groups(exchange: CommunicationGraph, pairs: Integers) -> tuple[list[tuple[int, int]], Integers]:
+    """Return the different pairs of groups of pairs of peers, and which of them each pair (M,) is."""
+    groups = np.searchsorted(exchange.starts, pairs, side="right") - 1
+    count = len(exchange.groups)
+    distinct, of_pair = np.unique(groups[:, 0] * count + groups[:, 1], return_inverse=True)
+    return [divmod(item, count) for item in distinct.tolist()], of_pair
+
+
+def _highest(ticks: Integers, arcs: Integers, when: Integers, ranks: Integers, first: Integers) -> Integers:
+    """Return, for each tick and directed link, the highest rank of the events up to that tick.
+
+    Parameters
+    ----------
+    ticks
+        The ticks (n,), rising.
+    arcs, when, ranks
+        The events (K,): the index among the M directed links, the time (not later than the last tick), the
+        rank.
+    first
+        The ranks (M,) at the beginning.
+    """
+    indices = np.full((len(ticks), len(first)), START, np.int64)
+    indices[0] = first
+    np.maximum.at(indices.reshape(-1), np.searchsorted(ticks, when) * len(first) + arcs, ranks)
+    return np.maximum.accumulate(indices, axis=0)

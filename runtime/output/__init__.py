@@ -1,0 +1,1 @@
+"""The output of results: text, plain data, tables and pictures."""

@@ -1,0 +1,201 @@
+"""The forms that all results share: plain data, JSON, notes, labelled lines and tables.
+
+Takes: frozen values, texts.
+Gives: `Plain`, `document`, `record`, `picked`, `reached`, `json_text`; `radius_text`, `quantity`,
+`uncertain`, `span`, `axis_label`, `listed`; `Lines`, `notes`, `sentences`, `labelled`, `table`; `MEANT`.
+Guarantees: a document is made of what JSON has words for; the same value gives the same text; a line is at
+most 80 columns wide where its words allow it.
+Does not: know a result.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from fractions import Fraction
+from typing import Any
+
+from apc.compiler.wording import measured, with_unit, wrapped
+from apc.frame.display_units import as_shown
+from apc.lazy import LazyTuple
+from apc.result import Result
+from apc.verdict import Note, Sentence, Term
+
+# The stability criterion by a criterion, where it is not that motions die out.
+MEANT = {
+    "mean-square": "judged in mean square, over the network as it is",
+    "passive": "judged with every passive hand at every device",
+}
+
+# Plain data, ready for JSON.
+Plain = dict[str, Any]
+
+# A text as its result has it: line by line, each at most 80 columns wide.
+Lines = Iterator[str]
+
+# A number nearer to 1 is printed by its distance from 1, with this number of digits at most.
+NEAR, REPORTED = 1e-6, 1e-4
+
+LINEARIZED = ", linearized at its start"
+
+
+def document(value: Any) -> Any:
+    """Return a value as plain data: a result by its own document, a complex number as a pair, no NaN.
+
+    Parameters
+    ----------
+    value
+        Dataclasses, mappings, sequences and arrays of numbers, texts and None.
+    """
+    if isinstance(value, Term | Sentence):
+        return str(value)
+    if value is None or isinstance(value, str | int):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, complex):
+        return document((value.real, value.imag))
+    if isinstance(value, Fraction):
+        return float(value)
+    if isinstance(value, Result):
+        return value.to_dict()
+    if is_dataclass(value):
+        return record(value)
+    if isinstance(value, Mapping):
+        return {key: document(item) for key, item in value.items() if item is not ...}
+    if isinstance(value, tuple | list | LazyTuple):
+        return [document(item) for item in value]
+    return document(value.tolist())  # of an array
+
+
+def record(value: Any, instead: Mapping[str, Any] | None = None) -> Plain:
+    """Return a dataclass as plain data, by its shown fields.
+
+    Parameters
+    ----------
+    value
+        The dataclass.
+    instead
+        Replacements of fields, or additional ones; `...` omits a field.
+    """
+    shown = [field.name for field in fields(value) if field.repr]  # there are as many modes as states
+    other = instead or {}
+    stored = {name: other[name] if name in other else getattr(value, name) for name in [*shown, *other]}
+    plain: Plain = document(stored)
+    return plain
+
+
+def picked(value: Any, *names: str) -> Plain:
+    """Return some fields and properties of a value as plain data."""
+    return {name: document(getattr(value, name)) for name in names}
+
+
+def reached(value: Any, path: str) -> Any:
+    """Return the value at a path of attributes and indices, such as "a.b.0"; None beyond a None."""
+    for name in path.split("."):
+        if value is None:
+            return None
+        value = value[int(name)] if name.isdigit() else getattr(value, name)
+    return value
+
+
+def json_text(result: Any, *, indent: int | None = 2) -> str:
+    """Return plain data as one JSON document, on one line if `indent` is None.
+
+    JSON has no non-finite numbers; null replaces them, as in `document`.
+    """
+    return json.dumps(document(result), ensure_ascii=False, allow_nan=False, indent=indent)
+
+
+def radius_text(radius: float, error: float, radius_excess: tuple[float, float] | None = None) -> str:
+    """Return a spectral radius with its error: near 1 by how far it is from it, "1 − 3.2e-15 ± 9e-16".
+
+    Parameters
+    ----------
+    radius, error
+        The radius and its error.
+    radius_excess
+        Its difference from 1, lower and upper bound, if known more accurately.
+    """
+    low, high = radius_excess or (radius - 1 - error, radius - 1 + error)
+    away, off = (low + high) / 2, (high - low) / 2
+    if not off < abs(away):
+        return measured(radius, error)
+    if abs(away) >= NEAR:
+        return measured(1 + away, off) if abs(radius - 1) <= error else measured(radius, error)
+    return f"1 {'−' if away < 0 else '+'} {measured(abs(away), max(off, abs(away) * REPORTED))}"
+
+
+def quantity(value: float, unit: str, digits: int = 6) -> str:
+    """Return an SI number with `digits` digits in its display unit."""
+    by, shown = as_shown(value, unit)
+    return with_unit(f"{value * by:.{digits}g}", shown)
+
+
+def uncertain(value: float, error: float, unit: str) -> str:
+    """Return a number in SI with its error, in the unit in which people are shown it."""
+    by, shown = as_shown(value, unit)
+    return measured(value * by, error * by, shown) if error else f"{quantity(value, unit, 15)}, exact"
+
+
+def span(low: float, high: float, unit: str) -> str:
+    """Return a range between two numbers in SI, with one unit; format as in `quantity`."""
+    by, shown = as_shown(max(abs(low), abs(high)), unit)
+    return with_unit(f"{low * by:.6g} to {high * by:.6g}", shown)
+
+
+def axis_label(name: str, unit: str) -> str:
+    """Return the label of an axis: quantity and unit."""
+    return name if unit == "1" else f"{name} [{unit.replace('*', '·')}]"
+
+
+def listed(names: Sequence[str], most: int = 6) -> str:
+    """Return the first names of several, and "…" for the others; "none" where there are none."""
+    return ", ".join([*names[:most], *["…"][: max(len(names) - most, 0)]]) or "none"
+
+
+def notes(*texts: Note) -> Lines:
+    """Yield texts as indented lines; nothing for an empty text."""
+    for text in texts:
+        yield from wrapped(str(text), "  ", "    ")
+
+
+def sentences(*texts: str) -> Lines:
+    """Yield texts as lines with equal indentation."""
+    for text in texts:
+        yield from wrapped(text, "  ", "  ")
+
+
+def labelled(*rows: tuple[str, str], width: int = 17) -> Lines:
+    """Yield texts next to their labels, in a column of fixed width; nothing for an empty text."""
+    for label, text in rows:
+        if text:
+            yield from wrapped(text, f"  {label:<{width}}", " " * (width + 2))
+
+
+def table(rows: Sequence[Sequence[str]], sides: str = "", *, later: int | None = None) -> Lines:
+    """Yield rows of cells as lines, each column as wide as its widest cell.
+
+    Parameters
+    ----------
+    rows
+        The cells, as many in each row; the headings are the first row.
+    sides
+        The alignment `<` or `>` of each column; by default all are left-aligned.
+    later
+        The column at which the last cell continues in a second line; by default below its beginning.
+    """
+    if not rows:
+        return
+    sides = sides or "<" * len(rows[0])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    if sides[-1] == "<":
+        widths[-1] = 0
+    for row in rows:
+        cells = [f"{cell:{side}{width}}" for cell, side, width in zip(row, sides, widths, strict=True)]
+        first = "  " + "".join(f"{cell}  " for cell in cells[:-1])
+        first += " " * (len(cells[-1]) - len(row[-1]))
+        for line in wrapped(row[-1], first, " " * (len(first) if later is None else later)) or [""]:
+            yield line.rstrip()

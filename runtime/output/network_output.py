@@ -1,0 +1,158 @@
+"""Mean-square verdicts and statistics of packet recordings, as text and plain data.
+
+Takes: a `MeanSquareStability`, a `LinkFit`. Gives: text and document of each; `recording_document`,
+`recording_table`, `link_entry`.
+Guarantees: a missing verdict has a reason, and assumptions come first. The keys are those of a link's entry.
+Does not: compute.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from apc.compiler.wording import counted, wrapped
+from apc.output.formatting import LINEARIZED, Lines, Plain, labelled, notes, radius_text, record, sentences
+
+if TYPE_CHECKING:
+    from apc.mean_square.dropout_bounds import ConsecutiveLosses
+    from apc.mean_square.mean_square_stability import MeanSquareStability
+    from apc.network.link_fit import LinkFit, Share
+
+_WORDS = {
+    True: "Over the network as it is, the mean square of every motion dies out that something holds back.",
+    False: "Over the network as it is, the mean square of some motion grows.",
+    None: "The growth of mean squares lies nearer to 1 than its error bound.",
+}
+
+
+def network_text(result: MeanSquareStability) -> Lines:
+    """Yield the mean-square verdict of a model, in words and numbers."""
+    radius = result.mean_square_radius
+    where = " over its network" if radius is None else ""
+    yield f"{result.topology}: {result.verdict}{where}{LINEARIZED if result.linearized else ''}"
+    yield ""
+    if radius is not None:
+        yield from sentences(_WORDS[result.stable])
+        yield ""
+        error, root = result.error or 0.0, math.sqrt(radius)
+        rooted = radius_text(root, error / (2 * root) if root else error)
+        yield from labelled(
+            ("mean squares", f"multiplied by {radius_text(radius, error)} a frame"),
+            ("their root", f"{rooted}, to compare with a spectral radius"),
+        )
+    if result.rms_error_m is not None:
+        separation = (
+            f"{result.rms_error_m * 1e3:.4g} mm rms, for 1 N rms at every hand, white from tick to tick"
+        )
+        yield from labelled(("copies apart", separation))
+    if result.almost_sure is not None:
+        low, high = result.almost_sure.interval
+        exponent = f"growth e^{result.almost_sure.exponent:.4g} a frame ({low:.4g} to {high:.4g})"
+        yield from labelled(("almost surely", exponent))
+    if result.losses_in_a_row is not None:
+        yield from labelled(*_losses(result.losses_in_a_row))
+    yield from labelled(("proof", str(result.proof)))
+    yield from notes(*result.notes)
+
+
+def _losses(losses_in_a_row: ConsecutiveLosses) -> Iterator[tuple[str, str]]:
+    if losses_in_a_row.certified is not None:
+        harmless = (
+            f"any pattern of at most {losses_in_a_row.certified}"
+            if losses_in_a_row.certified
+            else "not even one at a time"
+        )
+        yield "losses in a row", f"{harmless} is certified harmless"
+    pattern = "".join("×" if lost else "·" for lost in losses_in_a_row.unstable_pattern or ())
+    by = f"by {losses_in_a_row.growth:.6g} a frame" if pattern else ""
+    if "×" in pattern:
+        yield "worst pattern", f"{pattern} lost again and again (×) makes a motion grow {by}"
+    elif pattern:
+        yield "losses in a row", f"with none a motion grows {by}"
+
+
+def network_document(result: MeanSquareStability) -> Plain:
+    """Return the mean-square verdict of a model as plain data."""
+    return record(result, {"topology": ...})
+
+
+def recording_text(recording: LinkFit) -> Lines:
+    """Yield the statistics of a recording in words and numbers, and the corresponding link entry."""
+    of = f" by {recording.program}" if recording.program else ""
+    file = Path(recording.file).name
+    yield f"{file}: {counted(recording.packets, 'packet', ',')} recorded{of}"
+    yield ""
+    if recording.limitations:
+        yield from notes(*recording.limitations)
+        yield ""
+    yield from labelled(("lost", _share(recording.lost)))
+    if recording.lost.count:
+        how = "losses follow losses" if recording.bursty else "no more than luck makes of independent losses"
+        average = f"{recording.lost.count / recording.bursts:.3g} packets on average"
+        bursts = f"{recording.bursts:,}, {average}, {recording.longest_burst:,} the longest"
+        yield from labelled(("bursts", bursts), ("", f"{how} (Fisher's exact test)"))
+    if recording.distribution is not None:
+        several = recording.packets > recording.lost.count + 1
+        spread = f", standard deviation {_ms(recording.std)}" if several else ""
+        quantiles = (
+            (f"  {100 * share:g} %", f"at most {_ms(delay)}") for share, delay in recording.quantiles
+        )
+        span = f"{_ms(recording.shortest)} to {_ms(recording.longest)}"
+        yield from labelled(("delay", span), ("  mean", f"{_ms(recording.mean)}{spread}"), *quantiles)
+    if recording.reordered is not None:
+        yield from labelled(("overtaken", counted(recording.reordered, "packet", ",")))
+    yield "\n  as keys of a link"
+    yield from wrapped(link_entry(recording), "    ", "     ")
+    if recording.distribution is not None and recording.distribution.jitter:
+        away = (
+            f"shares of packets below a delay differ by at most {100 * recording.distribution.distance:.2g} %"
+        )
+        nearest = f"{recording.distribution.distribution} is the nearest of the distributions: {away}"
+        yield from wrapped(nearest, "    ", "    ")
+    yield f"  or packet by packet\n    lan: {{clock: network, trace: {file}}}"
+
+
+def recording_document(recording: LinkFit) -> Plain:
+    """Return a recording as plain data: seconds, shares from 0 to 1."""
+    shares = {name: getattr(recording, name) for name in ("lost", "p", "r")}
+    instead = {name: record(share, {"share": share.value}) for name, share in shares.items()}
+    return record(recording, {"delays": ..., "entry": link_entry(recording), **instead})
+
+
+def recording_table(recording: LinkFit) -> str:
+    """Return all delays as the table that a link's `trace` takes."""
+    rows = ("lost" if math.isinf(delay) else f"{delay * 1e3:.12g}" for delay in recording.delays)
+    return "\n".join(["delay [ms]", *rows])
+
+
+def link_entry(recording: LinkFit) -> str:
+    """Return the entry of a link with the keys that a recording amounts to."""
+    keys = ["clock: network"]
+    if recording.distribution is not None:
+        keys.append(f"delay: {_ms(recording.distribution.delay)}")
+        if recording.distribution.jitter:
+            keys += [
+                f"jitter: {_ms(recording.distribution.jitter)}",
+                f"distribution: {recording.distribution.distribution}",
+            ]
+    if recording.bursty:
+        keys.append(f"loss: {{p: {_percent(recording.p.value)}, r: {_percent(recording.r.value)}}}")
+    elif recording.lost.count:
+        keys.append(f"loss: {_percent(recording.lost.value)}")
+    return f"lan: {{{', '.join(keys)}}}"
+
+
+def _share(share: Share) -> str:
+    between = " to ".join(map(_percent, share.interval))
+    return f"{share.count:,} of {share.of:,}: {_percent(share.value)} (95 %: {between})"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.3g} %"
+
+
+def _ms(seconds: float) -> str:
+    return f"{seconds * 1e3:.4g} ms" if math.isfinite(seconds) else "–"

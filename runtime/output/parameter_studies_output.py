@@ -1,0 +1,360 @@
+"""Parameters, critical values, margins, sensitivities, sweeps, batches: as text, data and tables.
+
+Takes: results of `parameter_studies` and `sweeps`, `Parameters`. Gives: their texts, documents and tables.
+Guarantees: numbers have the digits that their errors permit; parameters are in a unit valid for `--set`.
+Does not: compute, except for the root locus in a picture of a critical value.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
+from typing import TYPE_CHECKING, Any
+
+from numpy.typing import NDArray
+
+from apc.compiler.wording import counted, in_hertz, known_digits, with_unit, wrapped
+from apc.frame.display_units import as_shown
+from apc.optional import need
+from apc.output.formatting import (
+    MEANT,
+    Lines,
+    Plain,
+    document,
+    notes,
+    quantity,
+    record,
+    sentences,
+    span,
+    table,
+    uncertain,
+)
+from apc.parameter_studies.crossing import PERIOD
+
+if TYPE_CHECKING:
+    import pandas
+
+    from apc.frame.parameter_listing import Parameters, Settable
+    from apc.parameter_studies.batch_analysis import Analyses
+    from apc.parameter_studies.critical_values import Critical
+    from apc.parameter_studies.crossing import Crossing
+    from apc.parameter_studies.margins import Margins
+    from apc.parameter_studies.sensitivity import Sensitivities
+    from apc.sweeps.resumable_sweep import Sweep
+
+ROUGH = 1e-2  # of a value: its error is then said to be no slip
+SHOWN = 6  # rows of the table of what moves the radius most; digits of a value in a sentence
+
+# A relative change of the radius below this, for a relative change of 1 in a parameter, is indistinguishable
+# from rounding.
+LEAST_CHANGE = 1e-9
+
+NONE_REPORTED = "what moves the radius most: no change of it can be told from rounding"
+
+HOW = (
+    '--set NAME="VALUE UNIT" sets one, in every command that analyses; words, as of a type, stand in the file'
+)
+
+
+def critical_text(critical: Critical) -> Lines:
+    """Yield the critical values of a parameter."""
+    unit = critical.unit
+    now = quantity(critical.current, unit)
+    if critical.groups:
+        values = [
+            "several values" if value is None else quantity(value, unit) for _, value in critical.groups
+        ]
+        now = ", ".join(
+            f"{value} at {group}" for value, (group, _) in zip(values, critical.groups, strict=True)
+        )
+        now += f", to be one value for all {'groups' if len(critical.groups) > 1 else 'its peers'}"
+    text = _stable_ranges(critical)
+    if not text:
+        text = str(critical.verdict or "")
+        if critical.counted and critical.verdict and critical.has_effect:
+            text = f"{critical.verdict.word} at every number looked at"
+    yield from wrapped(f"{critical.topology}: {text}")
+    meant = MEANT.get(critical.criterion, "")
+    yield from notes(meant, *critical.limitations, f"{critical.parameter} is now {now}")
+    yield ""
+    if not critical.has_effect:
+        return
+    if critical.counted:
+        yield from _count_lines(critical)
+        return
+    for crossing in critical.crossings:
+        yield f"  {uncertain(crossing.value, crossing.error, unit)}"
+        turns = "" if math.isnan(crossing.frequency_hz) else f", {in_hertz(crossing.frequency_hz)}"
+        yield f"    {_sides(crossing)}{turns}, {crossing.proof}"
+        if crossing.kind == PERIOD:
+            yield from sentences(
+                "periods in the middle of this range make frames of too many ticks with the other clocks"
+            )
+        elif crossing.error > ROUGH * abs(crossing.value):
+            yield "    no narrower: within its error the bounds on growth leave the verdict open"
+    if critical.crossings:
+        yield ""
+    yield f"  scanned {_span(critical.searched_to, unit)}"
+    yield f"  {counted(critical.evaluations, 'value')} looked at: two crossings near to each other could hide"
+    if critical.isolated:
+        ends = " and ".join(quantity(value, unit) for value in critical.isolated)
+        yield from sentences(f"at {ends} the verdict differs from that at all neighbouring values")
+    if critical.undecided:
+        parts = ", ".join(_span(pair, unit) for pair in critical.undecided[:SHOWN])
+        rest = f" and {len(critical.undecided) - SHOWN} more" if len(critical.undecided) > SHOWN else ""
+        yield from sentences(f"the verdict is left open {parts}{rest}")
+    if not critical.complete:
+        yield "  an eigenvalue keeps near to the boundary: more crossings could hide"
+
+
+def _stable_ranges(critical: Critical) -> str:
+    """Return the stable range of a model in a sentence; empty without a crossing."""
+    ranges, begin, included, least = [], "", None, -math.inf
+    for crossing in critical.crossings:
+        if critical.counted:
+            value = f"{math.floor(crossing.boundary) + (crossing.stable_side == 'above'):,d}"
+        else:
+            by, shown = as_shown(crossing.value, critical.unit)
+            error = 0.0 if crossing.stable_at else crossing.error * by
+            value = with_unit(f"{_on_stable_side(crossing.value * by, error, crossing.stable_side):g}", shown)
+        if crossing.stable_side == "above":
+            begin, included = value, critical.counted or crossing.stable_at
+            least = crossing.value + crossing.error
+            continue
+        if begin and not critical.counted and crossing.value - crossing.error <= least + 1e-9 * abs(least):
+            begin = ""  # stable at a single value
+            continue
+        most = f"up to {value}" if critical.counted or crossing.stable_at else f"below {value}"
+        ranges.append(f"from {begin} {most}" if begin else most)
+        begin = ""
+    ranges += [f"from {begin} on" if included else f"above {begin}"] if begin else []
+    return f"stable with {critical.parameter} {', and '.join(ranges)}" if ranges else ""
+
+
+def _sides(crossing: Crossing) -> str:
+    """Return the stable side of a crossing; of a jump, the verdict at its own value, too."""
+    if crossing.kind != "jump":
+        return f"stable {crossing.stable_side} it"
+    at = {True: ", stable at it", False: ", unstable at it", None: ""}[crossing.stable_at]
+    return f"jump{at}, stable {crossing.stable_side} it"
+
+
+def _on_stable_side(value: float, error: float, side: str) -> float:
+    """Return a crossing as far inside as its error, to no digit that the error hides."""
+    inward = -error if side == "below" else error
+    if not math.isfinite(inward):
+        return value
+    known = Decimal(value).adjusted() - Decimal(error).adjusted() if inward else SHOWN
+    context = Context(min(max(known, 1), SHOWN), ROUND_FLOOR if side == "below" else ROUND_CEILING)
+    return float(context.create_decimal_from_float(value + inward))
+
+
+def _span(ends: tuple[float, float], unit: str) -> str:
+    return f"from {quantity(ends[0], unit)} to {quantity(ends[1], unit)}"
+
+
+def _count_lines(critical: Critical) -> Lines:
+    """Yield the stable numbers of peers, and the number analyzed."""
+    first, last = map(int, critical.searched_to)
+    sides = [crossing.stable_side for crossing in critical.crossings]
+    ends = [math.floor(crossing.boundary) for crossing in critical.crossings]
+    lines = [
+        (f"{low:,d}" if low == high else f"{low:,d} to {high:,d}", "stable" if stable else "unstable")
+        for low, high, stable in zip(
+            [first, *(end + 1 for end in ends)],
+            [*ends, last],
+            [*(side == "below" for side in sides), sides[-1:] == ["above"]],
+            strict=True,
+        )
+        if sides
+    ]
+    if lines:
+        yield from table(lines)
+        yield ""
+    evaluations = f"every number from {first:,d} to {last:,d} was looked at"
+    if critical.evaluations != last - first + 1:
+        evaluations = (
+            f"{critical.evaluations} numbers from {first:,d} to {last:,d} were looked at, those on "
+            "either side of "
+            "a change among them; a change and back between two could hide"
+        )
+    yield from sentences(evaluations)
+
+
+def critical_picture(critical: Critical, ax: Any) -> Any:
+    """Draw where the eigenvalues go; return the matplotlib Axes."""
+    from apc.output.analysis_output import locus_picture
+    from apc.parameter_studies.root_locus import root_locus
+
+    return locus_picture(root_locus(critical.system, critical), ax)
+
+
+def critical_document(critical: Critical) -> Plain:
+    """Return the critical values of a parameter as plain data."""
+    return record(critical, {"verdict": critical.verdict or "", "groups": dict(critical.groups)})
+
+
+def margins_text(margins: Margins) -> Lines:
+    """Yield the table of the margins, of at most 80 columns."""
+    if not margins.rows:
+        yield from notes(f"margins {margins.note}")
+        return
+    width = max(len(row.parameter) for row in margins.rows)
+    ends = []
+    for row in margins.rows:
+        value, error = row.value or 0.0, row.error or 0.0
+        by, shown = as_shown(value, row.unit)
+        ends.append("" if row.value is None else with_unit(known_digits(value * by, error * by, 7), shown))
+    wide = max(16, *map(len, ends))
+    yield f"  {'may grow':<{width}}  from           {'to':<{wide}} times  at"
+    for row, end in zip(margins.rows, ends, strict=True):
+        times = "–" if row.gain_margin is None else f"{row.gain_margin:.4g}"
+        at = in_hertz(math.nan if row.frequency_hz is None else row.frequency_hz)
+        text = f"{end:<{wide}} {times:>5}  {at}{', jump' if row.kind == 'jump' else ''}"
+        if row.note:
+            text = f"not looked for: {row.note}"
+        elif row.value is None:
+            text = f"none found up to {quantity(row.searched_to, row.unit, 5)}"
+        yield f"  {row.parameter:<{width}}  {quantity(row.current, row.unit, 5):<14} {text}"
+    yield from notes(margins.note)
+
+
+def margins_document(margins: Margins) -> Plain:
+    """Return the margins as plain data."""
+    return {"margins": document(margins.rows), "note": margins.note}
+
+
+def sensitivities_text(sensitivities: Sensitivities) -> Lines:
+    """Yield the table of sensitivities, of at most 80 columns."""
+    # Eigenvalues that share the radius often have equal sensitivities; then one row is sufficient.
+    same: dict[tuple[str, str, str], list[str]] = {}
+    for row in sensitivities.rows:
+        if abs(row.relative) > LEAST_CHANGE * sensitivities.radius:
+            key = (row.parameter, f"{quantity(row.value, row.unit):<15}", f"{row.relative / 100:+.2e}")
+            same.setdefault(key, []).append(str(row.mode + 1))
+    if not same:
+        text = sensitivities.note if len(sensitivities.active) < 2 else ""
+        yield from notes(text or NONE_REPORTED)
+        return
+    rows: list[tuple[str, ...]] = [("what moves it most", f"{'value':<15}", "per percent")]
+    for (*cells, change), modes in list(same.items())[:SHOWN]:
+        which = f"  mode {', '.join(modes)}" if len(modes) < len(sensitivities.active) else ""
+        rows.append((*cells, change + which))
+    yield from table(rows)
+    yield from notes(sensitivities.note)
+
+
+def sensitivities_document(sensitivities: Sensitivities) -> Plain:
+    """Return the derivatives as plain data."""
+    return {
+        "spectral_radius": sensitivities.radius,
+        "active": [{"eigenvalue": document(value), "system": name} for value, name in sensitivities.active],
+        "derivatives": document(sensitivities.rows),
+        "note": sensitivities.note,
+    }
+
+
+def analyses_text(analyses: Analyses) -> Lines:
+    """Yield many analyses in a few lines: what varied, the verdicts."""
+    yield f"{analyses.topology}: {analyses.verdict.size:,} points"
+    yield from notes(*analyses.limitations)
+    for name, values in zip(analyses.parameters, analyses.values, strict=True):
+        yield f"  {name}: {values.min():g} … {values.max():g}"
+    yield from _verdict_lines(
+        *(Counter(values.ravel().tolist()) for values in (analyses.verdict, analyses.message))
+    )
+
+
+def analyses_document(analyses: Analyses) -> Plain:
+    """Return many analyses as plain data, a list a column."""
+    columns = {heading: column.tolist() for heading, column in _analyses_columns(analyses).items()}
+    return {"topology": analyses.topology, "limitations": list(analyses.limitations), **document(columns)}
+
+
+def analyses_table(analyses: Analyses) -> pandas.DataFrame:
+    """Return many analyses as a pandas table, a row a point."""
+    return need("pandas", "data").DataFrame(_analyses_columns(analyses))
+
+
+def _analyses_columns(analyses: Analyses) -> dict[str, NDArray[Any]]:
+    columns = {
+        "verdict": analyses.verdict,
+        "spectral_radius": analyses.spectral_radius,
+        "spectral_radius_error": analyses.spectral_radius_error,
+        "rigid_modes": analyses.rigid_modes,
+        "frequency [Hz]": analyses.frequency_hz,
+        "damping_ratio": analyses.damping_ratio,
+        "message": analyses.message,
+    }
+    every = {**dict(zip(analyses.parameters, analyses.values, strict=True)), **columns}
+    return {heading: column.ravel() for heading, column in every.items()}
+
+
+def _verdict_lines(verdicts: Counter[str], messages: Counter[str]) -> Lines:
+    """Yield the number of points with each verdict, and the most frequent error."""
+    for verdict, count in sorted(verdicts.items(), key=lambda item: (-item[1], item[0])):
+        yield f"  {count:>10,} × {verdict}"
+    counter = Counter({text: count for text, count in messages.items() if text})
+    for text, count in counter.most_common(1):
+        yield from notes(f"at {count:,} of them: {text}")
+
+
+def sweep_text(sweep: Sweep) -> Lines:
+    """Yield a sweep in a few lines: the file, the swept parameters, the verdicts."""
+    where = f" → {sweep.out}" if sweep.out else ""
+    yield f"{sweep.topology}: {sweep.points:,} points{where}"
+    yield from notes(*sweep.made_of["limitations"])
+    for axis in sweep.grid.axes:
+        ends = span(float(axis.values[0]), float(axis.values[-1]), axis.unit)
+        yield f"  {axis.free.label}: {ends}, {counted(len(axis.values), 'value')}"
+    yield from _verdict_lines(sweep.counts, sweep.messages)
+    yield from (f"  note: {note}" for note in sweep.notes)
+
+
+def sweep_document(sweep: Sweep) -> Plain:
+    """Return the description and result counts of a sweep, without its rows, as plain data."""
+    return {
+        **sweep.made_of,
+        "columns": list(sweep.headings),
+        "verdicts": dict(sweep.verdicts),
+        "out": str(sweep.out) if sweep.out else None,
+        "notes": list(sweep.notes),
+    }
+
+
+def sweep_table(sweep: Sweep) -> pandas.DataFrame:
+    """Return a sweep as a pandas table, with the headings as its columns."""
+    return need("pandas", "data").DataFrame(dict(zip(sweep.headings, sweep.columns, strict=True)))
+
+
+def parameters_text(parameters: Parameters) -> Lines:
+    """Yield a line per parameter: name, value, limits, and description."""
+    yield f"{parameters.topology}: what may be set\n"
+    rows = [(row.name, _value(row), _limits(row), _crossing_rows(row)) for row in parameters.rows]
+    yield from table([("name", "value", "limits", ""), *rows], later=6)
+    yield ""
+    yield from sentences(HOW)
+
+
+def _value(settable: Settable) -> str:
+    if settable.low == settable.high:
+        return quantity(settable.low, settable.unit, 9)
+    return span(settable.low, settable.high, settable.unit)
+
+
+def _limits(settable: Settable) -> str:
+    by, _ = as_shown(max(abs(settable.low), abs(settable.high)), settable.unit)
+    low = (
+        ""
+        if settable.minimum is None
+        else f"{'>' if settable.exclusive_minimum else '≥'} {settable.minimum * by:.9g}"
+    )
+    high = "" if settable.maximum is None else f"≤ {settable.maximum * by:.9g}"
+    return ", ".join(limit for limit in (low, high) if limit)
+
+
+def _crossing_rows(settable: Settable) -> str:
+    fixed = f"not to be set: {settable.fixed}" if settable.fixed else ""
+    follows = f"follows: {settable.follows}" if settable.follows else ""
+    return "; ".join(part for part in (settable.description, follows, fixed) if part)

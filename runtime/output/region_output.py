@@ -1,0 +1,181 @@
+"""Stable regions as text, plain data, tables and files.
+
+Takes: a `Region`, or `Panels` of them.
+Gives: their texts, documents, rows and pictures.
+Guarantees: a text states the limits of the search.
+Does not: compute, or draw (see `region_picture`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.wording import counted, known_digits, measured
+from apc.frame.display_units import as_shown
+from apc.output.analysis_output import range_document
+from apc.output.formatting import MEANT, Lines, Plain, notes, picked, quantity, sentences, span, table
+from apc.output.region_picture import panel_letter, panels_picture, region_picture  # noqa: F401 -- looked up
+from apc.tables import Row, TableColumn, Tabled
+
+if TYPE_CHECKING:
+    from apc.regions.panels import Panel, Panels
+    from apc.regions.stable_region import Curve, Region
+
+Floats = NDArray[np.float64]
+
+# Curves listed; of a boundary with more curves only the number is printed.
+MOST_CURVES = 12
+
+
+def region_text(region: Region) -> Lines:
+    """Yield the output of `apc region` for one region."""
+    axes = [
+        (letter, interval.free.label, span(float(interval.low), float(interval.high), interval.unit))
+        for letter, interval in (("x", region.x), ("y", region.y))
+    ]
+    off, percent = region.stable_area_error, 100 / float(region.rectangle.width.prod())
+    share = known_digits(percent * region.stable_area, percent * off, 4)
+    area = measured(region.stable_area, off) if off else f"{region.stable_area:.9g}"
+    yield f"{region.topology}: {_words(region)}"
+    yield from notes(MEANT.get(region.criterion, ""), *region.limitations)
+    yield ""
+    yield from table(axes)
+    yield f"\n  stable area  {area} in SI, {share} % of the rectangle"
+    if region.curves:
+        yield ""
+        rows = [("boundary", "frequency [Hz]", "from (x, y)", "to (x, y)", "error")]
+        yield from table([*rows, *(_row(region, curve) for curve in region.curves[:MOST_CURVES])])
+        left = len(region.curves) - MOST_CURVES
+        if left > 0:
+            yield f"  and {left} more (--json lists all)"
+    if coarse := region.coarse:
+        most, many = max(curve.error for curve in coarse), counted(len(coarse), "curve")
+        yield ""
+        yield from sentences(
+            f"{many} could not be followed to {region.tolerance:.0e} of a coordinate, but to {most:.0e}"
+        )
+    sizes = zip(region.cell, (region.x, region.y), strict=True)
+    cell = " × ".join(quantity(size, axis.unit, 4) for size, axis in sizes)
+    evaluations = f"Looked at in cells of {cell}, and finer where the eigenvalues hint at more; "
+    yield ""
+    yield from sentences(f"{evaluations}an island inside one cell could be missed.")
+    if region.stepped and region.criterion == "passive":
+        yield "  Its points are on the boundary, with straight lines between; the error is an"
+        yield "  estimate by how far the middles of these were off, no bound."
+    elif region.stepped:
+        yield "  Along these times the boundary has steps: it is right to a cell only."
+
+
+def _words(region: Region) -> str:
+    if region.curves:
+        closed = sum(curve.closed for curve in region.curves)
+        pieces = "one piece" if len(region.curves) == 1 else f"{len(region.curves)} pieces"
+        return f"the stable region has a boundary in {pieces}" + (f", {closed} closed" if closed else "")
+    return "stable in the whole rectangle" if region.corner else "stable nowhere inside the rectangle"
+
+
+def _row(region: Region, curve: Curve) -> tuple[str, ...]:
+    low, high = (f"{value:.4g}" for value in curve.frequency_hz)
+    frequency = "–" if low == "nan" else low if low == high else f"{low} to {high}"
+    end = "closed" if curve.closed else _point(region, curve, -1)
+    return f"{curve.mode:.11}", frequency, _point(region, curve, 0), end, f"{curve.error:.0e}"
+
+
+def _point(region: Region, curve: Curve, index: int) -> str:
+    """Return a point of a curve in the units of the axes; its error is relative to each coordinate."""
+    by = [float(as_shown(float(axis.high), axis.unit)[0]) for axis in (region.x, region.y)]
+    return "({}, {})".format(
+        *(known_digits(point, curve.error * abs(point), 6) for point in curve.points[index] * by)
+    )
+
+
+def region_document(region: Region) -> Plain:
+    """Return the `apc region --json` data of one region."""
+    names = ("topology", "tolerance", "stable_area", "stable_area_error", "cell", "criterion", "limitations")
+    each = ("points", "handles", "error", "mode", "frequency_hz", "closed", "smooth")
+    return {
+        **picked(region, *names),
+        "x": range_document(region.x),
+        "y": range_document(region.y),
+        "coarse": [number for number, curve in enumerate(region.curves) if curve in region.coarse],
+        "boundary": [{**picked(curve, *each), "stable_side": "left"} for curve in region.curves],
+        "area_unit": _product(region.x.unit, region.y.unit),
+        "finest_cell": region.finest,
+        "origin": dict(region.system.origin.digests),
+    }
+
+
+def _product(x: str, y: str) -> str:
+    """Return the unit of an area."""
+    units = [unit for unit in (x, y) if unit != "1"]
+    return "*".join(f"({unit})" if "/" in unit or "*" in unit else unit for unit in units) or "1"
+
+
+def panels_text(panels: Panels) -> Lines:
+    """Yield the output of `apc region` for several regions."""
+    for index, panel in enumerate(panels.panels):
+        if panel.title:
+            yield f"({panel_letter(index)}) {panel.title}\n"
+        for region, gain in zip(panel.regions, panel.gains, strict=True):
+            yield from region_text(region)
+            if gain != 1:
+                yield f"  Compared at equal effective gain: y counts {gain} times, once an other."
+            yield ""
+
+
+def panels_document(panels: Panels) -> Plain:
+    """Return the output of `apc region --json`: the region if single, else the panels."""
+    if panels.alone is not None:
+        return panels.alone.to_dict()
+    return {"normalized": panels.normalized, "panels": [_panel_document(panel) for panel in panels.panels]}
+
+
+def _panel_document(panel: Panel) -> Plain:
+    return {
+        "panel": panel.title,
+        "regions": [
+            {**region.to_dict(), "y_multiplied_by": gain}
+            for region, gain in zip(panel.regions, panel.gains, strict=True)
+        ],
+        "overlays": [{"label": label, "points": points.tolist()} for label, points in panel.overlays],
+    }
+
+
+def panels_rows(panels: Panels) -> Tabled:
+    """Return the columns of a table of boundary points, a row a point, and how they were made."""
+    regions = [(region, panel.title) for panel in panels.panels for region in panel.regions]
+    made = {
+        "axes": [range_document(interval) for interval in (regions[0][0].x, regions[0][0].y)],
+        "limitations": {region.topology: list(region.limitations) for region, _ in regions},
+        "origin": {region.topology: dict(region.system.origin.digests) for region, _ in regions},
+    }
+    rows = (row for region, title in regions for row in _rows(region, title))
+    return _columns(regions[0][0]), rows, made
+
+
+def region_rows(region: Region) -> Tabled:
+    """Return the same of one region."""
+    return _columns(region), _rows(region), {}
+
+
+def _columns(region: Region) -> list[TableColumn]:
+    """Return the columns of a table of boundary points."""
+    x, y = (
+        TableColumn(interval.free.label, "" if interval.unit == "1" else interval.unit)
+        for interval in (region.x, region.y)
+    )
+    words = (TableColumn("panel", kind="text"), TableColumn("topology", kind="text"))
+    curve = (TableColumn("curve", kind="count"), TableColumn("mode", kind="text"))
+    return [*words, *curve, x, y, TableColumn("error")]
+
+
+def _rows(region: Region, panel: str = "") -> Iterator[Row]:
+    """Yield a row a point of every curve, in the order of `_columns`."""
+    for number, curve in enumerate(region.curves):
+        mode = curve.mode
+        for point in curve.points.tolist():
+            yield (panel, region.topology, number, mode, *point, curve.error)

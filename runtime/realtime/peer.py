@@ -1,0 +1,579 @@
+"""The real-time loop of one peer: clock ticks, reception of packets, sending.
+
+Takes: a model, the peer's name, addresses, a duration. Gives: `PeerLoop`, `live_topology`, `traced`,
+`number_of`; `StoppedError`.
+Guarantees: every tick is executed once, in order, even if late. A tick receives the packets that had arrived
+at its execution. A peer that starts late or again joins at the present instant. Peers that stop sending are
+held or omitted as the link specifies.
+Does not: simulate other peers, or synchronize host clocks. The offset of two clocks is measured at connection
+(error: half the shortest round trip); later drift appears in the delays. A change of a host's wall-clock time
+has no effect: the clock used is monotonic.
+
+The peer with the lowest number announces time 0 once all peers with known addresses are connected, unless one
+of them already has it. The nonce of the announcing peer is the session number. The ticks of an instant are
+executed at its end, by the simulation's program split at every instant; the peer's device is integrated as in
+the simulation.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+import select
+import socket
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from fractions import Fraction
+from multiprocessing.connection import Connection
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import Channel, Link, Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
+from apc.compiler.wording import counted, cut
+from apc.frame.communication_graph import CommunicationGraph, build_exchange
+from apc.frame.parameters import resolve
+from apc.network.channel import PacketSource, channel_law
+from apc.network.packet_schedule import START, DeliveredPackets
+from apc.realtime.device import DeviceFunction, Outside
+from apc.realtime.packets import DROPPED, Address, Data, Hello, HelloReply, Post
+from apc.realtime.process_priority import now
+from apc.simulation.interpreted_engine import InterpretedEngine
+from apc.simulation.output_blocks import forces_in_time, unsolved
+from apc.simulation.population import instants_within
+from apc.simulation.settings import Settings
+from apc.simulation.simulation import prepare
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+NANO = 10**9
+# Seconds after which a packet that has not come is given up, and times its nominal delay if that is more.
+GIVEN_UP, TIMES = 1, 4
+KNOCK = NANO // 20  # from one hello to the next
+# Round trips by which another's clock is known, the shortest of them, and what lies between two.
+TRIPS, BETWEEN = 10, NANO // 200
+HEAD_START = NANO // 2  # between the announcement of time 0 and time 0
+LARGEST = 1 << 16  # bytes of a datagram
+AHEAD = 1024  # packets whose random numbers are drawn in one batch
+# Datagrams read between two readings of the clock, and the total that a late tick reads: some tenths of a
+# millisecond at any packet rate.
+AT_ONCE = 32
+
+
+def live_topology(system: Model) -> Model:
+    """Return a model whose links have the real network's behavior: packets are received as they arrive."""
+    timings = {timing.name: timing.value for timing in system.timings}
+    late = [
+        max(timings[text] for text in (link.delay, *(pair.delay for pair in link.delays)))
+        for link in system.links
+    ]
+    given_up = [[float(max(Fraction(GIVEN_UP), TIMES * delay))] for delay in late]
+    links = tuple(map(traced, system.links, given_up))
+    return replace(system, links=links, within=())
+
+
+def traced(link: Link, delays: Sequence[float] | Floats) -> Link:
+    """Return a link with recorded delays, in seconds; its treatment of losses is unchanged."""
+    typical = link.channel or Channel(None, None, "uniform", "newest", "hold", None)
+    lawless = replace(typical, loss=None, jitter=None, distribution="uniform")
+    return replace(link, channel=replace(lawless, trace=np.asarray(delays)))
+
+
+class StoppedError(RuntimeError):
+    """The loop has to end: a stop was requested, or its device failed."""
+
+
+class PeerLoop:
+    """A peer's loop: its clock, its socket, and its part of the model."""
+
+    def __init__(
+        self,
+        system: Model,
+        peer: str,
+        listening: socket.socket,
+        addresses: Mapping[str, Address],
+        *,
+        digest: bytes,
+        duration: Fraction,
+        secret: bytes = b"",
+        emulate: bool = False,
+        seed: int | None = None,
+        stop: Connection | None = None,
+        device: DeviceFunction | None = None,
+    ) -> None:
+        """Prepare the loop.
+
+        Parameters
+        ----------
+        system
+            The model, with its parameter values.
+        peer
+            The peer's name, such as "left[1]".
+        listening
+            A bound UDP socket.
+        addresses
+            The addresses of the other peers, by name.
+        digest, secret
+            As for `Post`.
+        duration
+            The duration in seconds.
+        emulate
+            Whether the sender delays and drops packets according to the model's links.
+        seed
+            The seed of the losses; by default that of the topology's experiment.
+        stop
+            A file descriptor that becomes readable to request the end.
+        device
+            The external device that replaces the peer's simulated one.
+
+        Raises
+        ------
+        ApcError
+            E970 there is no such peer, E971 one that it sends to or receives from has no address; those of
+            `prepare`.
+        """
+        self.system, self.name = system, peer
+        self.exchange = build_exchange(system, resolve(system).timings)
+        self.local = number_of(self.exchange, peer, "--peer")
+        self.others = {number_of(self.exchange, text, "--to"): address for text, address in addresses.items()}
+        settings = Settings(duration, jit=False, seed=seed)
+        self.simulation = prepare(live_topology(system), settings, signals=[f"{peer}.*"], live=True)
+        self.frame_ns = int(self.simulation.frame * self.simulation.quantum * NANO)
+        self.frames = -(-int(duration * NANO) // self.frame_ns)
+        self.post = Post(
+            self.local, digest, secret, {address: number for number, address in self.others.items()}
+        )
+        self.socket = listening
+        self.socket.setblocking(False)
+        self.begins = 0  # when the model begins, by this host's clock; 0 while not known
+        self.session = 0  # what all peers that play together know it by; 0 while not known
+        # Of each other the shortest round trip, and how far its clock was ahead then.
+        self.offsets: dict[int, tuple[int, int]] = {}
+        self.began: HelloReply | None = None  # the first that said when the model begins
+        self.knocked = 0  # when others were asked last
+        self.first = 0  # the frame with which it joins
+        self.stopped = False
+        self.trouble: ApcError | None = None  # why it ended before its end, where nobody stopped it
+        self.stop = stop
+        self.watched: list[socket.socket | Connection] = [listening, *([stop] if stop else [])]
+        self.rows: list[Floats] = []
+        self.player = _SinglePeer(self, device, emulate=emulate)
+        self._check_addresses()
+
+    def _check_addresses(self) -> None:
+        pairs = {tuple(pair) for route in self.player.routes for pair in route.pairs.tolist()}
+        needed = {item for pair in pairs if self.local in pair for item in pair} - {self.local}
+        unknown = [self.exchange.peer_name(other) for other in sorted(needed - set(self.others))][:4]
+        wrong = (
+            (
+                not needed,
+                f"{self.name} sends nothing over a link and hears nothing: there is nobody to play with",
+                "apc simulate",
+            ),
+            (
+                self.local in self.others,
+                f"{self.name} is the peer that is played: --to says where the others are",
+                f"--listen HOST:PORT for {self.name}",
+            ),
+            (
+                len(set(self.others.values())) < len(self.others),
+                "two peers have one address: a packet is known by where it comes from",
+                "a port of its own for each",
+            ),
+            (
+                bool(unknown),
+                f"{self.name} sends to or hears {', '.join(unknown)}, which have no address",
+                " ".join(f'--to "{text}=HOST:PORT"' for text in unknown),
+            ),
+        )
+        for is_wrong, message, hint in wrong:
+            if is_wrong:
+                location = SourceLocation("--to" if needed else self.system.name)
+                raise ApcError(Diagnostic("E971", location, message, hint=hint))
+
+    # ---- meeting
+
+    def meet(self, patience: float) -> None:
+        """Determine the start time of the session.
+
+        Raises
+        ------
+        ApcError
+            E972 no announcement arrives within the time limit.
+        StoppedError
+            A stop was requested before.
+        """
+        end, leads = now() + int(patience * NANO), self.local < min(self.others)
+        self.player.warm_up()
+        while not self.session:
+            self._knock(self.others)
+            self.take_in(now() + KNOCK)
+            if self.began is not None:
+                for _ in range(TRIPS):
+                    self._knock(self.others)
+                    self.take_in(now() + BETWEEN)
+                self.begins = self.began.begins - self.offsets[self.began.sender][1]
+                self.session = self.began.session
+            elif leads and set(self.others) == set(self.post.nonces):
+                self.begins, self.session = now() + HEAD_START, self.post.nonce
+            elif now() > end:
+                raise self._single(patience)
+        if now() > self.begins:  # who begins late, or again, comes in with the frame after the next
+            self.first = (now() - self.begins) // self.frame_ns + 2
+            self.player.instant = self.first * self.frame_ns
+
+    def _knock(self, others: Iterable[int]) -> None:
+        """Ask others whether they are there."""
+        self.knocked = now()
+        for other in others:
+            self._send(self.post.hello(now(), other), self.others[other])
+
+    def _single(self, patience: float) -> ApcError:
+        missing = sorted(set(self.others) - set(self.post.nonces)) or sorted(self.others)[:1]
+        names = ", ".join(self.exchange.peer_name(number) for number in missing)
+        dropped = self.post.dropped.items()
+        text = "; ".join(f"{counted(count, 'datagram')} dropped: {DROPPED[why]}" for why, count in dropped)
+        message = f"{names} did not say within {patience:g} s when the topology begins" + (
+            text and f" ({text})"
+        )
+        hint = "the same FILE, --set and --secret-file at every peer, started within --wait of each other"
+        return ApcError(Diagnostic("E972", SourceLocation(self.name), message, hint=hint))
+
+    # ---- running
+
+    def run(self) -> None:
+        """Run until the end, a stop request, or a failure of the device or an equation."""
+        simulation, first = self.simulation, self.first
+        while first < self.frames:
+            count = min(simulation.length, self.frames - first)
+            given = forces_in_time(simulation, first)
+            played = self.player.advance(first, count, given)
+            self.rows.append(played.rows[: played.frames * len(simulation.sample_times)].copy())
+            first += played.frames
+            if played.frames < count:
+                if not (self.stopped or self.trouble):
+                    self.trouble = unsolved(simulation, first)
+                return
+
+    def wait(self, instant: int) -> int:
+        """Receive packets until an instant of the model, in nanoseconds; return the lateness."""
+        if not self.begins:  # warming up
+            return 0
+        self.take_in(self.begins + instant)
+        return now() - self.begins - instant
+
+    # ---- the network
+
+    def take_in(self, until: int) -> None:
+        """Receive packets, and send those due, until an instant of this host's clock."""
+        held = self.player.held_back
+        while True:
+            while held and held[0][0] <= now():
+                _, _, datagram, address = heapq.heappop(held)
+                self._send(datagram, address)
+            self._read()
+            if self.post.unmet and now() >= self.knocked + KNOCK:
+                self._knock(self.post.unmet)
+                self.post.unmet.clear()
+            left = min(until, held[0][0] if held else until) - now()
+            ready, _, _ = select.select(self.watched, [], [], max(left, 0) / NANO)
+            if self.stop in ready:
+                self.stopped = True
+                raise StoppedError
+            if now() >= until:
+                return
+
+    def _read(self) -> None:
+        for _ in range(AT_ONCE):
+            try:
+                datagram, address = self.socket.recvfrom(LARGEST)
+            except BlockingIOError:
+                return
+            except OSError:  # earlier packets had no receiver; Linux reports that here
+                continue
+            came = now()
+            match self.post.read(datagram, address[:2]):
+                case Data() as packet:
+                    self.player.receive(packet, came - self.begins)
+                case Hello() as hello:
+                    answer = self.post.answer(now(), hello, came, self.begins, self.session)
+                    self._send(answer, address)
+                case HelloReply() as answer:
+                    self._connected(answer, came)
+
+    def _connected(self, answer: HelloReply, came: int) -> None:
+        """Learn another's clock, and when the model begins, by a round trip (RFC 5905, section 8)."""
+        trip = (came - answer.requested) - (answer.time - answer.came)
+        ahead = ((answer.came - answer.requested) + (answer.time - came)) // 2
+        self.offsets[answer.sender] = min(self.offsets.get(answer.sender, (trip, ahead)), (trip, ahead))
+        if answer.session and self.began is None:
+            self.began = answer
+
+    def _send(self, datagram: bytes, address: Address) -> None:
+        try:
+            self.socket.sendto(datagram, address)
+        except OSError:  # nobody is there, or no room: one packet more that is lost
+            self.post.drop("not sent")
+
+
+class _SinglePeer(InterpretedEngine):
+    """One peer of a population, executed instant by instant; the other peers' packets come from the network.
+
+    `log` has (due, late, took) of each instant, `arrivals` (link, sender, count, sent, arrived) of each
+    packet, all in nanoseconds of the session; `observed`, per route, has the packets in effect at its ticks
+    on the peer's incoming links.
+    """
+
+    def __init__(self, loop: PeerLoop, device: DeviceFunction | None, *, emulate: bool) -> None:
+        simulation, population = loop.simulation, loop.simulation.population
+        self.loop, self.routes = loop, population.exchange_program.routes
+        self.member = next(g for g, member in enumerate(population.members) if loop.local in member.peers)
+        super().__init__(population, None, moving=(self.member,))
+        self.quantum_ns = simulation.quantum * NANO
+        schedules = [member.program.schedule for member in population.members]
+        self.begin_at = [0, *(int(number * self.quantum_ns) for number in instants_within(schedules))]
+        self.links = [_OfLink(loop, index) for index in range(len(loop.system.links))]
+        self.newest = [np.full(len(route.pairs), START, np.int64) for route in self.routes]
+        self.mine = [np.flatnonzero(route.pairs[:, 1] == loop.local) for route in self.routes]
+        self.observed: list[list[tuple[Integers, Flags]]] = [[] for _ in self.routes]
+        self.network = _Emulated(loop) if emulate else None
+        member = population.members[self.member]
+        self.outside = Outside(loop.system, member, device) if device else None
+        self.ahead: list[
+            tuple[int, int, Data]
+        ] = []  # packets not yet received by a tick, by sampling instant
+        self.held_back: list[tuple[int, int, bytes, Address]] = []
+        self.log: list[tuple[int, int, int]] = []
+        self.arrivals: list[tuple[int, int, int, int, int]] = []
+        self.sent: dict[int, Counter[int]] = defaultdict(Counter)  # packets by link and receiver
+        self.instant = 0
+
+    def warm_up(self) -> None:
+        """Execute a frame whose packets have no receiver, so that loading and compiling precede the run."""
+        self.advance(0, 1, forces_in_time(self.loop.simulation, 0))
+        self.begin(0)
+        self.log, self.observed = [], [[] for _ in self.routes]
+
+    def _segment(
+        self,
+        number: int,
+        index: int,
+        observed: tuple[DeliveredPackets, ...],
+        rows: Floats,
+        pushes: Sequence[Floats | None],
+    ) -> None:
+        """Wait for a segment's instant, execute it, and send its packets at its end."""
+        instant = number * self.loop.frame_ns + self.begin_at[index]
+        late, begun = self.loop.wait(instant), now()
+        self.instant = instant
+        outside = self.outside if self.loop.begins else None
+        if outside and (index == 0 or self.begin_at[index] > self.begin_at[index - 1]):
+            self._of_device(outside.measure, instant / NANO, self.carries[self.member])
+        super()._segment(number, index, observed, rows, pushes)
+        if outside and index:  # before it nothing ticks: a frame begins with what is sent then
+            self._push(outside)
+        self._hand_over(number, index)
+        took = now() - begun
+        if self.log and self.log[-1][0] == instant:  # what a frame begins with, and its first tick
+            _, late, before = self.log.pop()
+            took += before
+        self.log.append((instant, late, took))
+
+    def _of_device(self, requested: Callable[..., None], *subject: object) -> None:
+        """Call the external device; its failure ends the loop, and the record is kept."""
+        try:
+            requested(*subject)
+        except ApcError as error:
+            self.loop.trouble = error
+            raise StoppedError from None
+
+    def _push(self, outside: Outside) -> None:
+        """Pass the force that acts from this instant on to the external device."""
+        layout = self.population.members[self.member].program.layout
+        carry = self.carries[self.member][:, 0]
+        self._of_device(outside.push, self.instant / NANO, carry[: layout.states], carry[layout.held])
+
+    def _sees(self, index: int, tick: int, observed: tuple[DeliveredPackets, ...]) -> tuple[Integers, Flags]:
+        """Return the packets that have arrived, and the packets that are due.
+
+        A late peer does not receive packets sampled after its present instant.
+        """
+        while self.ahead and self.ahead[0][0] <= self.instant:
+            _, _, packet = heapq.heappop(self.ahead)
+            link = self.links[packet.link]
+            for at, arc in link.arcs[packet.sender]:
+                last = self.newest[at][arc]
+                self.newest[at][arc] = max(last, packet.count) if link.newest else packet.count
+        route, newest, arrival_process = (
+            self.routes[index],
+            self.newest[index],
+            self.loop.simulation.arrival_processes[index],
+        )
+        instant = int(self.instant // self.quantum_ns)
+        due = (instant - arrival_process.nominal - arrival_process.phase) // arrival_process.period
+        missing = (newest < due) & (due >= 0) if route.zero else np.zeros(len(newest), np.bool_)
+        mine = self.mine[index]
+        self.observed[index].append((newest[mine].copy(), missing[mine].copy()))
+        return newest.copy(), missing
+
+    def _hand_over(self, number: int, index: int) -> None:
+        """Send the packets of a segment, each at its instant or, emulated, at its arrival time."""
+        loop, member = self.loop, self.population.members[self.member]
+        sent = member.program.schedule.sent
+        slots = {(sent[row].link, sent[row].slot) for row in member.program.segments[index].sent}
+        for name, slot in sorted(slots):
+            link = next(link for link in self.links if link.name == name)
+            count = number * link.slots + slot
+            keys = [link.keys[channel, slot] for channel in link.channels_of(loop.local)]
+            column = self.population.exchange_program.column_of[loop.local]
+            values = tuple(
+                self.packets[number % self.population.exchange_program.ring, keys, column].tolist()
+            )
+            instant = link.instant(count)
+            for other in sorted(link.receivers) if loop.begins else ():  # no warm-up packets
+                delay = self.network.delay(link, other, count) if self.network else 0
+                self.sent[link.location][other] += 1
+                if delay is not None:
+                    at = loop.begins + instant + delay
+                    datagram = loop.post.data(at, other, link.location, count, values)
+                    if datagram is None:
+                        loop.post.drop("not sent")
+                        continue
+                    heapq.heappush(self.held_back, (at, len(self.log), datagram, loop.others[other]))
+
+    def receive(self, packet: Data, came: int) -> None:
+        """Store a packet that arrived at an instant of the session, unless its contents are impossible."""
+        link = self.links[packet.link] if packet.link < len(self.links) else None
+        if why := "malformed" if link is None else self._refused(packet, came, link):
+            self.loop.post.drop(why)
+            return
+        assert link is not None
+        exchange_program, (frame, slot) = self.population.exchange_program, divmod(packet.count, link.slots)
+        link.counts.setdefault(packet.sender, set()).add(packet.count)
+        keys = [link.keys[channel, slot] for channel in link.channels_of(packet.sender)]
+        self.packets[frame % exchange_program.ring, keys, exchange_program.column_of[packet.sender]] = (
+            packet.values
+        )
+        heapq.heappush(self.ahead, (link.instant(packet.count), len(self.arrivals), packet))
+        self.arrivals.append((link.location, packet.sender, packet.count, link.instant(packet.count), came))
+
+    def _refused(self, packet: Data, came: int, link: _OfLink) -> str:
+        """Return the reason for dropping a packet, empty if valid."""
+        if packet.sender not in link.arcs or len(packet.values) != len(link.channels_of(packet.sender)):
+            return "malformed"
+        if not self.loop.begins:
+            return "joining"
+        frame, frame_now = packet.count // link.slots, came // self.loop.frame_ns
+        # Of the frames that are kept the oldest may be overwritten by one that is early.
+        stored = self.population.exchange_program.ring - 3
+        if frame < frame_now - stored:
+            return "late"
+        # A late peer may still need packets that a newer one would overwrite.
+        if frame > min(frame_now + 1, self.instant // self.loop.frame_ns + stored - 1):
+            return "early"
+        return "heard before" if packet.count in link.counts.get(packet.sender, ()) else ""
+
+
+class _OfLink:
+    """A peer's view of a link: `index` and `name`; `slots` per frame; its receivers and senders.
+
+    `channels` are the channels that each peer sends over the link, in the order of a packet's values, and
+    `keys` their storage keys. `arcs` are the routes and directed links of each sender, `counts` the packets
+    received from it.
+    """
+
+    def __init__(self, loop: PeerLoop, index: int) -> None:
+        population = loop.simulation.population
+        self.location, self.name = index, loop.system.links[index].name
+        link, timings = loop.system.links[index], resolve(loop.system).timings
+        clock = next(clock for clock in loop.system.clocks if clock.name == link.clock)
+        self.phase, self.period = (timings[text] * NANO for text in (clock.phase, clock.period))
+        self.newest = link.channel is None or link.channel.reorder == "newest"
+        self.slots = int(loop.simulation.frame * loop.simulation.quantum * NANO / self.period)
+        self.channels: dict[int, list[str]] = {}
+        for member in population.members:
+            sent = sorted({sent.channel for sent in member.program.schedule.sent if sent.link == self.name})
+            self.channels |= dict.fromkeys(member.peers.tolist(), sent)
+        listed = enumerate(population.exchange_program.keys)
+        self.keys = {(sent.channel, sent.slot): row for row, sent in listed if sent.link == self.name}
+        self.receivers: set[int] = set()
+        self.arcs: dict[int, list[tuple[int, int]]] = {}
+        for at, route in enumerate(population.exchange_program.routes):
+            for arc, (sender, receiver) in enumerate(route.pairs.tolist() if route.link == self.name else ()):
+                if sender == loop.local:
+                    self.receivers.add(receiver)
+                if receiver == loop.local:
+                    self.arcs.setdefault(sender, []).append((at, arc))
+        self.counts: dict[int, set[int]] = {}
+
+    def channels_of(self, peer: int) -> list[str]:
+        """Return the channels that a peer sends over the link, in the order of a packet's values."""
+        return self.channels[peer]
+
+    def instant(self, count: int) -> int:
+        """Return the sampling time of a packet, in nanoseconds of the model."""
+        return int(self.phase + count * self.period)
+
+
+class _Emulated:
+    """Emulation of the links in the topology: the delay of each packet, and its loss."""
+
+    def __init__(self, loop: PeerLoop) -> None:
+        self.loop = loop
+        self.timings = resolve(loop.system).timings
+        self.delays: dict[tuple[int, int], Iterator[tuple[int, float]]] = {}
+
+    def delay(self, link: _OfLink, other: int, count: int) -> int | None:
+        """Return the delay of a packet in nanoseconds, None if lost; the counts of a link only grow."""
+        key = link.location, other
+        if key not in self.delays:
+            self.delays[key] = enumerate(_plotted(self._source(link, other)))
+        value = next(delay for number, delay in self.delays[key] if number == count)
+        return None if math.isinf(value) else int(value * NANO)
+
+    def _source(self, link: _OfLink, other: int) -> PacketSource:
+        loop, exchange = self.loop, self.loop.exchange
+        arc, declared = (loop.local, other), loop.system.links[link.location]
+        of, to = map(exchange.group_of, arc)
+        delay = self.timings[exchange.delay(link.name, of, to)]
+        law = channel_law(
+            loop.system, declared if declared.channel else traced(declared, [float(delay)]), delay
+        )
+        return PacketSource(law, link.name, [arc], seed=loop.simulation.seed)
+
+
+def _plotted(source: PacketSource) -> Iterator[float]:
+    """Yield the delays of a directed link's packets, in seconds."""
+    while True:
+        yield from source.take(AHEAD)[0].tolist()
+
+
+def number_of(exchange: CommunicationGraph, name: str, option: str) -> int:
+    """Return the number of a peer called `left[1]`, as given to an option.
+
+    Parameters
+    ----------
+    exchange
+        The peers of the model.
+    name, option
+        The given texts, and the option.
+
+    Raises
+    ------
+    ApcError
+        E970 there is no such peer.
+    """
+    every = [exchange.peer_name(index) for index in range(exchange.peers)]
+    if name in every:
+        return every.index(name)
+    names = every[:4]
+    expected = f"one of {', '.join(names)}{', …' if len(every) > 4 else ''}"
+    near = nearest(name, [f"{group}[1]" for group in exchange.groups]) or names[0]
+    hint = f'{option} "{near}{"=HOST:PORT" if option == "--to" else ""}"'
+    raise ApcError(
+        Diagnostic("E970", SourceLocation(option), "a peer", expected, cut(name) or "nothing", hint)
+    )

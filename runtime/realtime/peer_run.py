@@ -1,0 +1,246 @@
+"""The record of a run on disk: a file per peer, a trace per directed link, and the topology.
+
+Takes: a `PeerLoop` that has ended. Gives: `PeerRecord`, `PeerRun`, `RealtimeRun`, `run_of`, `check_folder`,
+`write_run`; `delays_of`, `file_name`, `trace_name`.
+Guarantees: a run is moved to its destination when completely written; until then the destination is
+unchanged.
+Does not: read a run (see `run_folder`), or compare it with analysis (see `run_comparison`).
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler import store
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
+from apc.compiler.files import check_target, same_file, unwritable
+from apc.realtime.peer import NANO, PeerLoop
+from apc.simulation.output_blocks import instants_of
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+TOPOLOGY = "topology.apc"
+# Of the arrays of a peer's file the type and the number of dimensions, and of those of each route.
+ARRAYS = {
+    "time": ("<f8", 1),
+    "values": ("<f8", 2),
+    "delayed": ("<f8", 1),
+    "took": ("<f8", 1),
+    "arrivals": ("<i8", 2),
+}
+OF_ROUTES = {"packets": ("<i8", 2), "missing": ("|b1", 2)}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PeerRecord:
+    """The metadata of one peer's run.
+
+    `session` is the common session number; `first` is the frame in which the peer joined, of `frames`;
+    `outside` is whether it had an external device. `signals` are the recorded signals. `dropped` counts
+    datagrams by reason; `not_granted` lists the privileges that were not granted; `sent` counts packets by
+    link and receiver; `offsets` are, for each other peer, the shortest round trip and how far its clock was
+    ahead, in seconds.
+    """
+
+    name: str
+    number: int
+    digest: str
+    session: int
+    first: int
+    frames: int
+    stopped: bool
+    emulated: bool
+    outside: bool
+    signals: tuple[str, ...]
+    dropped: dict[str, int]
+    not_granted: tuple[str, ...]
+    sent: dict[int, dict[int, int]]
+    offsets: dict[int, tuple[float, float]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PeerRun(PeerRecord):
+    """The record of one peer's run.
+
+    `values` (rows, signals) are its signals at `time` (rows,) in seconds, as `simulate` gives them. `delayed`
+    and `took` (n,) are, for each instant, the start after its due time and the execution time, in seconds.
+    `arrivals` (n, 5) are link, sender, count, sampling instant and arrival instant of a packet, in
+    nanoseconds of the session. `packets` and `missing` are, per route of the model, the packets in effect and
+    the losses at its ticks on the peer's incoming links (ticks, links).
+    """
+
+    time: Floats
+    values: Floats
+    delayed: Floats
+    took: Floats
+    arrivals: Integers
+    packets: tuple[Integers, ...]
+    missing: tuple[NDArray[np.bool_], ...]
+
+    @property
+    def arcs(self) -> list[tuple[int, int]]:
+        """The link and the sender of each incoming connection with packets."""
+        return sorted({(link, sender) for link, sender in self.arrivals[:, :2].tolist()})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RealtimeRun:
+    """Several peers' part of one run of a model."""
+
+    folder: str
+    system: Model
+    peers: tuple[PeerRun, ...]
+
+
+def run_of(loop: PeerLoop, digest: bytes, not_given: tuple[str, ...]) -> PeerRun:
+    """Return the record of a loop that has ended."""
+    simulation, player = loop.simulation, loop.player
+    rows = np.concatenate([np.zeros((0, simulation.population.width)), *loop.rows])
+    last = int(simulation.settings.duration / simulation.quantum)
+    played = len(rows) // len(simulation.sample_times)
+    instants, recorded = instants_of(simulation, loop.first, played, last)
+    recorded &= np.isfinite(rows).all(axis=1)
+    # After a stop request it does not wait for the last instant.
+    log = np.maximum(np.array(player.log, np.int64).reshape(-1, 3), 0)
+
+    def observed(index: int, kind: type) -> tuple[NDArray[Any], ...]:
+        arcs = zip(player.observed, player.mine, strict=True)
+        return tuple(
+            np.array([tick[index] for tick in ticks], kind).reshape(len(ticks), len(mine))
+            for ticks, mine in arcs
+        )
+
+    return PeerRun(
+        name=loop.name,
+        number=loop.local,
+        digest=digest.hex(),
+        session=loop.session,
+        first=loop.first,
+        frames=loop.frames,
+        stopped=loop.stopped,
+        emulated=loop.player.network is not None,
+        outside=loop.player.outside is not None,
+        signals=tuple(signal.name for signal in simulation.signals),
+        dropped=dict(loop.post.dropped),
+        not_granted=not_given,
+        sent={link: dict(counts) for link, counts in player.sent.items()},
+        offsets={number: (trip / NANO, ahead / NANO) for number, (trip, ahead) in loop.offsets.items()},
+        time=np.asarray(instants[recorded] * float(simulation.quantum), np.float64),
+        values=rows[recorded][:, simulation.order],
+        delayed=log[:, 1] / NANO,
+        took=log[:, 2] / NANO,
+        arrivals=np.array(player.arrivals, np.int64).reshape(-1, 5),
+        packets=observed(0, np.int64),
+        missing=observed(1, np.bool_),
+    )
+
+
+def check_folder(folder: Path, topology: Path) -> None:
+    """Refuse, before anything is played, a folder that can't hold a run of a model.
+
+    Raises
+    ------
+    ApcError
+        E973 it holds something else, E601 nothing can be written there.
+    """
+    if folder.exists() and not folder.is_dir():
+        message = "is there already, and is no folder"
+    elif folder.exists() and any(folder.iterdir()) and not (folder / TOPOLOGY).is_file():
+        message = "is there already, and is no folder of a run"
+    elif any(
+        same_file(folder / TOPOLOGY, path) for path in (topology, topology.parent / f"{topology.stem}.apc")
+    ):
+        message = "holds the topology that is played, and is no folder of a run"
+    else:
+        check_target(folder / TOPOLOGY if folder.exists() else folder)
+        return
+    raise ApcError(Diagnostic("E973", SourceLocation(str(folder)), message, hint="--out another.run"))
+
+
+def write_run(folder: Path, system: Model, peers: Sequence[PeerRun], *, whole: bool = False) -> None:
+    """Write what peers did.
+
+    Parameters
+    ----------
+    folder
+        The folder; created if missing.
+    system
+        The model.
+    peers
+        Some of its peers, or all.
+    whole
+        Whether these are all that stay in the folder.
+
+    Raises
+    ------
+    ApcError
+        E601 it can't be written.
+    """
+    here = folder if folder.is_dir() else folder.parent
+    try:
+        with tempfile.TemporaryDirectory(prefix=f".{folder.name[:64]}.", dir=here) as temporary:
+            ready = Path(temporary)
+            store.save(system, ready / TOPOLOGY)
+            for peer in peers:
+                _write_peer(ready, peer, system)
+            folder.mkdir(exist_ok=True)
+            written = {path.name for path in ready.iterdir()}
+            for name in sorted(
+                written, key=lambda name: name != TOPOLOGY
+            ):  # by which a run's folder is known
+                (ready / name).replace(folder / name)
+        for path in (*folder.glob("*.npz"), *folder.glob("*-to-*.csv")) if whole else ():
+            if path.name not in written:
+                path.unlink()
+    except OSError as error:
+        raise unwritable(folder, error) from None
+
+
+def _write_peer(folder: Path, peer: PeerRun, system: Model) -> None:
+    """Write a peer's record, and a trace of every incoming link. Raises OSError on failure."""
+    words = msgspec.json.encode({field.name: getattr(peer, field.name) for field in fields(PeerRecord)})
+    arrays = {name: getattr(peer, name) for name in ARRAYS}
+    for name in OF_ROUTES:
+        arrays |= {f"{name}{at}": item for at, item in enumerate(getattr(peer, name))}
+    arrays["record"] = np.frombuffer(words, np.uint8)
+    np.savez_compressed(folder / f"{file_name(peer.name)}.npz", **arrays)
+    for link, sender in peer.arcs:
+        rows = (
+            "lost" if math.isinf(value) else f"{value * 1e3:.6f}" for value in delays_of(peer, link, sender)
+        )
+        text = "\n".join(["delay [ms]", *rows, ""])
+        (folder / trace_name(system, link, sender, peer.number)).write_text(text, encoding="utf-8")
+
+
+def delays_of(peer: PeerRun, link: int, sender: int) -> Floats:
+    """Return the delays (n,) of a directed link's packets, from sampling to arrival; infinite if lost.
+
+    They begin with the first packet that the peer could receive and end with the last that arrived.
+    """
+    rows = peer.arrivals[(peer.arrivals[:, 0] == link) & (peer.arrivals[:, 1] == sender)]
+    counts = rows[:, 2]
+    delays = np.full(int(counts.max()) - int(counts.min()) + 1, math.inf)
+    delays[counts - counts.min()] = np.maximum(rows[:, 4] - rows[:, 3], 0) / NANO
+    return delays
+
+
+def file_name(peer: str) -> str:
+    """Return `left-1` for `left[1]`, which a shell would take for a pattern."""
+    return peer.replace("[", "-").replace("]", "")
+
+
+def trace_name(system: Model, link: int, sender: int, receiver: int) -> str:
+    """Return the name of the trace of a directed link."""
+    names = [f"{group.name}-{index + 1}" for group in system.groups for index in range(group.count)]
+    return f"{system.links[link].name}-{names[sender]}-to-{names[receiver]}.csv"

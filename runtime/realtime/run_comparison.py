@@ -1,0 +1,253 @@
+"""Comparison of a real-time run with simulation (same packet arrivals) and analysis (measured network).
+
+Takes: a `RealtimeRun`. Gives: `RunComparison`, `compare_run`; `ArcRun`, `Ticks`, `ticks_of`; `MeasuredLink`.
+Guarantees: the simulation is that of `simulate` with the recorded packets in effect at each tick. Without the
+complete record of a peer there is no simulation, and the reason is given.
+Does not: write files (see `run`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.analysis.analysis import Analysis, analyze
+from apc.compiler.compiled import Link, Model
+from apc.mean_square.mean_square_stability import MeanSquareStability, mean_square_stability
+from apc.network.link_fit import LinkFit, fit_delays
+from apc.network.packet_schedule import START, DeliveredPackets
+from apc.realtime.peer import live_topology, traced
+from apc.realtime.peer_run import PeerRun, RealtimeRun, delays_of, trace_name
+from apc.result import Result
+from apc.simulation.interpreted_engine import InterpretedEngine
+from apc.simulation.output_blocks import blocks
+from apc.simulation.population import Population
+from apc.simulation.settings import Settings
+from apc.simulation.simulation import Simulation, prepare
+
+Floats = NDArray[np.float64]
+
+# A directed link is analyzed packet by packet only up to this number of packets, with delays of at most this
+# many periods. The analysis multiplies all frames with all packets in transit.
+LONGEST, LATEST = 1_000, 4
+SHARES = (0.5, 0.99, 0.999, 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Ticks:
+    """Quantiles (`SHARES`) of the delay and the execution time of a peer's ticks, in seconds."""
+
+    peer: str
+    ticks: int
+    delayed: tuple[float, ...]
+    took: tuple[float, ...]
+    joined: float
+    stopped: bool
+    not_granted: tuple[str, ...]
+    dropped: dict[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class ArcRun:
+    """The packets of a directed link: those `sent` (None without the sender's record), and the arrivals."""
+
+    link: str
+    sender: str
+    receiver: str
+    sent: int | None
+    came: LinkFit
+    trace: str
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredLink:
+    """Analysis of the model with a link as measured: `delay` to reception, packets of a directed link."""
+
+    link: str
+    arc: str
+    delay: float
+    analysis: Analysis
+    network: MeanSquareStability | None
+
+
+@dataclass(frozen=True, slots=True)
+class RunComparison(Result):
+    """Comparison of a run with simulation and analysis.
+
+    `differences` has, for each unit of signals, the largest difference between recording and simulation, and
+    the largest recorded value. It is empty without a simulation; `why_not` is the reason.
+    """
+
+    shown_by: ClassVar[str] = "realtime_output:run_comparison"
+
+    topology: str
+    folder: str
+    seconds: float
+    emulated: bool
+    ticks: tuple[Ticks, ...]
+    arcs: tuple[ArcRun, ...]
+    differences: dict[str, tuple[float, float]]
+    why_not: str
+    measured: tuple[MeasuredLink, ...]
+
+
+def ticks_of(peer: PeerRun, frame: float) -> Ticks:
+    """Return statistics of a peer's ticks; `frame` is the frame length in seconds."""
+    late, took = (_shares(values) for values in (peer.delayed, peer.took))
+    return Ticks(
+        peer=peer.name,
+        ticks=len(peer.delayed),
+        delayed=late,
+        took=took,
+        joined=peer.first * frame,
+        stopped=peer.stopped,
+        not_granted=peer.not_granted,
+        dropped=dict(peer.dropped),
+    )
+
+
+def _shares(values: Floats) -> tuple[float, ...]:
+    return tuple(float(np.quantile(values, share)) for share in SHARES) if len(values) else ()
+
+
+def compare_run(run: RealtimeRun) -> RunComparison:
+    """Compare a run with the results of `simulate` and `analyze`.
+
+    Raises
+    ------
+    ApcError
+        Those of `prepare`, for a model that cannot be simulated.
+    """
+    system, peers = run.system, run.peers
+    simulation = prepare(live_topology(system), Settings(_duration(peers), jit=False))
+    frame = float(simulation.frame * simulation.quantum)
+    why_not, arcs = _incomplete(system, peers), _arcs(run)
+    received = [
+        [arc for arc in arcs if arc.link == link.name and arc.came.distribution] for link in system.links
+    ]
+    return RunComparison(
+        topology=system.name,
+        folder=run.folder,
+        seconds=max((float(peer.time[-1]) for peer in peers if len(peer.time)), default=0.0),
+        emulated=any(peer.emulated for peer in peers),
+        ticks=tuple(ticks_of(peer, frame) for peer in peers),
+        arcs=arcs,
+        differences={} if why_not else _differences(run, simulation),
+        why_not=why_not,
+        measured=tuple(
+            _measured(system, link, arc_runs)
+            for link, arc_runs in zip(system.links, received, strict=True)
+            if arc_runs
+        ),
+    )
+
+
+def _duration(peers: tuple[PeerRun, ...]) -> Fraction:
+    ends = [float(peer.time[-1]) for peer in peers if len(peer.time)]
+    return Fraction(max(min(ends, default=0.0), 1e-3)).limit_denominator(10**6)
+
+
+def _incomplete(system: Model, peers: tuple[PeerRun, ...]) -> str:
+    """Return the reason why the run cannot be simulated, empty if it can."""
+    if len(peers) < system.peers:
+        return f"of {system.peers} peers {len(peers)} left their part of the run"
+    if local := [peer.name for peer in peers if peer.outside]:
+        return f"{', '.join(local)} had a device outside, whose motion is not known"
+    if none := [peer.name for peer in peers if not all(map(len, peer.packets))]:
+        return f"{', '.join(none)} ended before the first tick that hears"
+    late = [peer.name for peer in peers if peer.first]
+    return f"{', '.join(late)} joined later, or again, in a state that others had not" if late else ""
+
+
+class _DeliveredRun:
+    """The packets in effect at the ticks of a run, frame by frame (see `packet_schedule`)."""
+
+    def __init__(self, run: RealtimeRun, population: Population) -> None:
+        self.now, self.observed = 0, list[DeliveredPackets]()
+        self.frame = population.frame
+        self.routes = population.exchange_program.routes
+        for index, route in enumerate(self.routes):
+            rows = min(len(peer.packets[index]) for peer in run.peers if peer.packets[index].size)
+            packets = np.full((rows, len(route.pairs)), START, np.int64)
+            missing = np.zeros(packets.shape, np.bool_)
+            for peer in run.peers:
+                arcs = np.flatnonzero(route.pairs[:, 1] == peer.number)
+                if len(arcs):
+                    packets[:, arcs] = peer.packets[index][:rows]
+                    missing[:, arcs] = peer.missing[index][:rows]
+            self.observed.append(DeliveredPackets(packets, missing))
+
+    def take(self, until: int) -> tuple[DeliveredPackets, ...]:
+        """Return the packets in effect at each route's ticks until the end of a frame, in quanta."""
+        first, last, self.now = self.now // self.frame, until // self.frame, until
+        seens = []
+        for route, observed in zip(self.routes, self.observed, strict=True):
+            rows = np.minimum(np.arange(first * route.ticks, last * route.ticks), len(observed.packets) - 1)
+            seens.append(DeliveredPackets(observed.packets[rows], observed.missing[rows]))
+        return tuple(seens)
+
+
+def _differences(run: RealtimeRun, simulation: Simulation) -> dict[str, tuple[float, float]]:
+    """Return the largest differences between recorded and simulated signals, by unit."""
+    player = InterpretedEngine(simulation.population, lambda _: _DeliveredRun(run, simulation.population))
+    whole = np.concatenate([block.values for block in blocks(simulation, player=player)])
+    simulated = {
+        signal.name: (signal.unit, whole[:, column]) for column, signal in enumerate(simulation.signals)
+    }
+    result: dict[str, tuple[float, float]] = {}
+    for peer in run.peers:
+        for name, played in zip(peer.signals, peer.values[: len(whole)].T, strict=True):
+            unit, values = simulated[name]
+            far = float(np.abs(played - values[: len(played)]).max(initial=0.0))
+            most, large = result.get(unit, (0.0, 0.0))
+            result[unit] = max(most, far), max(large, float(np.abs(played).max(initial=0.0)))
+    return result
+
+
+def _arcs(run: RealtimeRun) -> tuple[ArcRun, ...]:
+    system, peers = run.system, {peer.number: peer for peer in run.peers}
+    timings = {timing.name: float(timing.value) for timing in system.timings}
+    periods = {clock.name: timings[clock.period] for clock in system.clocks}
+    arc_runs = []
+    for peer in run.peers:
+        for number, sender in peer.arcs:
+            link, trace = system.links[number], trace_name(system, number, sender, peer.number)
+            other = peers.get(sender)
+            came = fit_delays(delays_of(peer, number, sender), trace, interval=periods[link.clock])
+            arc_runs.append(
+                ArcRun(
+                    link=link.name,
+                    sender=other.name if other else trace.split("-to-")[0],
+                    receiver=peer.name,
+                    sent=other.sent.get(number, {}).get(peer.number, 0) if other else None,
+                    came=came,
+                    trace=str(Path(run.folder) / trace),
+                )
+            )
+    return tuple(arc_runs)
+
+
+def _measured(system: Model, link: Link, arcs: Sequence[ArcRun]) -> MeasuredLink:
+    """Return the analysis with the worst directed link of a network link: most losses, then largest delay."""
+    worst = max(arcs, key=lambda arc: (arc.came.lost.value, arc.came.mean))
+    came, clocks = worst.came, {clock.name: clock.period for clock in system.clocks}
+    tick = min(float(timing.value) for timing in system.timings if timing.name in clocks.values())
+    median = dict(came.quantiles).get(0.5, came.mean)
+    delay = Fraction(int(np.ceil(median / tick - 1e-9))) * Fraction(tick).limit_denominator(10**9)
+    timings = tuple(
+        replace(timing, value=delay) if timing.name == link.delay else timing for timing in system.timings
+    )
+    period = next(float(timing.value) for timing in timings if timing.name == clocks[link.clock])
+    worse = replace(traced(link, came.delays), delays=())
+    links = tuple(worse if item is link else item for item in system.links)
+    measured = replace(system, timings=timings, links=links)
+    late = came.longest > LATEST * period or came.packets > LONGEST
+    network = None if late else mean_square_stability(measured)
+    arc = f"{worst.sender} to {worst.receiver}"
+    return MeasuredLink(link.name, arc, float(delay), analyze(measured), network)

@@ -1,0 +1,499 @@
+"""All peers' frames in machine code: the kernels as loops over peers, and the engine that plays them.
+
+Takes: a `HeterogeneousGroup`, the packets of its unreliable links.
+Gives: `library_of`, `LoadedLibrary`, `CompiledEngine`; `program_text`, the C text; `straight_lines`.
+Guarantees: the numbers of `interpreted_engine` to a few roundings of the sums; the text depends on what a
+peer does in a frame, not on how many peers there are or on their numbers.
+Does not: compile (see `c_compiler`), or play kernels that are not straight code, such as solvers.
+
+C, and not numba or LLVM: its compiler is of the machine, where these would be further packages to install.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.expression_data import PlainFunction, straight
+from apc.compiler.interpolation import table_of
+from apc.simulation.c_compiler import native
+from apc.simulation.exchange_program import (
+    Arrived,
+    CompleteGraphSum,
+    Deliver,
+    Operation,
+    PairwiseReduction,
+    Source,
+    WeightedSum,
+)
+from apc.simulation.population import DeliverySource, FrameRows, Population, PopulationState
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+# More operations and rows of tables than this in one kernel: to optimize straight code takes more than linear
+# time.
+MOST_OPERATIONS = 20_000
+MANY = 32  # peers of a member from which on their loop is put into lanes
+KINDS = ("complete", "weighed", "deliver", "look", "move", "work")
+OPERATORS = {"sum": 0, "mean": 0, "max": 1, "min": 2}
+
+HEAD = """\
+#include <math.h>
+#include <stdint.h>
+typedef int64_t whole;
+#if defined(_WIN32)
+#define LIBRARY __declspec(dllexport)
+#else
+#define LIBRARY
+#endif
+/* No number of a peer depends on another peer's within a loop; loops for two generations of processors. */
+#if defined(__clang__)
+#define LANES _Pragma("clang loop vectorize(assume_safety)")
+#define INSIDE static inline __attribute__((always_inline))
+#define CLONES
+#elif defined(__GNUC__)
+#define LANES _Pragma("GCC ivdep")
+#define INSIDE static inline __attribute__((always_inline))
+#if defined(MANY) && defined(__x86_64__) && defined(__gnu_linux__)
+#define CLONES __attribute__((target_clones("avx2", "default")))
+#else
+#define CLONES
+#endif
+#else
+#define LANES
+#define INSIDE static inline
+#define CLONES
+#endif
+"""
+PARAMETERS = """\
+whole n, double *carry, const double *heard, const double *constants, {local}const double *impulses,
+    whole sites, const whole *site, double frame, double *sent, const whole *keys, whole peers, double *rows,
+    whole width"""
+READ = """\
+whole arcs, const whole *senders, const whole *receivers, const double *weights, int mode, int first,
+    const whole *own, double *out, whole n, const double *const *sent, const double *missing, double t"""
+
+EXPRESSIONS = {
+    "neg": "-{0}",
+    "sq": "{0} * {0}",
+    "twice": "{0} + {0}",
+    "inv": "1.0 / {0}",
+    "sign": "{0} < 0 ? -1.0 : {0} > 0 ? 1.0 : {0}",
+    "not": "!{0}",
+    "add": "{0} + {1}",
+    "sub": "{0} - {1}",
+    "mul": "{0} * {1}",
+    "div": "{0} / {1}",
+    "constpow": "pow({0}, {1})",
+    # As C's fmin and fmax, which take the other for what is no number, in a form that goes into lanes.
+    "fmin": "{0} < {1} || {1} != {1} ? {0} : {1}",
+    "fmax": "{0} > {1} || {1} != {1} ? {0} : {1}",
+    "lt": "{0} < {1}",
+    "le": "{0} <= {1}",
+    "eq": "{0} == {1}",
+    "ne": "{0} != {1}",
+    "and": "{0} && {1}",
+    "or": "{0} || {1}",
+    "if_else_zero": "{0} ? {1} : 0.0",
+}
+# In the table t with its last row: the row before `at`, by halving, and what is made of it.
+SOUGHT = """\
+int low{k} = 0, high{k} = {last};
+while (high{k} - low{k} > 1) {{
+  const int middle = low{k} + (high{k} - low{k}) / 2;
+  if ({at} < times{t}[middle]) high{k} = middle; else low{k} = middle;
+}}
+const double rate{k} = (numbers{t}[high{k}] - numbers{t}[low{k}]) / (times{t}[high{k}] - times{t}[low{k}]);
+"""
+READ_INDEXED = {
+    "interpolate": "const double {v} = {at} < times{t}[0] ? numbers{t}[0] : {at} >= times{t}[{last}] ? "
+    "numbers{t}[{last}] : numbers{t}[low{k}] + rate{k} * ({at} - times{t}[low{k}]);",
+    "slope": "const double {v} = {at} < times{t}[0] || {at} >= times{t}[{last}] ? 0.0 : rate{k};",
+}
+
+
+def _fields(*columns: tuple[str, str]) -> np.dtype[Any]:
+    """Return a structure of `engine.c`: names of fields with their type, all of 8 bytes."""
+    return np.dtype([(name, type_) for names, type_ in columns for name in names.split()])
+
+
+WHOLE, NUMBER, ADDRESS = "i8", "f8", "u8"
+ROUTE = _fields(
+    ("arcs slots ticks zero channels", WHOLE),
+    ("columns keys held effective delivered missing", ADDRESS),
+)
+MEMBER = _fields(
+    ("count column recorded subsystems local impulse_rows", WHOLE),
+    ("carry received constants impulses subsystem", ADDRESS),
+)
+OPERATION = _fields(("kind a b c d e f g", WHOLE), ("x y z", NUMBER), ("p q u v r", ADDRESS))
+PLAN = _fields(
+    ("frames_kept keys peers operations samples width parts frame", WHOLE),
+    ("packets operation route member", ADDRESS),
+)
+
+
+def program_text(kernels: Sequence[tuple[PlainFunction, int]], reads: Sequence[PlainFunction]) -> str:
+    """Return the C text that plays members whose segments are these kernels, and looks at pairs so.
+
+    Parameters
+    ----------
+    kernels
+        The segments' kernels, each with how many signals it records at a mark.
+    reads
+        The functions of pairs (see `pairwise`).
+    """
+    parts = [HEAD]
+    parts += [_kernel(index, *kernel) for index, kernel in enumerate(kernels)]
+    parts += [_reduce(index, reduction) for index, reduction in enumerate(reads)]
+    parts.append(_table("kernels", "kernel", PARAMETERS.format(local="int own, "), len(kernels)))
+    parts.append(_table("looks", "look", READ, len(reads)))
+    parts.append(Path(__file__).with_name("engine.c").read_text(encoding="utf-8"))
+    return "\n".join(parts)
+
+
+def _table(name: str, each: str, parameters: str, count: int) -> str:
+    listed = ", ".join(f"{each}{index}" for index in range(count)) or "0"
+    return f"static void (*const {name}[])({parameters}) = {{{listed}}};\n"
+
+
+def _kernel(index: int, function: PlainFunction, recorded: int) -> str:
+    """Return a segment's kernel as a loop over peers."""
+    carry, received, constants, impulses, _ = (rows for _, rows in function.inputs)
+    inputs = [
+        *(f"carry[{k} * n + i]" for k in range(carry)),
+        *(f"heard[{k} * n + i]" for k in range(received)),
+        *(f"constants[own ? {k} * n + i : {k}]" for k in range(constants)),
+        *(f"impulses[{k} * sites + site[i]]" for k in range(impulses)),
+        "frame",
+    ]
+    after, sent, rows = function.results
+    values, lines = straight_lines(function, inputs)
+    stores = [f"carry[{k} * n + i] = {values[value]};" for k, value in enumerate(after) if value != k]
+    stores += [f"sent[keys[{k}] * peers + i] = {values[value]};" for k, value in enumerate(sent)]
+    stores += [
+        f"rows[{k // recorded} * width + {k % recorded} * n + i] = {values[value]};"
+        for k, value in enumerate(rows)
+    ]
+    body = "\n    ".join([*lines, *stores])
+    given = "n, carry, heard, constants, {}impulses, sites, site, frame, sent, keys, peers, rows, width"
+    return f"""\
+INSIDE void inside{index}({PARAMETERS.format(local="const int own, ")}) {{
+  LANES
+  for (whole i = 0; i < n; i++) {{
+    {body}
+  }}
+}}
+CLONES static void kernel{index}({PARAMETERS.format(local="int own, ")}) {{
+#ifdef MANY
+  if (own) inside{index}({given.format("1, ")});
+  else inside{index}({given.format("0, ")});
+#else
+  inside{index}({given.format("own, ")});
+#endif
+}}
+"""
+
+
+def _reduce(index: int, function: PlainFunction) -> str:
+    """Return a function of pairs as a loop over arcs, and what their values are joined to."""
+    local, sent, _, _ = (rows for _, rows in function.inputs)
+    inputs = [
+        *(f"((const double *)own[{2 * k}])[own[{2 * k + 1}] * r]" for k in range(local)),
+        *(f"sent[{k}][s]" for k in range(sent)),
+        "(missing ? missing[s] : 0.0)",
+        "t",
+    ]
+    values, lines = straight_lines(function, inputs)
+    body = "\n    ".join(lines)
+    return f"""\
+static void look{index}({READ}) {{
+  if (first) for (whole r = 0; r < n; r++) out[r] = mode == 0 ? 0.0 : mode == 1 ? -INFINITY : INFINITY;
+  for (whole a = 0; a < arcs; a++) {{
+    const whole s = senders[a], r = receivers[a];
+    {body}
+    const double value = {values[function.results[0][0]]};
+    out[r] = mode == 0 ? out[r] + weights[a] * value : mode == 1 ? fmax(out[r], value) : fmin(out[r], value);
+  }}
+}}
+"""
+
+
+def straight_lines(function: PlainFunction, inputs: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the names of a function's values, and the lines of C that make them."""
+    used = {index for _, *indices in function.operations for index in indices}
+    used |= {index for indices in function.results for index in indices}
+    names, lines = [], []
+    for index, text in enumerate(inputs):
+        names.append(f"v{index}")
+        if index in used:
+            lines.append(f"const double v{index} = {text};")
+    names += [_number(constant) for constant in function.constants]
+    for table in function.tables:
+        names.append(f"{len(names)}")
+        for subject, column in (("times", table.times), ("numbers", table.numbers)):
+            listed = ", ".join(map(_number, column.tolist()))
+            lines.append(f"static const double {subject}{names[-1]}[{len(column)}] = {{{listed}}};")
+    for word, *indices in function.operations:
+        name = f"v{len(names)}"
+        if word in READ_INDEXED:
+            table, at = (names[index] for index in indices)
+            rows = len(function.tables[indices[0] - len(inputs) - len(function.constants)].times)
+            text = SOUGHT + READ_INDEXED[word]
+            lines += text.format(v=name, k=len(names), at=at, t=table, last=rows - 1).splitlines()
+            names.append(name)
+            continue
+        form = EXPRESSIONS.get(word, f"{word}({', '.join(f'{{{k}}}' for k in range(len(indices)))})")
+        lines.append(f"const double {name} = {form.format(*(names[index] for index in indices))};")
+        names.append(name)
+    return names, lines
+
+
+def _number(value: float) -> str:
+    if math.isnan(value):
+        return "NAN"
+    if math.isinf(value):
+        return "INFINITY" if value > 0 else "(-INFINITY)"
+    return f"({value.hex()})" if math.copysign(1.0, value) < 0 else value.hex()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoadedLibrary:
+    """The compiled text of a population; `kernels` are the places of the segments' kernels, by their `id`."""
+
+    loaded: ctypes.CDLL
+    kernels: Mapping[int, int]
+
+
+def library_of(population: Population) -> LoadedLibrary | None:
+    """Return the compiled engine of a population, None if unavailable."""
+    segments = {
+        id(segment): (segment, m.program) for m in population.members for segment in m.program.segments
+    }
+    functions = [segment.kernel for segment, _ in segments.values()]
+    reads = list(population.exchange_program.functions)
+    if ctypes.sizeof(ctypes.c_void_p) != 8 or not all(
+        _is_worth_it(function) for function in (*functions, *reads)
+    ):
+        return None
+    kernels = [(straight(segment.kernel), len(program.recorded)) for segment, program in segments.values()]
+    many = max(member.count for member in population.members) >= MANY
+    loaded = native(program_text(kernels, [straight(reduction) for reduction in reads]), many=many)
+    if loaded is None:
+        return None
+    return LoadedLibrary(loaded, {key: index for index, key in enumerate(segments)})
+
+
+def _is_worth_it(function: Any) -> bool:
+    if not function.is_a("SXFunction"):
+        return False
+    rows = sum(len(table_of(table).times) for table in function.find_functions(0))
+    return bool(function.n_instructions() + rows <= MOST_OPERATIONS)
+
+
+class CompiledEngine(PopulationState):
+    """The memory of all peers, and the library that plays them in it."""
+
+    def __init__(
+        self,
+        library: LoadedLibrary,
+        population: Population,
+        timetable: Callable[[int], DeliverySource] | None,
+    ) -> None:
+        """Build the input data of the library.
+
+        Parameters
+        ----------
+        library
+            The population's.
+        population, timetable
+            As of `PopulationState`.
+        """
+        super().__init__(population, timetable)
+        self._play = library.loaded.play
+        self._play.argtypes = [ctypes.c_void_p, *[ctypes.c_int64] * 2, *[ctypes.c_void_p] * 2]
+        self._stored: list[NDArray[Any]] = []  # arrays whose addresses the library knows
+        exchange_program, members = population.exchange_program, population.members
+        heights = [
+            max(segment.kernel.numel_in("received") for segment in m.program.segments) for m in members
+        ]
+        self.received = [
+            self._local(np.zeros((height, member.count)))
+            for height, member in zip(heights, members, strict=True)
+        ]
+        self.members = self._local(np.array([self._member(g) for g in range(len(members))], MEMBER))
+        self.routes = self._local(
+            np.array([self._route(i) for i in range(len(exchange_program.routes))], ROUTE)
+        )
+        operations = [
+            self._operation("work", g, population.parts.index(part), member.program.layout.work.start + row)
+            for g, member in enumerate(members)
+            for row, part in enumerate(member.program.layout.parts)
+        ]
+        for index, listed in enumerate(exchange_program.segments):
+            operations += [self._received(operation) for operation in listed]
+            operations += [self._moved(g, index, library) for g in range(len(members))]
+        self.plan = self._local(np.zeros(1, PLAN))
+        _set(
+            self.plan[0],
+            frames_kept=exchange_program.ring,
+            keys=len(exchange_program.keys),
+            peers=exchange_program.start.shape[1],
+            operations=len(operations),
+            samples=population.sample_count,
+            width=population.width,
+            parts=len(population.parts),
+            frame=population.frame,
+            packets=self.packets,
+            operation=self._local(np.array(operations, OPERATION)),
+            route=self.routes,
+            member=self.members,
+        )
+        self.rows = self.work = np.empty((0, 0))  # of the last call
+
+    def advance(self, first: int, count: int, pushes: Sequence[Floats | None]) -> FrameRows:
+        """Play the frames from number `first` on (see `population.FrameEngine`)."""
+        population = self.population
+        for g, impulses in enumerate(pushes):
+            if impulses is not None:
+                self.members["impulses"][g] = impulses.ctypes.data
+        observed = self.delivered_until(first + count)
+        missing = [np.ascontiguousarray(route.missing) for route in observed]
+        for index, route in enumerate(observed):
+            self.routes["delivered"][index] = route.packets.ctypes.data
+            self.routes["missing"][index] = missing[index].ctypes.data
+        if len(self.work) != count:
+            self.rows = np.empty((count * population.sample_count, population.width))
+            self.work = np.empty((count, len(population.parts)))
+        self.work[:] = 0.0
+        addresses = self.rows.ctypes.data, self.work.ctypes.data
+        self._play(self.plan.ctypes.data, first, count, *addresses)
+        return FrameRows(self.rows, self.work, count)
+
+    # ---- the layout
+
+    def _local(self, array: Any) -> NDArray[Any]:
+        """Keep an array, contiguous, as long as the library may look at it."""
+        self._stored.append(np.ascontiguousarray(array))
+        return self._stored[-1]
+
+    def _whole(self, array: Any) -> Integers:
+        """Keep an array of whole numbers."""
+        return self._local(np.asarray(array, np.int64))
+
+    def _member(self, g: int) -> Any:
+        member = self.population.members[g]
+        subsystems = len(member.parameters)
+        return _set(
+            np.zeros(1, MEMBER)[0],
+            count=member.count,
+            column=int(self.population.exchange_program.first[g]),
+            recorded=len(member.program.recorded),
+            subsystems=subsystems,
+            local=int(subsystems > 1),
+            impulse_rows=member.program.impulse_rows,
+            carry=self.carries[g],
+            received=self.received[g],
+            constants=self._local(member.each(member.constants).T if subsystems > 1 else member.constants[0]),
+            subsystem=self._whole(member.rows),
+        )
+
+    def _route(self, index: int) -> Any:
+        exchange_program = self.population.exchange_program
+        route, keys = exchange_program.routes[index], exchange_program.channels[index]
+        return _set(
+            np.zeros(1, ROUTE)[0],
+            arcs=len(route.pairs),
+            slots=route.slots,
+            ticks=route.ticks,
+            zero=int(route.zero),
+            channels=len(keys),
+            columns=self._local(exchange_program.column_of[route.pairs[:, 0]]),
+            keys=self._local(keys),
+            held=self.held[index],
+            effective=self.effective[index],
+        )
+
+    def _operation(self, kind: str, *whole: int, **fields: Any) -> Any:
+        record = np.zeros(1, OPERATION)[0]
+        return _set(record, kind=KINDS.index(kind), **dict(zip("abcdefg", whole, strict=False)), **fields)
+
+    def _moved(self, g: int, index: int, library: LoadedLibrary) -> Any:
+        """Return the integrators of a member over a segment."""
+        population = self.population
+        segment = population.members[g].program.segments[index]
+        keys = self._whole([population.exchange_program.sent[g][row] for row in segment.sent])
+        where = (library.kernels[id(segment)], segment.first_mark, population.columns[g])
+        return self._operation("move", g, *where, segment.first_impulse, p=keys)
+
+    def _read(self, source: Source) -> tuple[int, int, int]:
+        """Return the location of a source: a packet's key and lag, or −1 and an address."""
+        if isinstance(source, Arrived):
+            return -1, 0, self.held[source.route][source.row].ctypes.data
+        return source.key, source.lag, 0
+
+    def _received(self, operation: Operation) -> Any:
+        match operation:
+            case CompleteGraphSum(g, row, packet, ranges, local, divisor):
+                where = (g, packet.key, packet.lag, len(ranges), int(local))
+                to = self.received[g][row]
+                return self._operation("complete", *where, x=divisor, p=self._whole(ranges), v=to)
+            case WeightedSum(g, row, source, weights):
+                fields = {
+                    "p": self._whole(weights.indptr),
+                    "q": self._whole(weights.indices),
+                    "u": self._local(weights.data),
+                }
+                key, lag, address = self._read(source)
+                return self._operation("weighed", g, key, lag, r=address, v=self.received[g][row], **fields)
+            case Deliver(route, tick):
+                return self._operation("deliver", route, tick)
+        return self._reduce(operation)
+
+    def _reduce(self, reduction: PairwiseReduction) -> Any:
+        """Return the pairwise functions."""
+        member = self.population.members[reduction.member]
+        carry, constants = self.carries[reduction.member], int(self.members["constants"][reduction.member])
+        local = len(member.parameters) > 1
+        rows = [(carry[row].ctypes.data, 1) for row in reduction.pairwise.carry]
+        stride = 8 * (member.count if local else 1)
+        rows += [(constants + stride * row, int(local)) for row in reduction.pairwise.constants]
+        sources = [self._read(source) for source in reduction.sources]
+        listed = [reduction.receivers, np.array(rows, np.int64).ravel(), np.array(sources, np.int64).ravel()]
+        quantum = member.program.schedule.quantum
+        where = (
+            reduction.function,
+            len(reduction.senders),
+            OPERATORS[reduction.operator],
+            int(reduction.first),
+            len(sources),
+        )
+        return self._operation(
+            "look",
+            reduction.member,
+            *where,
+            reduction.pairwise.now,
+            x=float(len(rows)),
+            y=float(quantum.numerator),
+            z=float(quantum.denominator),
+            p=self._local(reduction.senders),
+            q=self._local(np.concatenate(listed)),
+            u=self._local(reduction.weights),
+            r=self._read(reduction.missing)[2] if reduction.missing else 0,
+            v=self.received[reduction.member][reduction.row],
+        )
+
+
+def _set(record: Any, **fields: Any) -> Any:
+    """Fill in a structure: numbers, and the addresses of arrays."""
+    for name, value in fields.items():
+        record[name] = value.ctypes.data if isinstance(value, np.ndarray) else value
+    return record

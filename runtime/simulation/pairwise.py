@@ -1,0 +1,98 @@
+"""Pairwise coupling: functions of a receiving peer and each sender, evaluated pair by pair.
+
+Takes: a peer type's receives over an edge function, or of a maximum or minimum; the communication graph.
+Gives: `pair_function`, `Pairwise`; `count_pairs`.
+Guarantees: one function for all pairs.
+Does not: determine times of sending and reception (see `scheduling`), or senders (see `exchange_program`).
+
+    r_i = op_j e(x_i, u_i, m_i, s_ij, p_i, t)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi
+
+from apc.compiler.compiled import Model, PeerType
+from apc.frame.communication_graph import CommunicationGraph
+from apc.frame.jacobians import edge_name
+
+
+@dataclass(frozen=True, slots=True)
+class Pairwise:
+    """The pairwise function of one peer at one tick of its frame, the first instant of a segment.
+
+    `function` is that of `pair_function`; `carry` are the rows of the carry, `constants` those of the
+    subsystem's constants in `local`; `received` are the received rows of the schedule; `now` is the
+    instant in quanta.
+    """
+
+    function: Any  # casadi.Function
+    carry: tuple[int, ...]
+    constants: tuple[int, ...]
+    received: tuple[int, ...]
+    now: int
+
+
+def pair_function(peer_type: PeerType, partition: int, receive: int) -> tuple[Any, tuple[int, ...]]:
+    """Build the pairwise function of a receive (of a clock partition of a peer type).
+
+    Returns
+    -------
+    The casadi.Function (own, s, missing, t) -> value, and the rows of (x, u, m, p), numbered consecutively,
+    that are the relevant `local` values. `s` are the received channels; `missing` is 1 if the peer's own
+    value substitutes a packet, else 0.
+    """
+    clock = peer_type.clocks[partition]
+    exchange_program = clock.receives[receive]
+    sending = next((send for send in peer_type.sends if send.link == exchange_program.link), None)
+    sizes = (len(peer_type.states), len(peer_type.holds), len(clock.memories), len(peer_type.parameters))
+    x, u, m, p = (casadi.SX.sym("local", size) for size in sizes)
+    t, missing = casadi.SX.sym("t"), casadi.SX.sym("missing")
+
+    def evaluated(s: Any) -> Any:
+        return (
+            s[exchange_program.channel]
+            if exchange_program.edge is None
+            else exchange_program.edge(x, u, m, s, p, t)
+        )
+
+    sent = casadi.SX.sym(
+        "s",
+        exchange_program.channel + 1 if exchange_program.edge is None else exchange_program.edge.numel_in(3),
+    )
+    channels = _rows_used(evaluated(sent), sent)
+    received = sent
+    if sending is not None:
+        stand_in = sending.send(x, u, p, t)
+        received = casadi.vertcat(*(sent[row] + missing * stand_in[row] for row in range(sent.numel())))
+    value = casadi.densify(evaluated(received))
+    every = casadi.vertcat(x, u, m, p)
+    numbers = _rows_used(value, every)
+    arguments = [_rows(every, numbers), _rows(sent, channels), missing, t]
+    return casadi.Function("pair", arguments, [value]), tuple(numbers)
+
+
+def _rows_used(value: Any, symbols: Any) -> list[int]:
+    """Return the rows of a column on which a value depends."""
+    return sorted(set(casadi.jacobian(value, symbols).sparsity().get_triplet()[1]))
+
+
+def _rows(symbols: Any, indices: Sequence[int]) -> Any:
+    return casadi.vertcat(*(symbols[index] for index in indices)) if indices else casadi.SX(0, 1)
+
+
+def count_pairs(system: Model, exchange: CommunicationGraph) -> int:
+    """Return the number of pairwise evaluations at a tick, over all links."""
+    links = {
+        receive.link
+        for peer_type in system.peer_types
+        for partition in peer_type.clocks
+        for receive in partition.receives
+        if edge_name(partition, receive)
+    }
+    n = exchange.peers
+    return sum(n * (n - 1) if exchange.is_complete(link) else len(exchange.arcs(link)[0]) for link in links)

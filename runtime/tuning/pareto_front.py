@@ -1,0 +1,163 @@
+"""The Pareto front of an objective and a transparency metric: the optimum for each bound on the metric.
+
+Takes: a `Model`, `TuningSpec`, and the second quantity of the trade-off.
+Gives: `Design`, `ParetoFront`, `pareto_front`.
+Guarantees: each design is that of `tune` with its bound as a demand, proved or not as there.
+Does not: prove that no designs lie beyond.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic
+from apc.frame.numeric_model import prepare
+from apc.parameter_studies.crossing import Progress
+from apc.result import Result
+from apc.tuning.constraints import ConstraintSet
+from apc.tuning.specification import TRADEOFF, TRANSPARENCY, Objective, TransparencyMetric, TuningSpec
+from apc.tuning.tuner import Tuning, tune
+
+Floats = NDArray[np.float64]
+
+POINTS = 20  # designs of a front
+LEAST = 1 + 1e-3  # factor from the smallest transparency metric to the last bound
+SAME = 1e-3  # relative tolerance for equality of the metric at the optimum and its minimum
+
+
+@dataclass(frozen=True, slots=True)
+class Design:
+    """A design: decimal gains in SI, objective, transparency metric, and whether it is proved."""
+
+    gains: tuple[tuple[str, float, str], ...]
+    value: float
+    transparency: float
+    proved: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ParetoFront(Result):
+    """Designs from the smallest metric to the best objective; `knee` is the index of the knee.
+
+    The knee is farthest from the straight line between the ends, each axis counted from one end to the other.
+    `criterion` is the stability criterion, one of `parameter_studies.stability_criteria`; `limitations` lists
+    the limitations of the designs, `notes` the progress of the search.
+    """
+
+    shown_by = "tuning_output:pareto_front"
+
+    topology: str
+    objective: str
+    unit: str
+    maximize: bool
+    tradeoff: str
+    tradeoff_unit: str
+    designs: tuple[Design, ...]
+    knee: int
+    criterion: str
+    limitations: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the front; return the matplotlib Axes. Raises ApcError (E875) without matplotlib."""
+        return self._shown("picture", ax)
+
+
+def pareto_front(
+    system: Model,
+    spec: TuningSpec,
+    tradeoff: TransparencyMetric,
+    *,
+    points: int = POINTS,
+    seconds: float = float("inf"),
+    progress: Progress | None = None,
+) -> ParetoFront:
+    """Return the optimal designs for several bounds on a transparency metric.
+
+    Parameters
+    ----------
+    system, spec
+        As for `tune`.
+    tradeoff
+        The transparency metric; its `most` is ignored.
+    points
+        The number of designs.
+    seconds, progress
+        As for `tune`; the time limit is for all designs together.
+
+    Raises
+    ------
+    ApcError
+        E996 the metric is smallest at the best objective.
+    """
+    until = time.monotonic() + seconds
+    constraints = ConstraintSet(system, prepare(system), replace(spec, transparency_metrics=(tradeoff,)))
+    every = constraints.every()
+
+    def transparency(gains: Floats) -> float:
+        """Return the largest metric of all scenarios at gains (m,)."""
+        points = ((scenario.setting, np.append(gains, scenario.point)[None]) for scenario in every)
+        return max(float(constraints.measured(*point, constraints.spec)[0, 0, 0]) for point in points)
+
+    best = tune(system, spec, seconds=seconds, progress=progress)
+    least = Objective(
+        tradeoff.label, len(spec.free), False, TRANSPARENCY[tradeoff.name][0], ((1.0, tradeoff),)
+    )
+    other = tune(system, replace(spec, objective=least), seconds=until - time.monotonic(), progress=progress)
+    low, high = other.optimum, transparency(np.array([float(gain.value) for gain in best.gains]))
+    if not (best.feasible and other.feasible):
+        message = f"no gains were found in these ranges that meet all demands, whatever {tradeoff.label} is"
+        raise ApcError(Diagnostic("E996", TRADEOFF, message))
+    if not 0 < low < high * (1 - SAME):
+        message = f"the best {spec.objective.label} is the best for {tradeoff.label}, too"
+        message = (
+            f"{tradeoff.label} can be below 0: there are no bounds in equal ratios" if low <= 0 else message
+        )
+        raise ApcError(Diagnostic("E996", TRADEOFF, message))
+    designs, notes = [_design(best, high)], best.notes
+    for index, bound in enumerate(np.geomspace(high, low * LEAST, points)[1:].tolist(), 1):
+        left = until - time.monotonic()
+        if left <= 0:
+            notes = (*notes, f"the time was up after {index} of {points} bounds, the largest first")
+            break
+        requested = replace(
+            spec, transparency_metrics=(*spec.transparency_metrics, replace(tradeoff, most=bound))
+        )
+        tuning = tune(system, requested, seconds=left, progress=progress)
+        if tuning.feasible:
+            designs.append(
+                _design(tuning, transparency(np.array([float(gain.value) for gain in tuning.gains])))
+            )
+    designs.sort(key=lambda design: design.transparency)
+    return ParetoFront(
+        topology=system.name,
+        objective=spec.objective.label,
+        unit=best.unit,
+        maximize=spec.objective.maximize,
+        tradeoff=tradeoff.label,
+        tradeoff_unit=TRANSPARENCY[tradeoff.name][0],
+        designs=tuple(designs),
+        knee=_knee(designs),
+        criterion=spec.criterion,
+        limitations=best.limitations,
+        notes=notes,
+    )
+
+
+def _design(tuning: Tuning, transparency: float) -> Design:
+    gains = tuple((gain.parameter, float(gain.value), gain.unit) for gain in tuning.gains)
+    return Design(gains, tuning.value, transparency, tuning.proved)
+
+
+def _knee(designs: list[Design]) -> int:
+    """Return the place of the design farthest from the line between the ends."""
+    points = np.array([(design.transparency, design.value) for design in designs])
+    size = np.ptp(points, axis=0)
+    shares = (points - points[0]) / np.where(size == 0, 1.0, size) * np.sign(points[-1] - points[0])
+    return int(np.argmax(shares[:, 1] - shares[:, 0]))

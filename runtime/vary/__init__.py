@@ -1,1 +1,0 @@
-"""Many values of some parameters at once, and where between them the verdict changes."""
