@@ -23,7 +23,13 @@ def __getattr__(name: str) -> Any:
 
         return program_version()
     lookup, _, public = _attached()
-    return public if name == "__all__" else lookup(name)
+    if name == "__all__":
+        return public
+    from apc.renamed import FUNCTIONS
+
+    if name in FUNCTIONS:
+        raise AttributeError(f"apc.{name} is named apc.{FUNCTIONS[name]} now")
+    return lookup(name)
 
 
 def __dir__() -> list[str]:

@@ -19,6 +19,7 @@ from types import UnionType
 from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from apc.compiler.compiled import Model
+from apc.renamed import ARGUMENTS
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -48,7 +49,10 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
         try:
             bound = signature.bind(*args, **kwargs)
         except TypeError as error:
-            raise TypeError(f"apc.{function.__name__}: {error}") from None
+            former = ARGUMENTS[""] | ARGUMENTS.get(function.__name__, {})
+            renamed = [f"{name}= is named {former[name]}= now" for name in kwargs if name in former]
+            message = renamed[0] if renamed else error
+            raise TypeError(f"apc.{function.__name__}: {message}") from None
         for name, value in bound.arguments.items():
             if name in hints and not _fits(value, hints[name]):
                 wants = re.sub(r"\w+\.", "", inspect.formatannotation(hints[name]))

@@ -134,6 +134,10 @@ def name_of(
     return name
 
 
+# Keys of the language before version 0.2, and their names since.
+RENAMED = {"about": "description", "above": "exclusive_min"}
+
+
 class MappingReader:
     """A mapping that is read key by key; a value at fault is recorded and reads as one that isn't there.
 
@@ -148,6 +152,11 @@ class MappingReader:
         self.nodes = {key.text: value for key, value in node.entries}
         for key, value in node.entries:
             if key.text not in allowed:
+                if (renamed := RENAMED.get(key.text, "")) in allowed:
+                    text = f"{subject} has no key {key.text}: it is named {renamed} now"
+                    mistakes.take(fault("E202", key.location, text, hint=renamed))
+                    self.nodes.setdefault(renamed, value)
+                    continue
                 left = [known for known in allowed if known not in self.nodes]  # what is there was meant
                 close = nearest(key.text, left)
                 text = f"{subject} has no key {brief(key.text)}"

@@ -11,6 +11,7 @@ import click
 
 from apc import cli
 from apc.cli.options import echo
+from apc.renamed import COMMANDS
 
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 80}
 SUFFIX = "_command"  # of the functions that `apc.cli` names
@@ -56,7 +57,12 @@ class CommandGroup(click.Group):
         return LISTED
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Return the command of a name, whose module is loaded now; None if there is none."""
+        """Return the command of a name, whose module is loaded now; None if there is none.
+
+        Raises click.UsageError for a former name.
+        """
+        if cmd_name in COMMANDS:
+            raise click.UsageError(f"apc {cmd_name} is named apc {COMMANDS[cmd_name]} now.", ctx)
         command: click.Command | None = getattr(cli, f"{cmd_name}{SUFFIX}", None)
         return command
 

@@ -23,6 +23,7 @@ from apc.compiler.files import is_stdout
 from apc.compiler.number_parsing import plain_int
 from apc.compiler.timings import part, record
 from apc.output.formatting import json_text
+from apc.renamed import OPTIONS
 from apc.result import Result
 from apc.threads import start_single_threaded
 
@@ -154,6 +155,19 @@ def criterion_with(hands: str, criterion: str | None) -> str | None:
 
 class Command(click.Command):
     """A command that says with --timings how long each of its parts took."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the words of a command line. Raises click.UsageError with the present name of a former
+        option.
+        """
+        try:
+            return super().parse_args(ctx, args)
+        except click.NoSuchOption as error:
+            former = OPTIONS[""] | OPTIONS.get(self.name or "", {})
+            if error.option_name not in former:
+                raise
+            message = f"{error.option_name} is named {former[error.option_name]} now."
+            raise click.UsageError(message, ctx) from None
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command with one thread of each library, its parts measured if that is asked for."""

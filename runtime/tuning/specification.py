@@ -57,6 +57,16 @@ TRANSPARENCY = {
 }
 _METRICS = ", ".join(f"{name}{' at 5 Hz' if at else ''}" for name, (_, at) in TRANSPARENCY.items())
 
+# Former names, for a message.
+FORMER = {
+    "feel.impedance": "impedance",
+    "feel.transmitted": "transmitted_velocity",
+    "feel.error": "coordination_error",
+    "feel.error_h2": "coordination_error_h2",
+    "feel.error_hinf": HINF,
+    "feel.damping": "damping",
+}
+
 # A sign within a name, but not in an exponent.
 _UNSPACED = re.compile(r"(?<![\d.])[a-z]\s*[+-]\s*[\d.a-z]")
 
@@ -343,14 +353,18 @@ def _objective(gains: Sequence[Range], maximize: str, minimize: str) -> Objectiv
 
 
 def _names_metric(text: str) -> bool:
-    """Whether a text begins with the name of a metric."""
+    """Whether a text begins with the name of a metric, or with a former one."""
     name = re.split(r"[\s<=]", text.strip(), maxsplit=1)[0]
-    return name in TRANSPARENCY
+    return name in TRANSPARENCY or name.startswith("feel.")
 
 
 def _measure(text: str, location: SourceLocation, wants: str = "") -> TransparencyMetric:
     """Read `impedance at 5 Hz`, or `damping`."""
     name, at, frequency = (item.strip() for item in text.strip().partition(" at "))
+    if name in FORMER:
+        message = f"{name} is named {FORMER[name]} now"
+        fix = f'{location.file} "{FORMER[name]}{at and f" at {frequency}"}{wants}"'
+        raise ApcError(Diagnostic("E996", location, message, hint=fix))
     if name not in TRANSPARENCY or bool(at) != TRANSPARENCY[name][1]:
         example = f'{location.file} "impedance at 5 Hz{wants}"'
         expected = f"one of {_METRICS}"

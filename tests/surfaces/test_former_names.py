@@ -1,0 +1,88 @@
+"""Former commands, options, functions, arguments, keys and metrics: one message each, with the new name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import apc
+from apc import cli
+from apc.compiler.source.reading import RENAMED
+from apc.renamed import ARGUMENTS, COMMANDS, FUNCTIONS, OPTIONS
+from apc.tuning.specification import FORMER, TRANSPARENCY
+from tests.commands import Cli
+from tests.topologies import AVERAGE, replaced
+
+EVERY = [(command, old, new) for command, pairs in OPTIONS.items() for old, new in pairs.items()]
+
+
+@pytest.fixture
+def topology(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    monkeypatch.chdir(tmp_path)
+    Path("t.yaml").write_text(AVERAGE, encoding="utf-8")
+    return "t.yaml"
+
+
+@pytest.mark.parametrize("old", COMMANDS)
+def test_a_former_command_names_the_present_one(old: str, topology: str, cli: Cli) -> None:
+    ran = cli(old, topology)
+    assert ran.code == 2 and ran.err.strip().endswith(f"Error: apc {old} is named apc {COMMANDS[old]} now.")
+    assert cli(COMMANDS[old], "--help").code == 0
+
+
+@pytest.mark.parametrize(("command", "old", "new"), EVERY)
+def test_a_former_option_names_the_present_one(
+    command: str, old: str, new: str, topology: str, cli: Cli
+) -> None:
+    ran = cli(command or "critical", old, "x", topology)
+    assert ran.code == 2 and ran.err.strip().endswith(f"Error: {old} is named {new} now.")
+    assert new in cli(command or "critical", "--help").out
+
+
+def test_a_former_function_names_the_present_one() -> None:
+    for old, new in FUNCTIONS.items():
+        with pytest.raises(AttributeError, match=rf"^apc\.{old} is named apc\.{new} now$"):
+            getattr(apc, old)
+        assert callable(getattr(apc, new)) and old not in dir(apc)
+
+
+def test_a_former_argument_names_the_present_one(topology: str) -> None:
+    calls = {"": apc.analyze, "export": apc.export, "simulate": apc.simulate, "tune": apc.tune}
+    for function, pairs in ARGUMENTS.items():
+        for old, new in pairs.items():
+            call = calls.get(function, apc.pareto_front)
+            with pytest.raises(TypeError, match=rf"^apc\.\w+: {old}= is named {new}= now$"):
+                call(topology, **{old: "x"})  # type: ignore[operator]
+
+
+@pytest.mark.parametrize("old", FORMER)
+def test_a_former_metric_names_the_present_one(old: str, topology: str, cli: Cli) -> None:
+    at = " at 5 Hz" if TRANSPARENCY[FORMER[old]][1] else ""
+    words = ["--free", "coordination.stiffness=10 N/m:100 N/m", "--time", "1 s"]
+    ran = cli("tune", topology, *words, "--minimize", old + at)
+    assert ran.code == 1 and f"E996 {old} is named {FORMER[old]} now." in ran.err
+    assert f'Write: --minimize "{FORMER[old]}{at}"' in ran.err
+
+
+@pytest.mark.parametrize("old", RENAMED)
+def test_a_former_key_names_the_present_one(old: str, topology: str, cli: Cli) -> None:
+    if old == "about":
+        Path(topology).write_text(replaced(AVERAGE, ("clocks:", "about: three users\nclocks:")), "utf-8")
+        words = ["check", topology]
+    else:
+        Path("parts").mkdir()
+        Path("parts/pad.yaml").write_text(
+            "component: Pad\nconnectors: {a: Flange}\nparameters: {k: {unit: N/m, above: 0}}\n"
+            "equations: [a.f = k*a.x]\n",
+            encoding="utf-8",
+        )
+        words = ["library", "Pad", "--folder", "parts"]
+    ran = cli(*words)
+    assert ran.code == 1 and ran.err.count("E2") == 1
+    assert f"has no key {old}: it is named {RENAMED[old]} now. Write: {RENAMED[old]}" in ran.err
+
+
+def test_no_former_name_is_a_present_one() -> None:
+    names = {name.removesuffix("_command") for name in dir(cli)}
+    assert not COMMANDS.keys() & names and set(COMMANDS.values()) <= names
