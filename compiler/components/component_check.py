@@ -316,13 +316,25 @@ def _location(where: Where, node: Expr) -> SourceLocation:
 
 
 def _settle(
-    waiting: Mapping[Path, Written],
+    unresolved: Mapping[Path, Written],
     infer: Callable[[Expr, Where], T | None],
     known: dict[Path, T | None],
 ) -> None:
-    """Infer something of each name, which may depend on others: round by round, while any is settled."""
+    """Add the inferred values of all names to `known`.
+
+    A value may depend on the values of other names: rounds are repeated until none adds a value.
+
+    Parameters
+    ----------
+    unresolved
+        The expression of each name, and its location.
+    infer
+        Returns the value of an expression, or None while a name in it has no value.
+    known
+        The values by name, None where missing; changed here.
+    """
     while True:
-        result = {name: infer(*written) for name, written in waiting.items() if known[name] is None}
+        result = {name: infer(*written) for name, written in unresolved.items() if known[name] is None}
         known |= result
         if all(value is None for value in result.values()):
             return

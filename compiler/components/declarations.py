@@ -124,10 +124,10 @@ def _equation(text: str, location: SourceLocation) -> Equation:
     return equation
 
 
-def _items(node: Node, message: str) -> tuple[Node, ...]:
+def _items(node: Node, subject: str) -> tuple[Node, ...]:
     if isinstance(node, Sequence):
         return node.items
-    raise fault("E203", node.location, message, "a list", form(node), "equations: [a + b = c]")
+    raise fault("E203", node.location, subject, "a list", form(node), "equations: [a + b = c]")
 
 
 def read_sends(root: MappingReader, mistakes: Mistakes) -> tuple[SentValue, ...]:

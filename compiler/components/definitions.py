@@ -175,11 +175,11 @@ def _check_limits(
             mistakes.add("E204", variable.location, message, expected=expected, got=got)
 
 
-def _peers(node: Node, message: str) -> int:
+def _peers(node: Node, subject: str) -> int:
     """Read `peers: 2`: for how many peers a component that follows others is."""
     if (count := whole_number(node) or 0) >= 2:
         return count
-    raise fault("E203", node.location, message, "a whole number from 2 on", form(node), "peers: 2")
+    raise fault("E203", node.location, subject, "a whole number from 2 on", form(node), "peers: 2")
 
 
 Declared = TypeVar("Declared", bound=Parameter | ComponentVariable)

@@ -212,7 +212,7 @@ class _Clocks:
         return self._clocks.get(self._root(name), "")
 
     def check_start(self, name: str, location: SourceLocation) -> None:
-        """Record a value at the start, or at the tick before, of a variable that has no start value."""
+        """Record the error E507 if a name such as `initial(x)` or `previous(x)` has no start value."""
         call, _, variable = name[:-1].partition("(")
         if call in ("initial", "previous") and not self.variables.get(variable, True):
             hint = f"variables: {{{variable.rpartition('.')[2]}: {{unit: …, start: 0}}}}"

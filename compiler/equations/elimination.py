@@ -33,7 +33,8 @@ MOST_BY_CRAMER = 3  # equations: the terms of a determinant grow with the factor
 class Elimination:
     """Open rows Σ coefficient·unknown + rest = 0, the rest under `ONE`, and the pivots taken out of them.
 
-    Entries with more nodes than `longest` get names that begin with `name`.
+    `longest` is the largest number of nodes of an unnamed entry. A longer entry gets a name that begins
+    with `name`.
     """
 
     def __init__(

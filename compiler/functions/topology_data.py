@@ -227,7 +227,7 @@ def check_links(topology: Topology, peer_types: Sequence[PeerType], indices: Seq
 
 
 def _timings(peer_type: PeerType, link: str) -> str:
-    """Return a reduction of a peer type over a link that is undefined without senders, if any."""
+    """Return the peer type's `mean`, `max` or `min` over a link, undefined without senders; "" if none."""
     operators = (
         receive.operator for clock in peer_type.clocks for receive in clock.receives if receive.link == link
     )
@@ -241,14 +241,16 @@ def compiled_groups(
     links: Sequence[Link],
     timings: Timings,
 ) -> tuple[Group, ...]:
-    """Return the groups with their numbers of senders; a setting that is a timing depends on that timing.
+    """Return the compiled groups with their numbers of senders.
+
+    A group value that is also a timing is replaced by a reference to that timing.
 
     Parameters
     ----------
     topology
         The topology.
     peer_types, indices
-        The peer types, and the index of each group's.
+        The peer types, and the index of each group's peer type.
     links
         The links in use.
     timings
@@ -257,17 +259,16 @@ def compiled_groups(
     Raises
     ------
     ApcError
-        E215 a graph some of whose peers send nothing.
+        E215 some peers of a graph send nothing over its link.
     """
     exact = {timing.name for timing in timings.result}
-    declared = _declared(topology)
     groups, declared = [], _declared(topology)
     for group, index in zip(topology.groups, indices, strict=True):
         values = []
         for name, value in group.values:
             timing = f"{group.name}.{name}"
-            local = replace(value, expression=Name(tuple(timing.split(".")))) if timing in exact else value
-            values.append(_of_part(name, local, declared))
+            compiled = replace(value, expression=Name(tuple(timing.split(".")))) if timing in exact else value
+            values.append(_of_part(name, compiled, declared))
         columns = tuple(PeerColumn(name, numbers) for name, numbers in group.columns)
         groups.append(Group(group.name, group.count, index, tuple(values), columns))
     for link in (link for link in topology.links if link.graph.shape != "complete"):

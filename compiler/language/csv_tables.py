@@ -126,7 +126,7 @@ class CsvReader:
         self,
         columns: Sequence[int],
         readers: Sequence[Callable[[str], float]],
-        message: str,
+        subject: str,
         expected: str,
         *,
         empty_too: bool = False,
@@ -138,8 +138,8 @@ class CsvReader:
         columns
             The zero-based column indices.
         readers
-            For each of them, what gives the number of a cell, or raises ValueError.
-        message, expected
+            For each column, a function that returns the number in a cell or raises ValueError.
+        subject, expected
             The name and the expected contents of a cell, for messages.
         empty_too
             Read rows whose cells are all empty, too; a line without a character is no row.
@@ -169,7 +169,7 @@ class CsvReader:
                     except ValueError:
                         at = location.shifted(sum(len(cell) + 1 for cell in cells[:column]))
                         got = brief(cells[column]) or "nothing"
-                        mistakes.add("E703", at, message, expected=expected, got=got)
+                        mistakes.add("E703", at, subject, expected=expected, got=got)
                         faulty.add(location.line)
             if len(faulty) >= MOST_MISTAKES:
                 break

@@ -103,11 +103,11 @@ class Bounds:
             return f"{self._shown(self.maximum)} {self.unit} or less"
         return ""
 
-    def check(self, value: ScalarValue, message: str, mistakes: Mistakes) -> None:
+    def check(self, value: ScalarValue, subject: str, mistakes: Mistakes) -> None:
         """Record a number that breaks the bounds."""
         if expected := self.fault(value.number):
             got = f"{self._shown(value.number)} {self.unit}"
-            mistakes.add("E207", value.location, message, expected=expected, got=got)
+            mistakes.add("E207", value.location, subject, expected=expected, got=got)
 
     def _shown(self, number: Fraction) -> str:
         return f"{float(number / self.scale):.12g}"
@@ -126,7 +126,7 @@ def text_location(node: Node) -> SourceLocation:
 
 def read_binding(
     node: Node,
-    message: str,
+    subject: str,
     dimension: Dimension,
     unit: str,
     known: Callable[[tuple[str, ...]], Dimension | None],
@@ -139,8 +139,8 @@ def read_binding(
     ----------
     node
         The YAML node.
-    message
-        Its name, for messages.
+    subject
+        The name of the number, for messages.
     dimension, unit
         The required dimension and unit.
     known
@@ -156,42 +156,42 @@ def read_binding(
         E203 not a single value, E204 a unit that does not match, E206 for every unknown name; and those of
         `quantity`, `parse_expression` and `dimension_of`.
     """
-    text, location = text_of(node, message, f"{message}: 1 {unit}"), node.location
+    text, location = text_of(node, subject, f"{subject}: 1 {unit}"), node.location
     number, local = dict(words).get(text), ""
     if number is None:
-        _refuse_marks(text, location, message)
-        _refuse_computed(text, location, message, unit)
+        _refuse_marks(text, location, subject)
+        _refuse_computed(text, location, subject, unit)
         if not is_quantity(text):
             location = text_location(node)
             tree = _tree(text, location)
-            actual = _dimension(tree, text, location, message, known, names_known)
+            actual = _dimension(tree, text, location, subject, known, names_known)
             if actual is not None and actual != ANY and (actual != dimension or actual.clashes(dimension)):
                 got, hint = _misfit(tree, actual, dimension, unit)
                 raise fault(
-                    "E204", location, message, unit, f"{brief(text)}, which {got}", f"{message}: {hint}"
+                    "E204", location, subject, unit, f"{brief(text)}, which {got}", f"{subject}: {hint}"
                 )
             return ValueBinding(None, tree, dimension, location)
-        _refuse_trailing(text, location, message, names_known)
-        _refuse_mixture(text, location, message, names_known)
-        read = quantity(text, location, subject=message, unit=unit)
+        _refuse_trailing(text, location, subject, names_known)
+        _refuse_mixture(text, location, subject, names_known)
+        read = quantity(text, location, subject=subject, unit=unit)
         number, local = read.value, read.unit.text
     return ValueBinding(number, None, dimension, location, local)
 
 
-def _refuse_marks(text: str, location: SourceLocation, message: str) -> None:
+def _refuse_marks(text: str, location: SourceLocation, subject: str) -> None:
     """Raise ApcError for a number with a decimal comma, or with thousands separators."""
     bare = text.strip()
     if (match := _COMMA.fullmatch(bare)) is not None:
         raise fault(
-            "E221", location, message, "a decimal point", brief(text), either_comma(message, *match.groups())
+            "E221", location, subject, "a decimal point", brief(text), either_comma(subject, *match.groups())
         )
     if (match := _SPACED.match(bare)) is not None:
         joined = re.sub(r"[^0-9+-]", "", match[0]) + bare[match.end() :]
         expected = "a number without spaces or marks inside"
-        raise fault("E221", location, message, expected, brief(text), f"{message}: {joined}")
+        raise fault("E221", location, subject, expected, brief(text), f"{subject}: {joined}")
 
 
-def _refuse_computed(text: str, location: SourceLocation, message: str, unit: str) -> None:
+def _refuse_computed(text: str, location: SourceLocation, subject: str, unit: str) -> None:
     """Raise ApcError for numbers that are computed and have a unit behind them, as 2*pi*100 N/m."""
     match = _COMPUTED.fullmatch(text.strip())
     if match is None or is_quantity(text) or not match["numbers"].strip():
@@ -200,28 +200,28 @@ def _refuse_computed(text: str, location: SourceLocation, message: str, unit: st
     with Mistakes():
         number = evaluate(parse_expression(match["numbers"], location), lambda _: 0, location)
         if parse_unit(match["unit"], location).dimension == parse_unit(unit, location).dimension:
-            hint = f"{message}: {float(number):.9g} {match['unit']}"
+            hint = f"{subject}: {float(number):.9g} {match['unit']}"
     if hint:
-        raise fault("E204", location, message, _NO_UNITS, brief(text), hint)
+        raise fault("E204", location, subject, _NO_UNITS, brief(text), hint)
 
 
 # A number next to a word, without a sign between them.
 _BESIDE = re.compile(r"(?P<number>[+-]?[\d.]+(?:[eE][+-]?\d+)?)\s*(?P<rest>\(*(?P<word>[A-Za-z]\w*))")
 
 
-def _refuse_trailing(text: str, location: SourceLocation, message: str, names_known: Collection[str]) -> None:
+def _refuse_trailing(text: str, location: SourceLocation, subject: str, names_known: Collection[str]) -> None:
     """Raise ApcError for a number next to a name without a sign between them, as 2pi*f."""
-    alongside = _BESIDE.match(text.strip())
-    if alongside is None or alongside["word"] not in {*names_known, "pi", *FUNCTIONS}:
+    implicit_product = _BESIDE.match(text.strip())
+    if implicit_product is None or implicit_product["word"] not in {*names_known, "pi", *FUNCTIONS}:
         return
     with Mistakes():
-        parse_unit(alongside["word"], location)
+        parse_unit(implicit_product["word"], location)
         return
-    hint = f"{message}: {alongside['number']}*{text.strip()[alongside.start('rest') :]}"
-    raise fault("E204", location, message, _NO_UNITS, brief(text), hint)
+    hint = f"{subject}: {implicit_product['number']}*{text.strip()[implicit_product.start('rest') :]}"
+    raise fault("E204", location, subject, _NO_UNITS, brief(text), hint)
 
 
-def _refuse_mixture(text: str, location: SourceLocation, message: str, names_known: Collection[str]) -> None:
+def _refuse_mixture(text: str, location: SourceLocation, subject: str, names_known: Collection[str]) -> None:
     """Raise ApcError for a quantity with a unit that goes on as an expression, as 500 N/m/(peers - 1)."""
     for word in re.finditer(r"[A-Za-z]\w*", text):
         before = text[: word.start()].rstrip(" (")
@@ -230,8 +230,8 @@ def _refuse_mixture(text: str, location: SourceLocation, message: str, names_kno
                 parse_unit(word.group(), location)
                 return
             number, rest = before[:-1].strip(), text[len(before) - 1 :].strip()
-            hint = f"{message}: total{rest}, with parameters: {{total: {number}}}"
-            raise fault("E204", location, message, _NO_UNITS, brief(text), hint)
+            hint = f"{subject}: total{rest}, with parameters: {{total: {number}}}"
+            raise fault("E204", location, subject, _NO_UNITS, brief(text), hint)
 
 
 def _misfit(tree: Expr, actual: Dimension, due: Dimension, unit: str) -> tuple[str, str]:

@@ -60,42 +60,42 @@ def fault(
     return ApcError(Diagnostic(code, location, message, expected, got, hint))
 
 
-def mapping_of(node: Node, message: str, hint: str = "") -> Mapping:
-    """Return a node that is a mapping.
+def mapping_of(node: Node, subject: str, hint: str = "") -> Mapping:
+    """Return a node, checked to be a mapping.
 
     Parameters
     ----------
     node
         The node.
-    message
-        The name of its value, for a message.
+    subject
+        The name of the value, for the message.
     hint
         The line to write instead.
 
     Raises
     ------
     ApcError
-        E203 if it is none.
+        E203 the node is no mapping.
     """
     if isinstance(node, Mapping):
         return node
-    raise fault("E203", node.location, message, "a mapping of keys to values", form(node), hint)
+    raise fault("E203", node.location, subject, "a mapping of keys to values", form(node), hint)
 
 
-def text_of(node: Node, message: str, hint: str = "") -> str:
+def text_of(node: Node, subject: str, hint: str = "") -> str:
     """Return the text of a scalar that isn't empty; arguments and error as for `mapping_of`."""
     if isinstance(node, Scalar) and node.text.strip() and node.value is not None:
         return node.text
-    raise fault("E203", node.location, message, "a single value", form(node), hint)
+    raise fault("E203", node.location, subject, "a single value", form(node), hint)
 
 
-def list_of(node: Node, message: str, size: int, item: str) -> tuple[Node, ...]:
-    """Return the items of a list with `size` of them; `item` is one to show in a message. Raises E203."""
+def list_of(node: Node, subject: str, size: int, item: str) -> tuple[Node, ...]:
+    """Return the items of a list of `size` items; `item` is an example for the message. Raises E203."""
     if isinstance(node, Sequence) and len(node.items) == size:
         return node.items
     got = f"{len(node.items)}" if isinstance(node, Sequence) else form(node)
-    hint = f"{message}: [{', '.join([item] * size)}]"
-    raise fault("E203", node.location, message, f"a list of {size} values", got, hint)
+    hint = f"{subject}: [{', '.join([item] * size)}]"
+    raise fault("E203", node.location, subject, f"a list of {size} values", got, hint)
 
 
 def whole_number(node: Node) -> int | None:

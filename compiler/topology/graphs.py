@@ -140,11 +140,11 @@ def _peers(counts: Mapping[str, int]) -> dict[str, int]:
     return {name: k for k, name in enumerate(names)} | {str(k + 1): k for k in range(len(names))}
 
 
-def _arc(pair: Node, message: str, numbered: Mapping[str, int], mistakes: Mistakes) -> tuple[int, int, float]:
+def _arc(pair: Node, subject: str, numbered: Mapping[str, int], mistakes: Mistakes) -> tuple[int, int, float]:
     """Return the sender and the receiver of a pair, zero-based, and its weight."""
     if not isinstance(pair, Sequence) or len(pair.items) not in (2, 3):
         expected = "two peers, and a weight if it isn't 1"
-        raise fault("E203", pair.location, message, expected, form(pair), "[1, 2]")
+        raise fault("E203", pair.location, subject, expected, form(pair), "[1, 2]")
     ends: list[int] = []
     for node in pair.items[:2]:
         with mistakes:

@@ -268,11 +268,11 @@ def _loss(link: str, node: Node, numbers: NamedNumbers) -> Named[ScalarValue]:
     return ((name_p, p), *others)
 
 
-def _probability(node: Node, message: str, numbers: NamedNumbers) -> ScalarValue:
-    value = numbers.read(node, message, DIMENSIONLESS, "%")
+def _probability(node: Node, subject: str, numbers: NamedNumbers) -> ScalarValue:
+    value = numbers.read(node, subject, DIMENSIONLESS, "%")
     if 0 <= value.number <= 1:
         return value
     got = brief(node.text) if isinstance(node, Scalar) else ""
     bare = isinstance(node, Scalar) and isinstance(node.value, int | float) and 1 < value.number <= 100
-    hint = f"{message}: {got} %" if bare else ""
-    raise fault("E261", value.location, message, "a probability, 0 % to 100 %", got, hint)
+    hint = f"{subject}: {got} %" if bare else ""
+    raise fault("E261", value.location, subject, "a probability, 0 % to 100 %", got, hint)

@@ -37,16 +37,16 @@ TUNED = ("free", "maximize", "minimize", "subject", "over", "hands")
 def read_experiment(root: MappingReader, numbers: NamedNumbers) -> Experiment:
     """Read `experiment: {duration: 3 s, seed: 1}`; `numbers` reads the duration, in seconds."""
 
-    def duration(node: Node, message: str) -> Fraction:
-        value = numbers.read_time(node, message, "s")
+    def duration(node: Node, subject: str) -> Fraction:
+        value = numbers.read_time(node, subject, "s")
         if value.number <= 0:
-            raise fault("E207", value.location, message, "more than 0 s", str(value))
+            raise fault("E207", value.location, subject, "more than 0 s", str(value))
         return value.number
 
-    def seed(node: Node, message: str) -> int:
+    def seed(node: Node, subject: str) -> int:
         number = whole_number(node)
         if number is None or not 0 <= number < 2**63:
-            raise fault("E203", node.location, message, "a whole number, 0 or more", form(node))
+            raise fault("E203", node.location, subject, "a whole number, 0 or more", form(node))
         return number
 
     section = _section(root, "experiment", EXPERIMENT, "{duration: 3 s}")

@@ -166,13 +166,13 @@ class NamedNumbers:
         binding = read_binding(node, subject, dimension, unit, self.dimension, self.names, words)
         return settle(binding, self.number)
 
-    def read_time(self, node: Node, message: str, unit: str = "ms") -> ScalarValue:
+    def read_time(self, node: Node, subject: str, unit: str = "ms") -> ScalarValue:
         """Read a time, mostly in `unit`; a rate in Hz counts as its reciprocal. Raises ApcError."""
         if not (isinstance(node, Scalar) and node.text.rstrip().endswith("Hz")):
-            return self.read(node, message, SECOND, unit)
-        rate = self.read(node, message, SECOND.power(-1), "Hz")
+            return self.read(node, subject, SECOND, unit)
+        rate = self.read(node, subject, SECOND.power(-1), "Hz")
         if rate.number <= 0:
-            raise fault("E207", node.location, message, "a rate above 0 Hz", brief(node.text))
+            raise fault("E207", node.location, subject, "a rate above 0 Hz", brief(node.text))
         return ScalarValue(1 / rate.number, SECOND, None, rate.location)
 
     def read_for(self, node: Node, subject: str, item: Settable) -> ScalarValue:

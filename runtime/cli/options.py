@@ -27,7 +27,7 @@ from apc.renamed import OPTIONS
 from apc.result import Result
 from apc.threads import start_single_threaded
 
-# What the annotation of a parameter says of its option, where `option` says nothing else.
+# Settings of an option by the annotation of its parameter, unless `option` overrides them.
 FILE = {"type": click.Path(path_type=Path), "metavar": "FILE"}
 BY_TYPE: dict[str, dict[str, Any]] = {
     "bool": {"is_flag": True},
@@ -39,18 +39,18 @@ BY_TYPE: dict[str, dict[str, Any]] = {
 
 
 def option(text: str, metavar: str | None = None, *, name: str = "", **settings: Any) -> Any:
-    """Return what a parameter of a command has in the place of a default: its option.
+    """Return a function that makes the click option of a parameter; it is the parameter's default value.
 
     Parameters
     ----------
     text
         The option's help.
     metavar
-        What stands for its value in the help.
+        The placeholder of its value in the help.
     name
-        As it is written; `--` and the parameter's name if not given.
+        The option's name; by default `--` and the parameter's name.
     settings
-        More that click's `Option` takes, beside what the parameter's annotation says: see `BY_TYPE`.
+        Arguments of click's `Option`; they override those of the parameter's annotation (`BY_TYPE`).
     """
 
     def make(parameter: inspect.Parameter) -> click.Parameter:
@@ -67,7 +67,7 @@ def option(text: str, metavar: str | None = None, *, name: str = "", **settings:
 
 
 def argument(**settings: Any) -> Any:
-    """Return the same for an argument: `settings` are those of click's `Argument`."""
+    """Return a function that makes the click argument of a parameter; `settings` are click's `Argument`'s."""
     return lambda parameter: click.Argument([parameter.name], **settings)
 
 

@@ -256,17 +256,17 @@ def _is_undecided(solved: _SolvedLoop, lowest: float) -> bool:
 
 
 def _proof(solved: Sequence[_SolvedLoop], drifts: int) -> StabilityProof:
-    """Return the text of the proof, "" where floats decided everything."""
-    bits = max((item.bits for item in solved), default=0)
+    """Return the proof of stability or instability; `NO_PROOF` where floats decided all eigenvalues."""
+    bits = max((loop.bits for loop in solved), default=0)
     if not bits:
         return NO_PROOF
-    unstable = [item.bits for item in solved if item.inside is False]
+    unstable = [loop.bits for loop in solved if loop.inside is False]
     outcome = ProofOutcome.DRIFTS if drifts else ProofOutcome.STABLE
     if any(unstable):
         outcome, bits = ProofOutcome.UNSTABLE, max(unstable)
-    elif any(item.inside is None for item in solved):
+    elif any(loop.inside is None for loop in solved):
         outcome = ProofOutcome.UNDECIDED
-    elif unstable or not all(item.bits for item in solved if len(item.pairs.values)):
+    elif unstable or not all(loop.bits for loop in solved if len(loop.pairs.values)):
         outcome = ProofOutcome.PARTLY
     return StabilityProof(ProofMethod.BALLS, bits, outcome)
 
@@ -359,11 +359,14 @@ def _mode_of(motions: Sequence[ModeMotion], number: int) -> tuple[ModeMotion]:
 def _motions(
     systems: Sequence[ClosedLoop], solved: Sequence[_SolvedLoop], indices: Sequence[tuple[int, int]]
 ) -> tuple[ModeMotion, ...]:
-    """Return the modes of some eigenvalues, given by their systems and rows."""
+    """Return the mode motions of some eigenvalues.
+
+    Each of `indices` is the index of a system and the row of the eigenvalue in it.
+    """
     result: dict[tuple[int, int], ModeMotion] = {}
     with single_threaded(), np.errstate(all="ignore"):
         for s, (system, item) in enumerate(zip(systems, solved, strict=True)):
-            rows = [row for local, row in indices if local == s]
+            rows = [row for index_of_system, row in indices if index_of_system == s]
             if rows:
                 motions = _described(system, item, np.array(rows, dtype=np.intp))
                 result |= {(s, row): motion for row, motion in zip(rows, motions, strict=True)}

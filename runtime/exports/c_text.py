@@ -61,7 +61,7 @@ def _filled(file: str, peer: ExportedPeer, **values: object) -> str:
 def header(peer: ExportedPeer) -> str:
     """Return the header: the inputs, outputs, memory and functions of a peer."""
     peer_type, units = peer.peer_type, parameter_units(peer)
-    named = [(peer_type.parameters[index], units[peer_type.parameters[index]]) for index in peer.settable]
+    settings = [(peer_type.parameters[index], units[peer_type.parameters[index]]) for index in peer.settable]
     return _filled(
         "peer.h",
         peer,
@@ -76,7 +76,7 @@ def header(peer: ExportedPeer) -> str:
             for clock in peer_type.clocks
             for output, unit in zip(clock.outputs, clock.units, strict=True)
         ],
-        settings=[f"{local} [{unit}]" for local, unit in named],
+        settings=[f"{parameter} [{unit}]" for parameter, unit in settings],
         stored=_stored(peer),
     )
 

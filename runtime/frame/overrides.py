@@ -127,15 +127,18 @@ def apply(system: Model, overrides: Sequence[Override]) -> Model:
 
 
 def _counts(system: Model, everywhere: Mapping[str, Fraction]) -> dict[str, Fraction]:
-    """Return the number of peers of each group with the given values, empty if none of them changes."""
-    now = {group.name: Fraction(group.count) for group in system.groups}
-    requested = {group_count(name) for name in now}
+    """Return the number of peers of each group after an override; empty if no number changes.
+
+    `everywhere` are the overridden values that hold for all groups, by parameter name.
+    """
+    counts = {group.name: Fraction(group.count) for group in system.groups}
+    count_names = {group_count(name) for name in counts}
     scope = scope_of(system)
-    if scope.needed(requested).isdisjoint(everywhere):
+    if scope.needed(count_names).isdisjoint(everywhere):
         return {}
-    changed = scope.follow(everywhere, exact_value, lambda name: scope.holder[name].number, requested)
-    result = {name: changed.get(group_count(name), count) for name, count in now.items()}
-    return result if result != now else {}
+    values = scope.follow(everywhere, exact_value, lambda name: scope.holder[name].number, count_names)
+    result = {name: values.get(group_count(name), count) for name, count in counts.items()}
+    return result if result != counts else {}
 
 
 def _changed(scope: ParameterScope, given: Mapping[str, Fraction]) -> dict[str, Fraction]:

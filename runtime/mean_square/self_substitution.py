@@ -101,8 +101,8 @@ def quadrature(n: int, lost: float, most: int) -> tuple[Floats, Floats]:
         return outcomes.astype(np.float64), np.array(weights)
     k, chance = np.arange(most), 1 - lost
     middle = n * chance + k * (1 - 2 * chance)
-    alongside = np.sqrt(k[1:] * (n - k[1:] + 1.0) * chance * lost)
-    nodes, vectors = np.linalg.eigh(np.diag(middle) + np.diag(alongside, 1) + np.diag(alongside, -1))
+    off_diagonal = np.sqrt(k[1:] * (n - k[1:] + 1.0) * chance * lost)
+    nodes, vectors = np.linalg.eigh(np.diag(middle) + np.diag(off_diagonal, 1) + np.diag(off_diagonal, -1))
     return nodes, vectors[0] ** 2
 
 
@@ -117,37 +117,39 @@ def self_substitution(system: Model, reception: PerTickReception) -> Moments:
         The peers, from `class_moments.build_reception` with substitutes; packets are due at the start of
         frames.
     """
-    of = classes_of(reception)
-    receivers, offsets, _ = receivers_of(system, reception, of.common, of.weights)
+    classes = classes_of(reception)
+    receivers, offsets, _ = receivers_of(system, reception, classes.common, classes.weights)
     sizes = np.diff(offsets).tolist()
     width = max(sizes)
-    blocks, moving = [], []
-    for local, peer_versus_rest in enumerate(of.loops):
+    blocks, moment_coordinates = [], []
+    for index, peer_versus_rest in enumerate(classes.loops):
         starts = np.cumsum([0, *(sizes[g] for g in peer_versus_rest.of)]).tolist()
         matrix = _mean(receivers, peer_versus_rest, starts)
-        at = relative_coordinates(
+        coordinates = relative_coordinates(
             neutral_state(matrix, peer_versus_rest.neutral, peer_versus_rest.loop, starts)
         )
-        bounded, observed, shares = with_uncertainty(at), [], []
+        bounded, received_forms, shares = with_uncertainty(coordinates), [], []
         for subsystem, g in enumerate(peer_versus_rest.of):
             for weights, forms in _forms(receivers[g], peer_versus_rest, subsystem, starts, matrix):
-                observed.append(np.pad(forms[..., at.rest], [*[(0, 0)] * 2, (0, width - sizes[g]), (0, 0)]))
+                received_forms.append(
+                    np.pad(forms[..., coordinates.rest], [*[(0, 0)] * 2, (0, width - sizes[g]), (0, 0)])
+                )
                 shares.append(
                     np.outer(np.arange(len(sizes)) == g, peer_versus_rest.many[subsystem] * weights)
                 )
         into = relative_rows(
-            MIDPOINT_RADIUS.exact(np.eye(starts[-1], width) * (np.arange(width) < sizes[local])),
+            MIDPOINT_RADIUS.exact(np.eye(starts[-1], width) * (np.arange(width) < sizes[index])),
             bounded,
             MIDPOINT_RADIUS,
         )
-        inner = relative_rows(matrix[..., at.rest], bounded, MIDPOINT_RADIUS)
-        listed = np.concatenate(observed), np.concatenate(shares, axis=-1)
-        blocks.append(MomentBlock(inner, into[None], (local,), *listed))
-        moving.append(MomentCoordinates(peer_versus_rest, at, tuple(starts)))
-    everything = np.ones((len(sizes), width, width))
+        inner = relative_rows(matrix[..., coordinates.rest], bounded, MIDPOINT_RADIUS)
+        reception_terms = np.concatenate(received_forms), np.concatenate(shares, axis=-1)
+        blocks.append(MomentBlock(inner, into[None], (index,), *reception_terms))
+        moment_coordinates.append(MomentCoordinates(peer_versus_rest, coordinates, tuple(starts)))
+    ones_by_class = np.ones((len(sizes), width, width))
     entries = sum(size * (size + 1) // 2 for size in sizes)
-    operator = Operator(tuple(blocks), with_error_radius(everything, np.zeros_like(everything)))
-    return Moments(operator, tuple(moving), entries, max(operator.sizes))
+    operator = Operator(tuple(blocks), with_error_radius(ones_by_class, np.zeros_like(ones_by_class)))
+    return Moments(operator, tuple(moment_coordinates), entries, max(operator.sizes))
 
 
 def receivers_of(

@@ -259,6 +259,7 @@ def answer_document(answer: AnalysisReport) -> Plain:
 
 
 def _mode_table(modes: Sequence[Mode]) -> Lines:
+    """Yield a table of the slowest modes, and a count of the other modes."""
     # Modes indistinguishable from zero are only counted: their rounding depends on the machine.
     alive = [mode for mode in modes if _is_alive(mode)]
     rows = [mode for mode in alive if mode.eigenvalue.imag >= -mode.error]  # a conjugate pair is one row

@@ -42,7 +42,7 @@ LABEL = 256  # bytes of a name with its unit in a MAT- or NPZ-file, without the 
 
 
 class Arrays(TableWriter):
-    """Variables `time`, `values` (rows, signals), `names`, `units`, and what made them; abstract.
+    """A file of `time`, `values` (rows, signals), `names`, `units` and the provenance; abstract.
 
     They are written in one piece: the rows wait in the memory, and room is kept for them on the disk.
     """
@@ -219,13 +219,13 @@ class Recording:
 
 
 def open_recording(path: Path, simulation: Simulation) -> Recording:
-    """Begin a file, its format chosen by the suffix.
+    """Return an open recording of a simulation; the suffix selects the file format.
 
     Raises
     ------
     ApcError
-        E876 it would not fit the memory, E878 no such format, E879 it can't be written, E875 a library it
-        needs is not installed.
+        E876 the file needs too much memory, E878 unknown format, E879 it can't be written, E875 a required
+        library is not installed.
     """
     suffix, columns = check_suffix(path, SUFFIXES, "--out"), len(simulation.signals) + 1
     block = min(simulation.rows, simulation.length * len(simulation.sample_times))
@@ -234,9 +234,9 @@ def open_recording(path: Path, simulation: Simulation) -> Recording:
         each += WAITING * simulation.rows
     elif suffix == ".parquet":
         each += IN_PARQUET[0] + IN_PARQUET[1] * -(-simulation.rows // block)
-    needed, subject = columns * each, f"{simulation.rows:,} rows of {columns:,} columns in {path.name}"
+    needed, contents = columns * each, f"{simulation.rows:,} rows of {columns:,} columns in {path.name}"
     refuse_beyond(
-        needed, "E876", SourceLocation(simulation.system.origin.topology), subject, "fewer --signals"
+        needed, "E876", SourceLocation(simulation.system.origin.topology), contents, "fewer --signals"
     )
     return Recording(path, simulation)
 

@@ -170,17 +170,17 @@ def _proof_lines(tuning: Tuning) -> Lines:
 
 
 def _changing_lines(tuning: Tuning) -> Lines:
-    """Yield the result for the gains under a time-varying delay."""
+    """Yield the stability of the tuned gains under a time-varying delay, by numbers of peers."""
     if tuning.delay is None:
         return
-    gains_of: dict[str, list[str]] = {}
+    cases_by_text: dict[str, list[str]] = {}
     for counts, result in tuning.changing:
         numbers = ", ".join(f"{label} {number}" for label, number in counts)
-        gains_of.setdefault(changing_text(result, tuning.delay), []).append(numbers)
-    for text, where in gains_of.items():
+        cases_by_text.setdefault(changing_text(result, tuning.delay), []).append(numbers)
+    for text, cases in cases_by_text.items():
         yield from wrapped(text, "  ", "    ")
-        if any(where):
-            yield from wrapped(f"with {'; '.join(where)}", "    ", "    ")
+        if any(cases):
+            yield from wrapped(f"with {'; '.join(cases)}", "    ", "    ")
 
 
 def _where(binding: ActiveConstraint) -> str:

@@ -208,12 +208,12 @@ def write_run(folder: Path, system: Model, peers: Sequence[PeerRun], *, whole: b
 
 
 def _write_peer(folder: Path, peer: PeerRun, system: Model) -> None:
-    """Write a peer's record, and a trace of every incoming link. Raises OSError on failure."""
-    words = msgspec.json.encode({field.name: getattr(peer, field.name) for field in fields(PeerRecord)})
+    """Write a peer's record, and the delay trace of each incoming directed link. Raises OSError."""
+    record = msgspec.json.encode({field.name: getattr(peer, field.name) for field in fields(PeerRecord)})
     arrays = {name: getattr(peer, name) for name in ARRAYS}
     for name in OF_ROUTES:
-        arrays |= {f"{name}{at}": item for at, item in enumerate(getattr(peer, name))}
-    arrays["record"] = np.frombuffer(words, np.uint8)
+        arrays |= {f"{name}{at}": array for at, array in enumerate(getattr(peer, name))}
+    arrays["record"] = np.frombuffer(record, np.uint8)
     np.savez_compressed(folder / f"{file_name(peer.name)}.npz", **arrays)
     for link, sender in peer.arcs:
         rows = (

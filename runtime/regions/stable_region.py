@@ -396,7 +396,19 @@ def _refuse_two_times(system: Model, times: Sequence[ParameterRef]) -> None:
 
 
 def _check_count(axis: Range, both: bool, timed: bool, meant: str, *, affine: bool) -> None:
-    """Refuse a number of peers on an axis of a region without steps: ApcError E903."""
+    """Raise ApcError E903 for a number of peers on an axis where the region cannot be drawn in steps.
+
+    Parameters
+    ----------
+    axis
+        The axis of the number of peers.
+    both, timed
+        Whether the other axis is a number of peers, or a time.
+    meant
+        The stability criterion.
+    affine
+        Whether the model is linear.
+    """
     reasons = {
         "two numbers of peers": both,
         "a time beside it": timed,

@@ -276,13 +276,13 @@ def _straightened(window: Floats) -> Floats:
 
 
 def _drifts(window: Floats) -> bool:
-    """Return whether the mean of some channel drifts from quarter to quarter, by no less each time.
+    """Return whether the quarter means of a channel drift in one direction by steps of like size.
 
-    The step to the last quarter must be a large share of its range: what oscillates more does not drift.
+    The last step must also be a large share of the range of the last quarter: an oscillation is no drift.
     """
     quarters = np.array_split(window, 4)
     steps = np.diff([part.mean(axis=0) for part in quarters], axis=0)
     onwards = (np.sign(steps) == np.sign(steps[0])).all(axis=0)
-    stored = np.abs(steps[2]) > STORED * np.abs(steps[0])
+    kept = np.abs(steps[2]) > STORED * np.abs(steps[0])
     large = np.abs(steps[2]) > np.maximum(RAMP * np.ptp(window, axis=0), STEADY * np.ptp(quarters[3], axis=0))
-    return bool((onwards & stored & large).any())
+    return bool((onwards & kept & large).any())

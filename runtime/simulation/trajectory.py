@@ -264,9 +264,9 @@ def trajectory_of(
     Parameters
     ----------
     simulation
-        The model that was played.
+        The simulated model.
     keeper
-        Its rows.
+        The stored rows.
     summary, interrupted
         As `run_simulation` returns them.
     error

@@ -198,11 +198,11 @@ def _range(label: str, unit: str, text: str, default: int) -> tuple[Fraction, ..
     return (low, *inner, high)
 
 
-def _count(message: str, text: str) -> int:
+def _count(subject: str, text: str) -> int:
     """Read the number of values: a single value is written as a value, not as a range."""
     if not (text.isascii() and text.isdecimal() and len(text) <= MOST_DIGITS and int(text) >= 2):
         raise ApcError(
-            Diagnostic("E881", LOCATION, message, "2 values or more", text[:40] or "nothing", _FORM)
+            Diagnostic("E881", LOCATION, subject, "2 values or more", text[:40] or "nothing", _FORM)
         )
     return int(text)
 
