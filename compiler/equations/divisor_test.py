@@ -77,7 +77,7 @@ class _Residues:
         self.random = random.Random(0)
 
     def vanishes(self, expression: Term) -> bool:
-        """Return whether an expression is zero, where numbers differ from peer to peer for one of them."""
+        """Return whether an expression is zero for at least one peer."""
         if np.any(np.equal(self(expression), 0)):
             return True
         if not expression.has(sympy.Function) or _is_long(expression):

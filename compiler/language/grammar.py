@@ -241,6 +241,7 @@ class _Trees(TREE):
     """The actions of the rules and tokens of expression.lark; a node's text includes its parentheses."""
 
     def NUMBER(self, token: Token) -> Token:
+        """Return the token of a number, its length and size checked. Raises ParseError E323."""
         if len(token) > MAX_DIGITS:
             expected = f"at most {MAX_DIGITS} characters"
             raise ParseError("E323", token, "a number", expected, f"{len(token)}")

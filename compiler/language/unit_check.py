@@ -140,6 +140,7 @@ class _Checker:
         return DIMENSIONLESS if dimension == ANY else dimension
 
     def dimension(self, expr: Expr) -> Dimension | None:
+        """Return the dimension of an expression; None after an error, ANY for the literal 0."""
         if isinstance(expr, NumberLiteral):
             return DIMENSIONLESS if expr.value else ANY
         if isinstance(expr, Name):

@@ -243,10 +243,10 @@ def _meant(unit: Unit, requested: Unit) -> tuple[str, str]:
     return next(fitting, (requested.text if unit.scale == requested.scale else "", ""))
 
 
-def _is_of(text: str, requested: Dimension) -> bool:
-    """Return whether a text is a unit of a dimension; a derived unit may not be, as a root of mm."""
+def _is_of(text: str, dimension: Dimension) -> bool:
+    """Return whether a text is a unit of a dimension; False if it cannot be read as a unit."""
     try:
-        return _unit(text).dimension == requested
+        return _unit(text).dimension == dimension
     except ParseError:
         return False
 

@@ -100,7 +100,7 @@ def parse_source(data: bytes, *, file: str, path: Path | None = None) -> Source:
 
 
 def _missing(path: Path) -> str:
-    """Report a missing file, with the nearest name in its folder."""
+    """Return the message for a missing file, with the nearest name in its folder."""
     folder = path.parent
     try:
         known = sorted(entry.name for entry in folder.iterdir())

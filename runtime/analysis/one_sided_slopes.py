@@ -415,7 +415,23 @@ def _names(switched: SwitchedPeerType, pieces: Sequence[LinearPiece]) -> list[st
 def _side(
     topology: Instance, prepared: Prepared, origins: Sequence[int], chosen: Sequence[LinearPiece], name: str
 ) -> Side:
-    """Return the model with a piece for each peer or group; neighbours on one side are one group again."""
+    """Return the model on one side of a kink: each group with its linear piece.
+
+    Consecutive groups of equal origin and equal piece are merged.
+
+    Parameters
+    ----------
+    topology
+        The instance.
+    prepared
+        The numeric model.
+    origins
+        The index of the original group of each group.
+    chosen
+        The linear piece of each group.
+    name
+        The name of the side.
+    """
     system = topology.system
     numbers: dict[tuple[int, _Taken, Moving], int] = {}
     built: list[SubsystemJacobians] = []

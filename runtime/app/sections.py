@@ -125,7 +125,7 @@ def _named(mode: Mode) -> str:
 
 
 def _limits(analysis: Analysis) -> str:
-    """Return in a sentence which motion decides the verdict."""
+    """Return a sentence on the dominant mode: its growth or decay, and its largest participations."""
     if not analysis.modes:
         return "Nothing moves."
     dominant = analysis.modes[0]

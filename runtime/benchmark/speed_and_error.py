@@ -383,19 +383,19 @@ def _distance(simulation: Simulation, exact: Simulation) -> float:
 def _first(
     calls: Mapping[str, Callable[[], Any]],
 ) -> tuple[dict[str, Any], tuple[tuple[str, Note], ...], dict[str, list[float]]]:
-    """Call everything once; return what came out, what was refused and why, and the times of slow ones."""
+    """Call each method once; return the results, the failures with reasons, and the times of slow methods."""
     results, slow = {}, {}
     refused: list[tuple[str, Note]] = []
     for name, call in calls.items():
         try:
-            used, results[name] = timed(call)
+            seconds, results[name] = timed(call)
         except ApcError as error:
             refused.append((name, reason_of(error)))
         except Exception as error:  # a bug of one method is a result, and no reason to lose the others'
             refused.append((name, Limitation(LimitationCode.CRASHED, (repr(error),))))
         else:
-            if used > ENOUGH:
-                slow[name] = [used]
+            if seconds > ENOUGH:
+                slow[name] = [seconds]
     return results, tuple(refused), slow
 
 

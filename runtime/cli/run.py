@@ -109,6 +109,7 @@ def run_command(
 
 
 def _secret(path: Path | None) -> bytes:
+    """Return the shared secret in a file, b"" without one. Raises ApcError E974."""
     if path is None:
         return b""
     from apc.compiler.files import RefusedError, read_file

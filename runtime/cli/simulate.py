@@ -158,7 +158,7 @@ def _check_rows(out: Path) -> None:
 
 
 def _simulate_many(system: Model, how: Settings, runs: int, jobs: int, *, as_json: bool) -> None:
-    """Play a topology many times and print what that amounts to."""
+    """Simulate a topology many times and print the statistics."""
     from apc.simulation.monte_carlo import simulate_many
 
     with progress_bar("simulate", "runs") as show:
@@ -175,7 +175,7 @@ def _simulate_many(system: Model, how: Settings, runs: int, jobs: int, *, as_jso
 
 
 def _simulate_single(system: Model, how: Settings, stored: _StoredRows, *, as_json: bool) -> None:
-    """Play a topology once, keep what is wanted of it, and print what it amounts to."""
+    """Simulate a topology once, store the requested rows, and print the summary."""
     from apc.simulation.accuracy import compare_with
     from apc.simulation.simulation import prepare
     from apc.simulation.trajectory import Keeper, SimulationReport, provenance_of, trajectory_of

@@ -99,12 +99,14 @@ def scope_of(
 
 
 def with_times_of_groups(system: Model, given: Mapping[str, V]) -> dict[str, V]:
-    """Return values for all groups, and with each the timings that groups set for themselves.
+    """Return values by name, extended by the timings of groups that follow from them.
 
-    One value for all groups replaces a group's own. A timing of a group that is given itself keeps its value.
+    A value for all groups replaces the timings of single groups, except those that are in `given` too.
     """
-    local = {time: value for name, value in given.items() for time in times_of(system, name) if time != name}
-    return local | dict(given)
+    group_timings = {
+        time: value for name, value in given.items() for time in times_of(system, name) if time != name
+    }
+    return group_timings | dict(given)
 
 
 def _rows(name: str, formula: Formula, values: list[Any]) -> Any:

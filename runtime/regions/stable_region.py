@@ -365,18 +365,18 @@ def _starts(
 ) -> tuple[Side, ...]:
     """Return the models at the start, one for each side of a kink, with their Jacobians linearized there.
 
-    None where the start does not decide, or where the number of sides changes over the rectangle.
+    Empty where the start does not decide, or where the number of sides changes over the rectangle.
     """
-    listed = sides(system, prepared)
-    if len(listed) > 1:
+    kink_sides = sides(system, prepared)
+    if len(kink_sides) > 1:
         for value in rectangle.values(INSIDE).tolist():
             elsewhere = apply(system, overrides_at(system, free, value))
-            if len(sides(elsewhere, prepared)) != len(listed):
+            if len(sides(elsewhere, prepared)) != len(kink_sides):
                 return ()
-    starts = [prepare_at_start(side.system, side.prepared, free) for side in listed]
+    starts = [prepare_at_start(side.system, side.prepared, free) for side in kink_sides]
     return tuple(
         replace(side, prepared=start)
-        for side, start in zip(listed, starts, strict=True)
+        for side, start in zip(kink_sides, starts, strict=True)
         if start is not None and None not in starts
     )
 

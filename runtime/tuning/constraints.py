@@ -286,9 +286,16 @@ class ConstraintSet:
         return np.asarray(np.maximum(values, NONE))
 
     def changing(self, setting: int, numbers: Floats) -> Floats:
-        """Return ln of the loop gain under a delay that changes, (k,), with gains and box (k, n).
+        """Return ln of the loop gain (k,) under a time-varying delay.
 
-        It is proved from above (see `time_varying_delay.loop_gain`), and the same for every constant delay.
+        It is a proved upper bound (see `time_varying_delay.loop_gain`) and independent of constant delays.
+
+        Parameters
+        ----------
+        setting
+            The index of the scenario's overrides.
+        numbers
+            The values (k, n) of the gains and of the uncertain parameters.
         """
         overrides, _ = self.settings[setting]
         counts, delay = overrides[: len(self.spec.counts)], self.spec.delay
