@@ -1,6 +1,6 @@
 """Check whether a compiled model on disk is up to date with its texts.
 
-Takes: the path of a NAME.apc. Gives: `Origin`, what a model was made from, `origin_of`, `replayable`;
+Takes: the path of a NAME.apc. Gives: `Origin`, the sources of a model, `origin_of`, `replayable`;
 `Archive`, the parts of a file, `packed`, `read_archive`; `changed`, the first text that differs now;
 `builtin_files`, `program_digest`.
 Guarantees: the decision is by content only, without modification times or algebra imports. A model is passed
@@ -129,7 +129,7 @@ def read_archive(path: Path) -> Archive:
         numbers = (pair for change in made_from.changes for pair in change)
         if not all(name == HANDS_CHANGE or _RATIONAL.fullmatch(value) for name, value in numbers):
             raise ValueError
-    except (ValueError, RecursionError):  # what is nested too deeply
+    except (ValueError, RecursionError):  # nested too deeply
         raise fault("E604", location, FOREIGN, hint=hint) from None
     return Archive(made_from, model, is_sealed(whole, sealed), form[2] == b"compiled")
 
@@ -218,7 +218,7 @@ def builtin_files() -> dict[str, Path]:
 
 @functools.cache
 def program_digest() -> str:
-    """Return the SHA-256 of what compiles: every text of the compiler, and the version of CasADi."""
+    """Return the SHA-256 of the compiler: all of its source texts, and the version of CasADi."""
     compiler = Path(__file__).resolve().parent
     whole = hashlib.sha256(importlib.metadata.version("casadi").encode())
     for path in sorted(path for path in compiler.rglob("*") if path.suffix in (".py", ".lark", ".txt")):

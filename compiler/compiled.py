@@ -310,7 +310,7 @@ class PeerType:
     or without hands those with a connector for hands.
     `linear` is the peer type that represents it in a linear analysis, of the same states and parameters, None
     where that is the peer type itself; `replaced` are the parts in which they differ.
-    `symbols` are those of published wall conditions with the numbers that play them, empty unless every part
+    `symbols` are those of published wall conditions with their parameters or numbers, empty unless every part
     but hands has some.
     """
 

@@ -85,7 +85,7 @@ _CODES = {
 _NAMES = {code: word for word, code in _CODES.items()}
 # CasADi's Newton iteration ends before it takes a step smaller than this, in SI. That step is taken
 # afterwards and squares the error: the rest is rounding. A bound on the residual would depend on its scale.
-POLISH = "polish"  # what that step is called
+POLISH = "polish"  # the name of that step
 NEWTON = {"abstol": 0.0, "abstolStep": 1e-11, "max_iter": 100, "show_eval_warnings": False}
 
 
@@ -94,7 +94,7 @@ class PlainFunction:
     """A function of columns to columns.
 
     `inputs` are (name, number of entries); `operations` are (word, value) or (word, value, value); `results`
-    the values that make up each output; `tables` what some of them look up.
+    the values that make up each output; `tables` the tables that some of them look up.
     """
 
     inputs: tuple[tuple[str, int], ...]
@@ -150,7 +150,7 @@ def composed(name: str, loops: Sequence[AlgebraicLoop], result: Any, words: Sequ
     name
         The function's name.
     loops, result
-        SX functions of the inputs and of what the loops before have found.
+        SX functions of the inputs and of the solutions of the loops before.
     words
         The names of the inputs.
     """

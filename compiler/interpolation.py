@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-TABLE = "table"  # what the function of a table is called; CasADi calls its derivatives fwd1_table and so on
+TABLE = "table"  # the name of the function of a table; CasADi calls its derivatives fwd1_table and so on
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -97,7 +97,7 @@ def recounted(system: Model, counts: Mapping[str, Fraction], location: SourceLoc
     Parameters
     ----------
     system
-        The model, in which `peers` and what follows from it have their new values already.
+        The model, in which `peers` and its dependent parameters have their new values.
     counts
         The new count of each group.
     location

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from apc.simulation.limit_cycle import LimitCycle
 
 # How far the radius that is differentiated may be from that of the analysis, relative to 1: roundings of a
-# well-conditioned frame stay below 1e-12; beyond ten times that, floats have lost what derivatives need.
+# well-conditioned frame stay below 1e-12; beyond ten times that, floats lose the digits of derivatives.
 SAME_RADIUS = 1e-11
 
 # More peers than this, if different or on a graph, are too many for default sensitivities.
@@ -332,7 +332,7 @@ def sensitivities_of(system: Model, prepared: Prepared, analysis: Analysis) -> S
     Parameters
     ----------
     system, prepared
-        The model, and what `numeric_model.prepare` made of it.
+        The model, and the result of `numeric_model.prepare`.
     analysis
         Its analysis.
     """

@@ -860,7 +860,7 @@ def simulate(
     trace_of: Literal["worst"] | None = None,
     error: bool = False,
 ) -> Trajectory:
-    """Play a model in time.
+    """Simulate a model in time.
 
     Parameters
     ----------

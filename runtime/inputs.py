@@ -91,7 +91,7 @@ def _is_topology(path: Path) -> bool:
 
 
 def load_fresh(path: Path) -> Model:
-    """Read a compiled model. Raises ApcError if it is damaged, or if what it was made from has changed."""
+    """Read a compiled model. Raises ApcError if it is damaged, or if its source texts have changed."""
     archive = read_archive(path)
     topology = path.with_name(archive.origin.topology)
     # `Path.is_file` raises for a name that is too long, which no file has.
@@ -197,7 +197,7 @@ def check_model_name(topology: Path) -> None:
     ------
     ApcError
         E617 another topology's model has the same name; E601 of that name is a device or pipe, which whoever
-        packed the folder put there, or a link to what is no compiled model.
+        packed the folder put there, or a link to a file that is no compiled model.
     """
     if not topology.name:
         return  # "." or "/": a folder; its reader reports the error

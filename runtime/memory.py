@@ -45,7 +45,7 @@ MACHINE = Path("/proc/meminfo")
 
 
 def refuse_beyond(needed: float, code: str, location: SourceLocation, subject: str, hint: str) -> None:
-    """Refuse what needs more memory than there is.
+    """Refuse a computation that needs more memory than there is.
 
     Parameters
     ----------

@@ -84,7 +84,7 @@ class ProofMethod(Term):
 
 
 class ProofOutcome(Term):
-    """What a proof came to; `PARTLY` where it decides only what floats left open."""
+    """The outcome of a proof; `PARTLY` where it decides only the cases that floats left open."""
 
     STABLE = "proved stable"
     DRIFTS = "proved to drift"
@@ -99,7 +99,7 @@ class ProofOutcome(Term):
 
 
 class ProofScope(Term):
-    """Of what a proof is, where it is not of the topology as it is."""
+    """The subject of a proof, where it is not the unchanged topology."""
 
     LINEARIZATION = "the linearization"
     NOMINAL_NETWORK = "the nominal network"
@@ -149,7 +149,7 @@ NO_PROOF = StabilityProof()
 
 
 class LimitationCode(Term):
-    """What a result does not cover, or what is wrong with it."""
+    """A limitation of a result, or a fault in it."""
 
     NOT_PROVED = "not proved"
     NO_BALLS = "no ball arithmetic"

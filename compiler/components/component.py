@@ -201,7 +201,7 @@ class Component:
     grips: tuple[str, ...] = ()
     peers: int = 0
     linearized: Linearized | None = None  # None where the equations themselves are linearized
-    symbols: Named[str] = ()  # symbols of published wall conditions, and the parameters that play them
+    symbols: Named[str] = ()  # symbols of published wall conditions, and their parameters
 
     def parameter(self, name: str) -> Parameter | None:
         """Return the parameter of this name, or None."""

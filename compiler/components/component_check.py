@@ -1,6 +1,6 @@
 """Whether a component is sound: names, units, reductions and balance, checked once, before any use of it.
 
-Takes: a component as it was read. Gives: `ComponentNames`, which infers what is not declared and checks the
+Takes: a component as it was read. Gives: `ComponentNames`, which infers undeclared dimensions and checks the
 equations; `check_balance`.
 Guarantees: every name in an equation is declared and every equation's units agree; a mistake is said once.
 Does not: read text (see `definitions`).
@@ -351,7 +351,7 @@ def _visible_names(component: Component) -> Iterator[tuple[Path, Dimension]]:
 
 
 def _known(dimension: Dimension | None) -> Dimension:
-    """Return a dimension that was inferred; what fits every dimension, such as 0, has none."""
+    """Return an inferred dimension; an expression that fits every dimension, such as 0, is dimensionless."""
     return DIMENSIONLESS if dimension in (None, ANY) else dimension
 
 

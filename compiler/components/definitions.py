@@ -110,7 +110,7 @@ def read_component(source: Source, library: Definitions) -> Component:
 
 
 def _symbols(root: MappingReader, component: Component) -> tuple[tuple[str, str], ...]:
-    """Read `symbols: {K: stiffness}`: the parameters that play symbols of published conditions."""
+    """Read `symbols: {K: stiffness}`: the parameters for the symbols of published conditions."""
     names = {parameter.name: None for parameter in component.parameters}
 
     def read(key: Scalar, value: Node) -> tuple[str, str]:

@@ -230,7 +230,7 @@ def read_entry(entry: PartEntry, scope: EntryScope, mistakes: Mistakes, index: i
     Parameters
     ----------
     entry
-        The entry, and what it is of.
+        The entry in the topology, with its component.
     scope
         The names that it can refer to.
     mistakes

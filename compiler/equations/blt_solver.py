@@ -63,7 +63,7 @@ def solve_blocks(
         As many equations as unknowns.
     problem
         Collects E503 a loop without an unknown to solve for, E511 linear equations that depend on each other,
-        E512 what is no number.
+        E512 a constant that is no number.
 
     Raises
     ------

@@ -28,7 +28,7 @@ Derivative = tuple[str, int]  # a variable and how often it is differentiated
 
 @dataclass(frozen=True, slots=True)
 class DifferentiatedNames:
-    """The names of what moves: `variables`, and those of held forces, which jump."""
+    """The names of time-varying quantities: `variables`, and held forces, which jump."""
 
     variables: Collection[str]
     jumping: Collection[str]

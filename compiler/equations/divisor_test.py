@@ -134,7 +134,7 @@ _POWER: Any = np.frompyfunc(_power, 3, 1)
 
 
 def _float_at(node: Term, point: Mapping[Symbol, float]) -> float:
-    """Return the value of an expression at a point in floats; raises what Python's arithmetic raises."""
+    """Return the value of an expression at a point in floats. Raises the errors of Python's arithmetic."""
     if node.is_Symbol:
         return point[node]
     if node.is_Rational:

@@ -1,7 +1,7 @@
 """A block of linear equations solved by Gaussian elimination with sparse symbolic rows.
 
-Takes: linear forms, and the tests of what may be divided by. Gives: `Elimination`, `eliminate`.
-Guarantees: what is divided by is never zero with the parameter values; a long entry gets a name of its own,
+Takes: linear forms, and the tests of divisors. Gives: `Elimination`, `eliminate`.
+Guarantees: a divisor is never zero with the parameter values; a long entry gets a name of its own,
 so that a chain of a thousand equations stays as long as it was.
 Does not: know sizes: numbers come in when a model runs.
 

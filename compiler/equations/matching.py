@@ -2,7 +2,7 @@
 
 Takes: which unknowns each equation holds. Gives: `match`.
 Guarantees: the same input gives the same matching.
-Does not: know what an equation or an unknown is.
+Does not: use the content of an equation or unknown.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Equations as residuals and what solving them gives: assignments, and loops that an iteration has to solve.
+"""Equations as residuals and their solution: assignments, and loops that an iteration has to solve.
 
 Takes: nothing (data types).
 Gives: `Residual`, `Problem`; `Assignment`, `ImplicitBlock`, their union `Step`, `Definition`; `listed`,
@@ -38,7 +38,7 @@ class Residual:
 class Problem:
     """The context of a solution: the test of divisors, and the collector of errors.
 
-    `where` is what a message calls the equations; `location` is where it points when there are none.
+    `where` is the name of the equations in messages; `location` is used when there are none.
     """
 
     where: str
@@ -103,7 +103,7 @@ class ImplicitBlock:
 
 
 Step = Assignment | ImplicitBlock
-Definition = Term | ImplicitBlock  # what gives an unknown its value
+Definition = Term | ImplicitBlock  # defines the value of an unknown
 
 
 def listed(texts: Sequence[str | Residual]) -> str:

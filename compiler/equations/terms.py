@@ -101,6 +101,7 @@ class Max(PiecewiseFunction):
     stays = ">="  # what the best so far is to the next
 
     def _eval_derivative(self, by: Symbol) -> Term:
+        """Return the derivative by a symbol: that of the selected argument (SymPy calls this method)."""
         best, slope = self.args[0], self.args[0].diff(by)
         for argument in self.args[1:]:
             slope = If.between(FUNCTIONS[self.stays](best, argument), slope, argument.diff(by))

@@ -4,7 +4,7 @@ Takes: `SortedPeerType`. Gives: `CasadiWriter`.
 Guarantees: written in the order in which things depend on one another, and nothing that isn't needed; a chain
 of definitions may be as long as it likes; what a nonlinear loop finds is a symbol, and a function that needs
 it solves the loop by Newton's iteration first.
-Does not: choose what is written (see `functions`).
+Does not: choose the written expressions (see `functions`).
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class CasadiWriter:
             receive.symbol for receive in peer_type.receives
         }
         self.parameters: dict[str, Any] = {}
-        self.loops: list[tuple[Any, Any, Any]] = []  # unknowns (n,), where they begin, what is to be zero
+        self.loops: list[tuple[Any, Any, Any]] = []  # unknowns (n,), their start values, the residuals
 
     def follow(self, received: Collection[str]) -> None:
         """Write the dependencies of states, limited signals and received sends.

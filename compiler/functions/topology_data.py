@@ -337,7 +337,7 @@ def _named(
 
 
 def _declared(topology: Topology) -> dict[str, NumberParameter | ComponentVariable]:
-    """Return by whole name what declares each number and start value of the parts."""
+    """Return the declaration of each number and start value of the parts, by qualified name."""
     result: dict[str, NumberParameter | ComponentVariable] = {}
     for part in topology.parts:
         for declared in (part.component.variables, part.component.numbers):

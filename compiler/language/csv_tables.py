@@ -31,7 +31,7 @@ from apc.compiler.number_parsing import plain_float
 from apc.compiler.source.reading import brief, fault
 
 MAX_BYTES = 1 << 26  # 64 MiB: some eight million numbers, read in a few seconds
-PACKED = ".gz"  # the suffix of what gzip packed
+PACKED = ".gz"  # the suffix of files that gzip packed
 MOST_COLUMNS = 1000  # more than a topology has parameters that differ from peer to peer
 MOST_MISTAKES = 20  # of one table; a wrong column has as many as rows
 _EXAMPLE = "device.mass [kg]"

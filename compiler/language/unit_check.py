@@ -33,7 +33,7 @@ ANY = Dimension((("any", 1),))
 
 _HALF = NumberLiteral(Fraction(1, 2))
 
-# What the arguments behind the first have to be.
+# Functions whose arguments after the first are times, and the expectation shown in errors.
 _TIMES = {"hold": "s, as a delay", "interpolate": "s, as tables are over time"}
 Lookup = Callable[[Name], Dimension | None]
 

@@ -292,7 +292,7 @@ def _number(text: str, offset: int) -> Fraction:
 
 @lru_cache(maxsize=1024)
 def _unit(text: str) -> Unit:
-    """Return a unit: what its names come to by Pint."""
+    """Return a unit: the product of its names according to Pint."""
     if len(text) > MAX_LENGTH:
         raise ParseError("E222", 0, "a unit", f"at most {MAX_LENGTH} characters", f"{len(text)}")
     try:
@@ -319,7 +319,7 @@ def _unit(text: str) -> Unit:
 
 
 def _refuse(text: str, fault: UnexpectedToken) -> NoReturn:
-    """Raise E222 for what cannot follow in a unit."""
+    """Raise E222 for a character that cannot follow in a unit."""
     token, bare, hint = fault.token, text.strip(), ""
     if "NAME" in fault.expected:
         expected = "a name such as N, m or s"

@@ -112,9 +112,9 @@ def name_of(
     Parameters
     ----------
     key, subject
-        The scalar, and what it names, for a message.
+        The scalar, and the noun for the named thing, for the message.
     used, whole
-        The names that are used already, and in what.
+        The names already in use, and the section that has them.
     words
         The words of the language, which can't be names.
 

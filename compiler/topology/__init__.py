@@ -1,1 +1,1 @@
-"""A topology section by section: who is there, what couples them, what carries."""
+"""A topology section by section: groups, parts, couplings, links."""

@@ -52,7 +52,7 @@ def read_graph(node: Node, numbers: NamedNumbers) -> Graph:
     node
         The node.
     numbers
-        Knows the groups, reads tables of arcs, and takes what is at fault in them.
+        Knows the groups, reads tables of arcs, and collects their errors.
 
     Raises
     ------

@@ -167,12 +167,11 @@ def _count(name: str, body: MappingReader, table: Table | None, counted: ScalarV
 
 @dataclass(frozen=True, slots=True)
 class GroupReader:
-    """Reads what groups set for themselves.
+    """Reads the settings of groups.
 
-    `settable` is what can be set, by the name a person writes; `parts` are all parts of the topology, each
-    before the parts inside it; `redeclared` names parts that are of another type at a group, by group;
-    `explain` raises, of a name that can't be set and its place, a better message
-    than ours, or that one was given.
+    `settable` are the settable declarations, by the name in the topology; `parts` are all parts of the
+    topology, each before the parts inside it; `redeclared` are the names of parts with another type at a
+    group, by group; `explain` raises a more specific error for a name that can't be set, if there is one.
     """
 
     settable: SettableNames

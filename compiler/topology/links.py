@@ -49,7 +49,7 @@ PROBABILITIES = {
 }
 LOSS_EXAMPLE = "loss: {p: 1 %, r: 25 %}"
 _EXAMPLES = {"loss": "loss: 2 %", "jitter": "jitter: 2 ms", "trace": "trace: delays.csv"}
-# What a number of a link's losses is, where one is read.
+# The declaration by which each number of a link's losses is read.
 PROBABILITY = Parameter(
     name="probability",
     unit=Unit("%", Fraction(1, 100), DIMENSIONLESS),

@@ -29,9 +29,9 @@ def redeclared(groups: Iterable[GroupBody], parts: PartEntries) -> dict[str, dic
     Parameters
     ----------
     groups
-        The groups, with what each sets.
+        The groups, with their settings.
     parts
-        The parts of the topology; its mistakes get what is wrong with a type.
+        The parts of the topology; errors in a type are added to its mistakes.
     """
     result: dict[str, dict[str, PartEntry]] = {}
     for group in groups:

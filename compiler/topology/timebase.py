@@ -1,4 +1,4 @@
-"""The clocks of a topology: what ticks, how often and from when on.
+"""The clocks of a topology: their periods and phases.
 
 Takes: the section `clocks`. Gives: `ClockDeclaration`, `read_clocks`.
 Guarantees: a period is more than nothing, a phase less than its period; both are exact.

@@ -53,7 +53,7 @@ TOPOLOGY = (
     "experiment",
     "studies",
 )
-# Those that it must have, and what to write.
+# The required sections, and an example of each.
 REQUIRED = {
     "topology": "my-topology",
     "peers": "{user: {count: 3}}",
@@ -235,7 +235,7 @@ class _Names:
         return [name for name, entry in self.sections.entries.items() if entry.section == "links"]
 
     def of_role(self, role: str, word: str) -> Collection[str]:
-        """Return the clocks or links, unused ones first. Raises what is wrong with their section."""
+        """Return the clocks or links, unused ones first. Raises the errors of their section."""
         section = f"{role}s"
         node = self.root.nodes.get(section)
         if word and node is None:

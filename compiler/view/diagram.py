@@ -138,7 +138,7 @@ def _part_lines(topology: Topology, part: PartInstance, count: int) -> Iterator[
 
 
 def _numbers(topology: Topology, part: PartInstance) -> Iterator[str]:
-    """Yield a part's numbers, those that are zero left out, and its words that are no default."""
+    """Yield a part's nonzero numbers, start values, options other than the default, and tables."""
     for name, entries in by_vector(part.values, itemgetter(0)).items():
         if any(value.number for _, value in entries):
             yield f"{name} {_quantities(part, entries)}"

@@ -1,4 +1,4 @@
-"""The value of any stage before the last as text for a person to read: what `apc compile --until` prints.
+"""The value of any stage before the last as text for a person to read: the output of `apc compile --until`.
 
 Takes: the value of a stage. Gives: `describe`.
 Guarantees: the same topology gives the same bytes.

@@ -272,7 +272,7 @@ def _silent(subsystem: SubsystemJacobians) -> SubsystemJacobians:
 
 
 def _too_much(prepared: Prepared, default: Analysis, times: int) -> str:
-    """Return why an analysis is not repeated by default, "" if it is."""
+    """Return the reason for not repeating an analysis by default, "" if it is repeated."""
     if default.method not in QUICK_METHODS:
         why = f"analysed by {default.method} they take long (--event-order)"
         return f"not repeated under other conventions: {why}"

@@ -88,7 +88,7 @@ def severity(stable: bool | None, measure: float) -> tuple[int, float]:
     stable
         The verdict; None is undecided, which is worse than stable and better than unstable.
     measure
-        What orders equal verdicts, larger if worse: a spectral radius, or a missing damping. NaN is worst.
+        The order of equal verdicts, larger if worse: a spectral radius or a missing damping. NaN is worst.
     """
     return {False: 2, None: 1, True: 0}[stable], math.inf if math.isnan(measure) else measure
 

@@ -278,7 +278,7 @@ class RootsFigure:
         )
 
     def path_of(self, result: Plain) -> None:
-        """Draw where the eigenvalues go as a slider goes through all its values."""
+        """Draw the root locus: the eigenvalues over the range of a slider."""
         self.path.data = {"x": result["real"], "y": result["imag"], "name": result["name"]}
         self.path_text.show_text(
             f"Dots: where they are for {result['slider']} from {result['from']} to {result['to']}."

@@ -50,7 +50,7 @@ class AnimationFrames:
 
 
 def motion_of(system: Model, *, struck: bool) -> AnimationFrames:
-    """Play a model: as it begins, or with the first peer's device struck besides.
+    """Simulate a model: from its start values, or with the first peer's device struck besides.
 
     Parameters
     ----------

@@ -517,7 +517,7 @@ class TopologyTab:
         return ""
 
     def _request_region(self) -> tuple[Range, Range, str] | None:
-        """Return the axes of the region, and what stable means there; None if there are no two axes."""
+        """Return the axes of the region, and its stability criterion; None without two axes."""
         if len(set(self.chosen)) < 2:
             return None
         axes = axes_of(self.sliders, self.positions, (self.chosen[0], self.chosen[1]))

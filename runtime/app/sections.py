@@ -72,7 +72,7 @@ class SectionAnswer:
 
 @lru_cache(maxsize=1)
 def _open_model(model: bytes) -> tuple[Model, Prepared]:
-    """Return the model of a page, and what all its analyses share."""
+    """Return the model of a page, and its numeric model, which all its analyses share."""
     system = model_of_bytes(model)
     return system, prepare(system)
 

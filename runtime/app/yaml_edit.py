@@ -312,7 +312,7 @@ def _at(root: _Node, path: Sequence[str]) -> _Node | None:
 def _put(text: str, path: Sequence[str], value: str) -> str:
     """Return a text with a value at the end of a path; missing keys are added.
 
-    What other aliases repeat of this place is written out in their places, as it was.
+    Other aliases of the changed node are replaced by its former text.
     """
     nodes = [_tree(text)]
     for index, key in enumerate(path, 1):

@@ -39,9 +39,9 @@ ENOUGH = 2.0  # seconds after which one is not repeated
 class HardCase:
     """One topology: the answer beside the truth.
 
-    `error` is |ρ − truth|, `bound` what the analysis says it is at most, both divided by max(ρ, 1) where ρ
+    `error` is |ρ − truth|, `bound` the error bound of the analysis, both divided by max(ρ, 1) where ρ
     is the truth. `seconds` is the median time of the analysis. `undecided` says that it left the verdict
-    open. `failed` says what is wrong, "" if nothing is: no bound and no verdict are failures too, since the
+    open. `failed` is the failure, "" if none: no bound and no verdict are failures too, since the
     truth is known.
     """
 

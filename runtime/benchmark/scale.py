@@ -1,4 +1,4 @@
-"""What more peers cost: time, memory and error against their number.
+"""The cost of the number of peers: time, memory and error.
 
 Takes: a topology file and the numbers of peers.
 Gives: `Scale`, `ScaleRow`, `scale`.

@@ -49,12 +49,12 @@ Floats = NDArray[np.float64]
 # none after its first run if that alone did.
 ROUNDS, ENOUGH = 15, 3.0
 
-# Errors below this are one: which of two is smaller is luck. An eigenvalue of n states is computed to some n
+# Errors below this count as equal: their order is random. An eigenvalue of n states is computed to some n
 # roundings, a state after so many ticks to about as many as the root of their number; topologies have tens of
 # states and hundreds of ticks.
 SAME = 64 * UNIT_ROUNDOFF
 
-# How long the topology is played: longer than any start-up.
+# Duration of the simulation: longer than any start-up.
 DURATION = Fraction(1, 4)
 
 # Limitations that no method may have.
@@ -84,7 +84,7 @@ class MethodTiming:
 
     @property
     def fails(self) -> bool:
-        """Whether the true error is above what the method says it is at most."""
+        """Whether the true error exceeds the method's error bound."""
         return self.error is not None and self.bound is not None and not self.error <= self.bound
 
 
@@ -114,7 +114,7 @@ class TaskComparison:
 
     @property
     def faults(self) -> tuple[str, ...]:
-        """What must not be: a wrong verdict or bound, or a method that crashes."""
+        """The failures: a wrong verdict or bound, or a method that crashes."""
         wrong = [note for note in self.notes if code_of(note) in WRONG]
         crashed = [pair for pair in self.refused if code_of(pair[1]) is LimitationCode.CRASHED]
         return (*map(str, wrong), *(f"{name} {reason}" for name, reason in crashed))
@@ -133,7 +133,7 @@ class Bench(Result):
 
     @property
     def faults(self) -> tuple[str, ...]:
-        """What must not be, on any topology: none where all is well."""
+        """The failures on all topologies, empty if there are none."""
         return tuple(fault for comparison in self.comparisons for fault in comparison.faults)
 
 
@@ -147,7 +147,7 @@ def bench(system: Model, *, rounds: int = ROUNDS, duration: Fraction = DURATION)
     rounds
         Runs of each method, fewer of slow ones.
     duration
-        How long the topology is played, in seconds.
+        The duration of the simulation, in seconds.
 
     Raises
     ------
@@ -158,7 +158,7 @@ def bench(system: Model, *, rounds: int = ROUNDS, duration: Fraction = DURATION)
         analysis = bench_analysis(system, rounds=rounds)
         try:
             simulation = bench_simulation(system, duration, rounds=rounds)
-        except ApcError as error:  # what is too large to be played can be analysed all the same
+        except ApcError as error:  # a model too large to simulate can still be analysed
             simulation = _simulation(duration, (), "nothing is played", (("every method", reason_of(error)),))
     return Bench(system.name, system.peers, machine(), (analysis, simulation))
 
@@ -169,7 +169,7 @@ def reason_of(error: ApcError) -> str:
 
 
 def machine() -> dict[str, str]:
-    """Return what was measured on."""
+    """Return the description of the machine."""
     return {
         "system": f"{platform.system()} {platform.machine()}",
         "processor": _processor(),
@@ -410,8 +410,8 @@ def pareto_front(measured: Sequence[MethodTiming]) -> tuple[MethodTiming, ...]:
 
     One beats another if it is faster by more than both spreads together and not less right, or more right and
     not slower. Half the distance between the quartiles is 0.67 of a normal deviation σ, the median of 15 runs
-    is certain to 0.32 σ, so that a difference of both spreads is three deviations of what luck makes. More
-    right is what errs less by more than luck (`SAME`). Without errors there is no front.
+    is certain to 0.32 σ, so that a difference of both spreads is three deviations of the random part. More
+    right is what errs less by more than chance (`SAME`). Without errors there is no front.
     """
     return tuple(
         replace(

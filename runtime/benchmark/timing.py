@@ -22,19 +22,19 @@ LEAST_ROUNDS = 3
 
 
 def timed(call: Callable[[], Result]) -> tuple[float, Result]:
-    """Return the processor's seconds of a call, and what it returned."""
+    """Return the processor's seconds of a call, and its result."""
     began = time.process_time()
     result = call()
     return time.process_time() - began, result
 
 
 def median_time(call: Callable[[], Result], runs: int, *, enough: float = math.inf) -> tuple[float, Result]:
-    """Return the median of the processor's seconds of some runs, and what the last one returned.
+    """Return the median of the processor's seconds of some runs, and the result of the last one.
 
     Parameters
     ----------
     call
-        What is run, at least once.
+        The function to run, at least once.
     runs
         How often.
     enough
@@ -51,7 +51,7 @@ def median_time(call: Callable[[], Result], runs: int, *, enough: float = math.i
 def alternate(
     calls: Mapping[str, Callable[[], Any]], rounds: int, *, enough: float = math.inf
 ) -> dict[str, list[float]]:
-    """Time all calls in rounds, so that what slows the machine for a while slows them alike.
+    """Time all calls in rounds, so that a temporary load on the machine slows all of them equally.
 
     Parameters
     ----------

@@ -30,7 +30,7 @@ from apc.simulation.simulation import SimulationPlan, plan_of
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Code(Result):
-    """One peer of a model in C, and the method of what moves in it."""
+    """One peer of a model in C, and the integration method of its states."""
 
     topology: str
     code: ExportedPeer

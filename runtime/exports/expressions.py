@@ -1,10 +1,10 @@
 """A peer type's functions as expressions of Modelica.
 
-Takes: a `casadi.Function` of scalar operations, and what its inputs are called.
+Takes: a `casadi.Function` of scalar operations, and the names of its inputs.
 Gives: `Text`, `number`, `identifier`, `unit_of_modelica`; `written`.
 Guarantees: parentheses where Modelica's precedence asks for them and nowhere else; a condition is a Boolean,
 never a number; a long part that is used again gets a name of its own.
-Does not: know what a variable means.
+Does not: use the meaning of a variable.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 class Text:
     """An expression: how tightly it binds, whether it is a Boolean; of `if c then v else 0`, c and v.
 
-    Of a variable `unit` is its unit in SI, and `start` what it is before the first tick.
+    Of a variable `unit` is its unit in SI, and `start` its value before the first tick.
     """
 
     text: str

@@ -39,9 +39,9 @@ DATE = (1980, 1, 1, 0, 0, 0)  # of every member of the archive: the first there 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FmuContent(Result):
-    """An FMU: the model it plays, of which `peer` if it is one, and its texts by their names.
+    """An FMU: the model it simulates, or `peer` if it is one peer, and its texts by their names.
 
-    `step` and `duration` are what a simulator may take, in seconds; `guid` is a digest of the texts.
+    `step` and `duration` are the proposed step size and duration in seconds; `guid` is a digest of the texts.
     """
 
     system: Model

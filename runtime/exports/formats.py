@@ -1,13 +1,13 @@
 """The table of export formats, with their export functions.
 
-Takes: a `Model`, where it goes and what is asked of it.
+Takes: a `Model`, the destination and the options.
 Gives: `Format`, `FORMATS`; `ExportRequest`; `format_of`, `export`.
 Guarantees: a format is chosen by its name or by the suffix, which agree; an option that means nothing to a
 format is refused; a maker is imported when it is asked for.
 Does not: make anything itself.
 
 A new format is a line of the table, its name, its suffix, what it is, the options it takes, and a case of
-`_makers`: a function that makes a result of a model and what is asked, and one that writes it.
+`_makers`: a function that makes a result of a model and the options, and one that writes it.
 """
 
 from __future__ import annotations

@@ -343,7 +343,7 @@ class _Peer:
         self.units = {clock.clock: clock.units for clock in self.peer_type.clocks}
 
     def declare(self) -> None:
-        """Declare what moves, and what acts on it."""
+        """Declare the states, and the inputs that act on them."""
         declare, peer_type = self.writer.declare, self.peer_type
         self.x = [
             declare(f"{self.name}.{state.name}", state.unit, self.location[state.start], fixed=True)

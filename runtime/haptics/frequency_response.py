@@ -38,7 +38,7 @@ from apc.verdict import Limitation, LimitationCode
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-# What is told beside the responses.
+# The results besides the responses.
 ALONGSIDE = ("low_frequency", "network_damping", "hinf", "h2")
 
 # The harmonics of the frame rate that are evaluated in addition to the fundamental.

@@ -129,12 +129,12 @@ def worst_trace(system: Model) -> Model:
     Parameters
     ----------
     system
-        The model, with the numbers to play.
+        The model, with the parameter values to simulate.
 
     Raises
     ------
     ApcError
-        E897 no such pattern is known, or it can't be played.
+        E897 no such pattern is known, or it can't be simulated.
     """
     losses_in_a_row = worst_case(system, prepare(system))
     pattern = losses_in_a_row.unstable_pattern

@@ -72,7 +72,7 @@ WORK = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Question:
-    """A model with ranges of what its peers are made of, `local`, and of what links lose."""
+    """A model with ranges of peer parameters, `local`, and of loss probabilities of links."""
 
     system: Model
     prepared: Prepared

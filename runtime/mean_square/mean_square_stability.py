@@ -99,13 +99,13 @@ class MeanSquareVerdict(Term):
 
 @dataclass(frozen=True, slots=True)
 class MeanSquareStability(Result):
-    """What becomes of a topology whose packets get lost or come late by chance.
+    """The mean-square stability of a topology with random packet losses or delays.
 
-    `mean_square_radius` is what second moments grow by in a frame, right to `error`; its root compares with
-    the nominal spectral radius. `exact` is False where it is an estimate. `rms_error_m` is how far a copy is
-    from the mean of the others, while every hand pushes with 1 N rms, anew at each tick.
+    `mean_square_radius` is the growth factor of second moments per frame, right to `error`; its root
+    compares with the nominal spectral radius. `exact` is False where it is an estimate. `rms_error_m` is the
+    deviation of a copy from the mean of the others, under independent hand forces of 1 N rms at each tick.
     `top_lyapunov_exponent` is told where mean squares do not settle it, `losses_in_a_row` where packets get
-    lost. None is what is not served, as `notes` say. `linearized`: the topology is not linear, and this holds
+    lost. None means not supported, see `notes`. `linearized`: the topology is not linear, and this holds
     near its start only.
     """
 
@@ -159,7 +159,7 @@ def mean_square_growth(system: Model, prepared: Prepared, *, bounded: bool = Tru
     Parameters
     ----------
     system, prepared
-        The model, and what `numeric_model.prepare` made of it with any numbers.
+        The model, and the result of `numeric_model.prepare` with any values.
     bounded
         Whether bounds are computed; without, they may be the radius itself.
     """

@@ -150,7 +150,7 @@ def trace_radius(system: Model, prepared: Prepared) -> TraceGrowth:
     Parameters
     ----------
     system, prepared
-        The model, and what `numeric_model.prepare` made of it.
+        The model, and the result of `numeric_model.prepare`.
 
     Raises
     ------

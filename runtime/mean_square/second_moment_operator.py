@@ -69,7 +69,7 @@ FIRST_WIDTH, WIDER_BOUNDS, LAST_WIDTH = 2e-12, 2.0, 1e-3
 # Fractions of the interval from 1 to the growth of the means at which a Y is tried for an entire cell.
 SHARES = (0.7, 0.3, 0.05, 0.0)
 
-# More than what eigenvalues of a symmetric matrix are off by, relatively.
+# An upper bound on the relative error of eigenvalues of a symmetric matrix.
 UNCERTAINTY = 1e-12
 
 # Roundings of a weight: those of a probability, and of how many peers it counts for.
@@ -264,7 +264,7 @@ class Enclosed:
 
 
 def enclosed(of: Operator, *, bounded: bool = True) -> Enclosed:
-    """Enclose what second moments grow by in a frame, for all start states.
+    """Enclose the growth factor of second moments per frame, for all start states.
 
     Parameters
     ----------
@@ -296,7 +296,7 @@ def enclosed(of: Operator, *, bounded: bool = True) -> Enclosed:
 
 
 def _root(of: Operator) -> float | None:
-    """Return the μ above what means grow by at which the largest eigenvalue of the gain is 1, None for none.
+    """Return the μ above the growth factor of means where the gain's largest eigenvalue is 1, or None.
 
     The root is that of 1/ρ − 1, which is nearly straight from −1 at the means' own growth, where the gain has
     its pole.

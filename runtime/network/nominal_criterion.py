@@ -64,7 +64,7 @@ def limitations(
 
 
 def refuse_range(system: Model) -> None:
-    """Refuse a model with a delay range where a fixed delay is required (play, export): ApcError E899."""
+    """Refuse a model with a delay range where a fixed delay is required (simulate, export): ApcError E899."""
     for interval in given_ranges(system):
         low, middle, high = (
             _ms(value) for value in (interval.low, (interval.low + interval.high) / 2, interval.high)
@@ -83,7 +83,7 @@ def _ms(seconds: Fraction) -> str:
 
 
 def channel_numbers(system: Model) -> frozenset[str]:
-    """Return the names of what links lose and delay packets by, and of all that these follow from."""
+    """Return the names of the losses and delays of links, and of all numbers that these depend on."""
     texts: list[str] = []
     for link in system.links:
         if link.channel is not None and link.channel.loss is not None:

@@ -4,7 +4,7 @@ Takes: a `Model` and its `Trajectory`. Gives: `SUFFIXES`, `check_animation`, `sa
 Guarantees: what is shown is of the run's own rows, the nearest in time; everything that moves stays in sight;
 a run is slowed down or sped up to what can be watched, and how much is written above it; a file is there
 whole or not at all.
-Does not: play the model, or need a display.
+Does not: simulate the model, or need a display.
 
 matplotlib is loaded when something is drawn and not before; it writes GIF by Pillow, MP4 by ffmpeg.
 """

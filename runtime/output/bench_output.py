@@ -94,7 +94,7 @@ def _choice(comparison: TaskComparison) -> str:
 
 
 def hard_text(hard_report: HardReport) -> Lines:
-    """Yield a line a hard case, and what failed."""
+    """Yield a line for each hard case, and the failures."""
     yield f"{hard_report.folder}: {counted(len(hard_report.cases), 'topology')} with a known truth\n"
     rows = [("topology", "error", "bound", "bound÷error", "time", "verdict")]
     for case in hard_report.cases:

@@ -255,7 +255,7 @@ def transparency_document(transparency: Transparency) -> Plain:
 
 
 def transparency_picture(transparency: Transparency, kind: str = "bode", ax: Any = None) -> Any:
-    """Draw the impedance, and what arrives elsewhere, as Bode's plot or Nyquist's; return the Figure.
+    """Draw the impedance, and the transmitted motion, as Bode's plot or Nyquist's; return the Figure.
 
     Into an `ax` of somebody's, of Bode's plot the magnitudes alone are drawn.
     """

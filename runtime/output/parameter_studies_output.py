@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from apc.sweeps.resumable_sweep import Sweep
 
 ROUGH = 1e-2  # of a value: its error is then said to be no slip
-SHOWN = 6  # rows of the table of what moves the radius most; digits of a value in a sentence
+SHOWN = 6  # rows of the table of sensitivities; digits of a value in a sentence
 
 # A relative change of the radius below this, for a relative change of 1 in a parameter, is indistinguishable
 # from rounding.
@@ -256,7 +256,7 @@ def sensitivities_document(sensitivities: Sensitivities) -> Plain:
 
 
 def analyses_text(analyses: Analyses) -> Lines:
-    """Yield many analyses in a few lines: what varied, the verdicts."""
+    """Yield many analyses in a few lines: the varied parameters, the verdicts."""
     yield f"{analyses.topology}: {analyses.verdict.size:,} points"
     yield from notes(*analyses.limitations)
     for name, values in zip(analyses.parameters, analyses.values, strict=True):

@@ -53,7 +53,7 @@ LABELS = {
     "largest_force": "largest force [N]",
     "copy_error": "copies apart [m]",
 }
-# Unit: what the panel is called, the unit it is drawn in, and how many of them make one of SI.
+# By unit: the panel's title, the displayed unit, and its number per SI unit.
 QUANTITIES = {
     "m": ("position", "mm", 1e3),
     "m/s": ("velocity", "m/s", 1.0),

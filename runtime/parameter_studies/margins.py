@@ -216,8 +216,8 @@ def _lines(
 ) -> Iterator[MatrixPath | PointwisePath | None]:
     """Yield the path of each parameter from its present value upwards, None at its maximum.
 
-    A motion without restoring force at a stiffness of 0 is rigid at the present values only: a parameter of 0
-    is varied separately. `singly`: each value is analysed separately.
+    A parameter of 0 has an evaluator of its own: a rigid mode at stiffness 0 is none at other values.
+    With `singly` each value is analysed separately.
     """
     base = np.array([parameter_of(system, item).value for item in free])
     parameter_refs = [item for item, value in zip(free, base, strict=True) if value]

@@ -150,7 +150,7 @@ class PeerLoop:
         self.socket = listening
         self.socket.setblocking(False)
         self.begins = 0  # when the model begins, by this host's clock; 0 while not known
-        self.session = 0  # what all peers that play together know it by; 0 while not known
+        self.session = 0  # the number of the common session of all peers; 0 while unknown
         # Of each other the shortest round trip, and how far its clock was ahead then.
         self.offsets: dict[int, tuple[int, int]] = {}
         self.began: HelloReply | None = None  # the first that said when the model begins
@@ -536,6 +536,7 @@ class _Emulated:
         return None if math.isinf(value) else int(value * NANO)
 
     def _source(self, link: _OfLink, other: int) -> PacketSource:
+        """Return the emulated packet delays and losses of a link from this peer to another."""
         loop, exchange = self.loop, self.loop.exchange
         arc, declared = (loop.local, other), loop.system.links[link.location]
         of, to = map(exchange.group_of, arc)

@@ -147,7 +147,7 @@ def run_of(loop: PeerLoop, digest: bytes, not_given: tuple[str, ...]) -> PeerRun
 
 
 def check_folder(folder: Path, topology: Path) -> None:
-    """Refuse, before anything is played, a folder that can't hold a run of a model.
+    """Refuse, before the run starts, a folder that can't hold a run of a model.
 
     Raises
     ------
@@ -169,7 +169,7 @@ def check_folder(folder: Path, topology: Path) -> None:
 
 
 def write_run(folder: Path, system: Model, peers: Sequence[PeerRun], *, whole: bool = False) -> None:
-    """Write what peers did.
+    """Write the records of the peers.
 
     Parameters
     ----------

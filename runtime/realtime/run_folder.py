@@ -158,7 +158,7 @@ def _check_signals(peer: PeerRun, topology: _Topology) -> None:
 
 
 def _check_packets(peer: PeerRun, topology: _Topology) -> None:
-    """Check what came, and what ticks saw of it."""
+    """Check the received packets, and those used at ticks."""
     for route, packets, missing in zip(topology.routes, peer.packets, peer.missing, strict=True):
         arcs = int((route.pairs[:, 1] == peer.number).sum())
         _want(

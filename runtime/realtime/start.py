@@ -115,7 +115,7 @@ def run_single(
     stop: Connection | None = None,
     device: DeviceFunction | None = None,
 ) -> RunPart:
-    """Play one peer.
+    """Run one peer.
 
     Parameters
     ----------

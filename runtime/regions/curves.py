@@ -4,7 +4,7 @@ Takes: points (k, 2) along a curve, and tangents there or handles.
 Gives: `handles_of`, `straight_handles`, `between`, `tangents`, `area_under`, `distance_from_arc`.
 Guarantees: `between` is the interpolant that results are given by; a curve scaled is the curve of its points
 and handles scaled.
-Does not: know what the curves bound.
+Does not: use the meaning of the curves.
 
 Between two points a and b lies the cubic with control points a, c, d, b; the handles (k − 1, 2, 2) of a curve
 are c and d of each of its segments.

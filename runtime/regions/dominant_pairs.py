@@ -4,7 +4,7 @@ Takes: a `DirectFamily`: the closed systems of a model as matrices over the unit
 Gives: `Pairs`, `join`; `Eigenvalues`; `log_magnitudes`, `by_system`.
 Guarantees: all points at once; what is small is computed in few calls. A complex pair is stood for by its
 eigenvalue of positive imaginary part.
-Does not: know what the two coordinates are.
+Does not: use the meaning of the two coordinates.
 
     d log|λ|/dx = Re(dλ/dx / λ)
 """
@@ -135,7 +135,7 @@ class Eigenvalues:
         return Pairs(system, value, slope, gradient, right, left)
 
     def value_errors(self, pairs: Pairs) -> Floats:
-        """Return by how much the eigenvalues (k,) may be off for what matrices are off: |w| E |v|/|w v|."""
+        """Return error bounds of the eigenvalues (k,) for errors E of the matrices: |w| E |v|/|w v|."""
         values = np.zeros(len(pairs.value))
         for s, rows in by_system(pairs.system):
             n = self.family.sizes[s]

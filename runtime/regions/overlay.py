@@ -1,9 +1,9 @@
-"""A published condition laid over two parameters of a model: who plays which symbol, and the curve.
+"""A published condition laid over two parameters of a model: the parameter of each symbol, and the curve.
 
 Takes: a `Model` and words such as
 `colgate:K=contact.stiffness,B=contact.damping,b=device.damping,T=haptic.period`.
 Gives: `Overlay`, `parse_overlay`, `symbol_values`, `overlay_points`.
-Guarantees: which parameter plays which symbol is said by the user, every one of them, and never guessed;
+Guarantees: the user states the parameter of each symbol; none is guessed;
 units fit; what depends on a parameter of the plane by an expression follows it.
 Does not: find a boundary that a line of the plane crosses twice; draw.
 """
@@ -35,7 +35,7 @@ LINES = 65
 
 @dataclass(frozen=True, slots=True)
 class Overlay:
-    """A published condition, and what plays each of its symbols, in their order: a parameter or SI number."""
+    """A published condition, and a parameter or SI number for each of its symbols, in their order."""
 
     condition: PublishedCondition
     roles: tuple[ParameterRef | float, ...]
@@ -84,7 +84,7 @@ def parse_overlay(system: Model, text: str) -> Overlay:
 
 
 def _role(system: Model, symbol: str, player: str) -> ParameterRef | float:
-    """Read what plays a symbol: a quantity begins with a digit, sign or point, a parameter never does."""
+    """Read the value of a symbol: a quantity begins with a digit, sign or point, a parameter never does."""
     from apc.compiler.language.units import parse_unit, quantity
 
     if player[0] in "+-.0123456789":

@@ -166,7 +166,7 @@ def compare_regions(
 
 
 def _refuse_set(axes: Sequence[Range], system: Model, settings: Sequence[str]) -> None:
-    """Raise E902 when a panel sets what an axis varies."""
+    """Raise E902 when a panel sets the parameter of an axis."""
     for text in settings:
         free = parse_override(system, text).free
         for axis in axes:

@@ -1,4 +1,4 @@
-"""What a report of topologies holds: the results of the other commands, each with the command that prints it.
+"""The contents of a report of topologies: results of other commands, each with its command.
 
 Takes: topologies and settings.
 Gives: `Section`, `TopologyReport`, `Report`; `report`; `differences`.
@@ -91,7 +91,7 @@ class Report(Result):
 
 @part("report")
 def report(paths: Sequence[Path], settings: Sequence[str] = ()) -> Report:
-    """Gather what is known of topologies.
+    """Gather the results of topologies.
 
     Parameters
     ----------
@@ -289,7 +289,7 @@ def _transparency(system: Model, call: str) -> Section:
 
 
 def differences(before: Any, now: Any) -> Iterator[str]:
-    """Yield what differs between plain data that a report keeps and the same computed anew.
+    """Yield the differences between plain data stored in a report and the same data recomputed.
 
     Words differ if they are others; numbers by more than roundings and the errors that stand beside them.
     """

@@ -1,1 +1,1 @@
-"""A model played in time."""
+"""Simulation of a model in time."""

@@ -44,7 +44,7 @@ class SignalError:
 
 @dataclass(frozen=True, slots=True)
 class ErrorEstimate:
-    """Errors by signal. `kind` is "rounding" or "method"; `compared` is what it was compared with."""
+    """Errors by signal. `kind` is "rounding" or "method"; `compared` is the reference."""
 
     kind: str
     compared: str
@@ -68,7 +68,7 @@ class AccuracyEstimator:
         self.low, self.high = np.full(n, np.inf), np.full(n, -np.inf)
 
     def take(self, block: OutputBlock) -> None:
-        """Compare one block; what only one of the runs reaches is left out."""
+        """Compare one block; rows that only one of the runs reaches are left out."""
         other = next(self.blocks, None)
         rows = min(len(block.time), len(other.time)) if other else 0
         if not other or not rows:

@@ -1,10 +1,10 @@
-"""All peers' frames in machine code: the kernels as loops over peers, and the engine that plays them.
+"""All peers' frames in machine code: the kernels as loops over peers, and the engine that runs them.
 
 Takes: a `HeterogeneousGroup`, the packets of its unreliable links.
 Gives: `library_of`, `LoadedLibrary`, `CompiledEngine`; `program_text`, the C text; `straight_lines`.
 Guarantees: the numbers of `interpreted_engine` to a few roundings of the sums; the text depends on what a
 peer does in a frame, not on how many peers there are or on their numbers.
-Does not: compile (see `c_compiler`), or play kernels that are not straight code, such as solvers.
+Does not: compile (see `c_compiler`), or run kernels that are not straight code, such as solvers.
 
 C, and not numba or LLVM: its compiler is of the machine, where these would be further packages to install.
 """
@@ -142,7 +142,7 @@ PLAN = _fields(
 
 
 def program_text(kernels: Sequence[tuple[PlainFunction, int]], reads: Sequence[PlainFunction]) -> str:
-    """Return the C text that plays members whose segments are these kernels, and looks at pairs so.
+    """Return the C text that runs members with these kernels as segments and these pairwise reductions.
 
     Parameters
     ----------
@@ -300,7 +300,7 @@ def _is_worth_it(function: Any) -> bool:
 
 
 class CompiledEngine(PopulationState):
-    """The memory of all peers, and the library that plays them in it."""
+    """The memory of all peers, and the library that advances it."""
 
     def __init__(
         self,
@@ -360,7 +360,7 @@ class CompiledEngine(PopulationState):
         self.rows = self.work = np.empty((0, 0))  # of the last call
 
     def advance(self, first: int, count: int, pushes: Sequence[Floats | None]) -> FrameRows:
-        """Play the frames from number `first` on (see `population.FrameEngine`)."""
+        """Simulate the frames from number `first` on (see `population.FrameEngine`)."""
         population = self.population
         for g, impulses in enumerate(pushes):
             if impulses is not None:

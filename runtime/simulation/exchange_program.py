@@ -172,7 +172,7 @@ class _Arcs:
 
 
 class _Listing:
-    """Collects the operations; what several of them use is found once."""
+    """Collects the operations; a common subexpression is computed once."""
 
     def __init__(
         self, exchange: CommunicationGraph, members: Sequence[GroupProgram], routes: Sequence[Route]

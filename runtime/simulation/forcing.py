@@ -5,7 +5,7 @@ Gives: `SubsystemForcing`, `subsystem_forcing`, `impulses`.
 Guarantees: an interval is split where a comparison of `time` switches (a step, a corner of a ramp, a row of
 a table), so that what is integrated is smooth; an impulse is right to `AGREE` of the largest of those
 integrated at once, and where a force jumps at an instant that is not known beforehand, to `LOST`.
-Does not: integrate what depends on the motion.
+Does not: integrate terms that depend on the motion.
 
     c = ∫₀ᵀ e^{A u} g(t + T − u) du
 

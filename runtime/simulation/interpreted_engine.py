@@ -66,7 +66,7 @@ class InterpretedEngine(PopulationState):
         ]
 
     def advance(self, first: int, count: int, pushes: Sequence[Floats | None]) -> FrameRows:
-        """Play the frames from number `first` on (see `population.FrameEngine`)."""
+        """Simulate the frames from number `first` on (see `population.FrameEngine`)."""
         population, sample_times = self.population, self.population.sample_count
         rows = np.full((count * sample_times, population.width), np.nan)
         work = np.zeros((count, len(population.parts)))
@@ -99,7 +99,7 @@ class InterpretedEngine(PopulationState):
         rows: Floats,
         pushes: Sequence[Floats | None],
     ) -> None:
-        """Play a segment of a frame."""
+        """Simulate a segment of a frame."""
         population, exchange_program = self.population, self.population.exchange_program
         packets = self.packets[number % exchange_program.ring]
         received = [

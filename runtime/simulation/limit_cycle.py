@@ -37,8 +37,8 @@ from apc.simulation.trajectory import Trajectory, simulate
 
 Floats = NDArray[np.float64]
 
-# How long is played, in seconds, unless peers are too many for more than the least; and the part of it, at
-# the end, that is measured.
+# The duration of the simulation, in seconds: the least for many peers, the most for few; and its last part,
+# which is measured.
 SHORTEST, LONGEST, MEASURED = 8, 80, 4
 
 # Below this fraction of time a contact counts as open; beyond this relative difference frequencies differ.
@@ -46,7 +46,7 @@ TOUCHED, SEPARATE = 1e-3, 0.2
 
 LET_GO = "the loads hold no contact closed: what touched at the start has let go, and there is no buzz"
 
-# Peers whose contacts are measured; ticks of all peers that are played, some ten seconds' worth.
+# Peers whose contacts are measured; ticks of all peers that are simulated, some ten seconds' worth.
 MOST_PEERS, MOST_SIMULATED = 20, 2 * 10**7
 
 # A swing below this part of the depth is none. If it changes by more than this over what is measured, it has
@@ -73,7 +73,7 @@ class SpectralPeak:
 
 @dataclass(frozen=True, slots=True)
 class ContactLimitCycle:
-    """A contact as it was played, and its depth as predicted under its load.
+    """A simulated contact, and its depth as predicted under its load.
 
     `load_n` is its mean push; `depth_m` is from the least to the largest, `in_contact` the share of the time
     in which it pushes. `predicted_depth_m` is None where nothing is predicted.
@@ -126,7 +126,7 @@ class _Measured:
 
 @part("limit cycle")
 def limit_cycle(system: Model, *, prepared: Prepared | None = None) -> LimitCycle:
-    """Predict the buzz of a model's one-sided contacts, and play it.
+    """Predict the limit cycles of a model's one-sided contacts, and simulate them.
 
     Parameters
     ----------

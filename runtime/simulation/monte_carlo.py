@@ -224,7 +224,7 @@ def _mean_square(system: Model) -> MeanSquare | None:
         with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
             prepared = numeric_model.prepare(system)
             result = mean_square_growth(system, prepared)
-    except ApcError as error:  # what can't be analysed can be played
+    except ApcError as error:  # a model that can't be analysed can still be simulated
         return MeanSquare(None, None, None, False, error.mistakes[0].message)
     linearized = not is_linear(system, prepared)
     settles_in = None
@@ -254,7 +254,7 @@ def _load(model: bytes, settings: Settings) -> Simulation:
 
 
 def _runs(simulation: Simulation, numbers: range) -> list[EnsembleRun]:
-    """Play some runs."""
+    """Simulate some runs."""
     player, runs = simulation.player(), []
     lengths = {signal.local for signal in simulation.signals if signal.unit == LENGTH}
     until = driven_until(simulation)

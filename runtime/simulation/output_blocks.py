@@ -1,4 +1,4 @@
-"""A model played in time: blocks of rows.
+"""Simulation of a model in time: blocks of rows.
 
 Takes: a `Simulation`. Gives: `OutputBlock`, `blocks`; `instants_of`, `forces_in_time`, `unsolved`.
 Guarantees: a row for time 0 and for every tick of the fastest clock until the end, values before the tick;
@@ -45,7 +45,7 @@ class OutputBlock:
 def blocks(
     simulation: Simulation, *, run: int = 0, player: FrameEngine | None = None
 ) -> Iterator[OutputBlock]:
-    """Play a model from time 0 and yield its rows, block by block.
+    """Simulate a model from time 0 and yield its rows, block by block.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def blocks(
 
 
 def unsolved(simulation: Simulation, frame: int) -> ApcError:
-    """Return the mistake of a frame that could not be played."""
+    """Return the error of a frame that could not be simulated."""
     location = SourceLocation(simulation.system.origin.topology)
     at = f"after {float(frame * simulation.frame * simulation.quantum):g} s"
     if not simulation.tolerances:

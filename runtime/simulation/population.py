@@ -52,7 +52,7 @@ class Population:
 class FrameRows:
     """Some frames: `rows` (frames · marks, width), `work` (frames, parts) in J until each begins.
 
-    Only the first `frames` could be played.
+    Only the first `frames` could be simulated.
     """
 
     rows: Floats
@@ -68,13 +68,13 @@ class DeliverySource(Protocol):
 
 
 class FrameEngine(Protocol):
-    """Plays a population, frame after frame; the runs of one seed differ in their packets."""
+    """Simulates a population, frame after frame; the runs of one seed differ in their packets."""
 
     def begin(self, run: int) -> None:
         """Go back to time 0 of the run of a number."""
 
     def advance(self, first: int, count: int, pushes: Sequence[Floats | None]) -> FrameRows:
-        """Play the frames from number `first` on; of the members with impulses `pushes` are these.
+        """Simulate the frames from number `first` on; `pushes` are the impulses on members.
 
         They are (frames, rows, subsystems). What is returned may be written over by the next call.
         """

@@ -36,7 +36,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """The rows of the carry: x, newest outputs, what holds put out, values to act later, work.
+    """The rows of the carry: x, newest outputs, outputs of holds, values to act later, work.
 
     `outputs` are the (clock partition, output) pairs that are remembered or recorded; `later_values` are
     values of earlier frames, or of earlier segments, that a hold puts out after; `parts` are those whose work
@@ -57,7 +57,7 @@ class Layout:
 
     @property
     def held(self) -> slice:
-        """The rows that hold what holds put out."""
+        """The rows of the outputs of holds."""
         return slice(*self.ends[2:4])
 
     @property
@@ -168,7 +168,7 @@ def build_member(
     program: Program,
     transitions: Sequence[Floats],
 ) -> GroupProgram:
-    """Collect what some peers of a group bring to a population.
+    """Collect the contributions of some peers of a group to a population.
 
     Parameters
     ----------

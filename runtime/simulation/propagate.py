@@ -186,7 +186,7 @@ def _symbols(peer_type: PeerType) -> tuple[Any, Any, Any, Any]:
 
 
 def _curved(speed: Any, moving: Any, t: Any) -> list[int]:
-    """Return the rates that are not linear in what moves: their slopes change, or they jump."""
+    """Return the rates that are not linear in the states: their slopes change, or they jump."""
     slopes = jacobian(speed, moving)
     varies = casadi.vertcat(moving, t)
     return [

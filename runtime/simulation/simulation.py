@@ -82,14 +82,14 @@ BINARY, DECIMAL = 8, 20
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Simulation:
-    """A topology ready to be played.
+    """A topology prepared for simulation.
 
     `signals` are the columns of what comes out, the `order` (signals,) of which in a row of the population is
     another; `sample_times` the instants of a frame's rows, in quanta, the first of which makes a row at time
     0 only unless `ticks_at_zero`; `forces` are those that change with time, of each member's different
     subsystems. `arrival_processes` are what chance does on the unreliable links, `seed` is what it begins
     from: that of the settings, or of the experiment. `library` is the machine code, None if there is none.
-    `length` frames are played at a time. `topology` is the system as it was given, without stamps on its
+    `length` frames are simulated at a time. `topology` is the system as it was given, without stamps on its
     packets (see `data_age.stamped`). `tolerances` are of the states that CVODES moves, `sent` the names of
     those that peers send as they are.
     """
@@ -204,7 +204,7 @@ def prepare(
 
 
 def check_length(system: Model, duration: Fraction, *, runs: int = 1) -> None:
-    """Refuse to play so long that no one will wait for it.
+    """Refuse a duration that would take too long to simulate.
 
     Parameters
     ----------
@@ -271,7 +271,9 @@ class SimulationPlan:
 
 
 def plan_of(system: Model, method: Method) -> SimulationPlan:
-    """Determine the events of a frame, and refuse models that cannot be simulated.
+    """Return the simulation plan of a model: its numbers, flows, routes and schedules.
+
+    Raises ApcError for a model that cannot be simulated.
 
     The plan's system is `stamped`: if ages are recorded, packets contain their time of sending.
     """

@@ -219,7 +219,7 @@ def simulate(
     method: Method = DEFAULT,
     error: bool = False,
 ) -> Trajectory:
-    """Play a model in time and keep its rows.
+    """Simulate a model in time and store its rows.
 
     Parameters
     ----------
@@ -232,7 +232,7 @@ def simulate(
     jit
         Whether to compile to machine code where there is a C compiler.
     seed
-        Of what is random; the experiment's if not given.
+        The seed of the random numbers; by default the experiment's.
     method
         The integration method between events.
     error

@@ -1,6 +1,6 @@
 """Work shared out to a running Dask cluster.
 
-Takes: a function of what all tasks share and of a task, the address of a scheduler. Gives: `cluster_workers`.
+Takes: a function of the shared data and of a task, the address of a scheduler. Gives: `cluster_workers`.
 Guarantees: the workers compute what a process here computes (see `processes`), with the same function; a
 cluster that isn't there, or lost, is told in a sentence.
 Does not: start a cluster, or install anything on it.
@@ -54,7 +54,7 @@ def cluster_workers(
         raise ApcError(Diagnostic("E888", location, message, hint=install_line("cluster")))
     import distributed
 
-    # What goes wrong is told once, by us.
+    # Errors are reported once, by this program.
     loggers = [logging.getLogger(name) for name in ("distributed", "tornado")]
     levels = [logger.level for logger in loggers]
     for logger in loggers:
@@ -91,12 +91,12 @@ def cluster_workers(
 
 
 def _taken(shared: Shared) -> Shared:
-    """Keep what is shared on a worker, from which the others have it."""
+    """Store the shared data on a worker, from which the others fetch them."""
     return shared
 
 
 def _trouble(error: BaseException, location: SourceLocation) -> ApcError | None:
-    """Return what to tell of a part that did not come back."""
+    """Return the message for a part without a result."""
     from distributed import KilledWorker
     from distributed.comm import CommClosedError
 

@@ -74,7 +74,7 @@ class Grid:
         return np.stack(np.unravel_index(np.asarray(points, dtype=np.int64), sizes), axis=1)
 
     def overrides(self, point: int) -> tuple[Override, ...]:
-        """Return what a point sets."""
+        """Return the overrides of a point."""
         pairs = zip(self.axes, self.values(point), strict=True)
         return tuple(Override(axis.free, value) for axis, value in pairs)
 
@@ -100,7 +100,7 @@ def check_size(texts: Sequence[str]) -> None:
         if len(parts) == 1:
             counts.append(text.count(",") + 1)
         else:
-            # What is no count is told of when it is read.
+            # An invalid count is reported when it is read.
             counts.append(int(given[0][:MOST_DIGITS]) if given else DEFAULT_COUNT)
     _refuse_many(counts)
 

@@ -1,8 +1,8 @@
-"""What a sweep can compute at each of its points.
+"""The quantities that a sweep can compute at each point.
 
 Takes: a `Model` and a name such as `analyze` or `critical:coordination.stiffness`.
 Gives: `SweepQuantity`, `QUANTITIES`, `find_quantity`, `faulty`; `BEGINNINGS`, `by_criterion`.
-Guarantees: what all points share is prepared once; a row does not depend on the parts computed before; a
+Guarantees: data common to all points are prepared once; a row does not depend on the parts computed before; a
 point that can't be computed is a row that says why; a number that isn't finite is left out of a row.
 Does not: choose points, or hold results.
 """
@@ -70,7 +70,7 @@ def find_quantity(system: Model, text: str) -> SweepQuantity:
     Raises
     ------
     ApcError
-        E884 no such quantity; what the quantity's own argument can be wrong in.
+        E884 no such quantity; the errors of the quantity's own argument.
     """
     criterion = next((item for item, start in BEGINNINGS.items() if text.startswith(start)), NOMINAL)
     text = text.removeprefix(BEGINNINGS.get(criterion, ""))
@@ -135,7 +135,7 @@ def _finite(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _stability_measure(system: Model, argument: str) -> SweepQuantity:
-    """Return the verdict in mean square and what second moments grow by in a frame."""
+    """Return the verdict in mean square and the growth factor of second moments per frame."""
     from apc.frame.numeric_model import prepare  # the nominal quantities need none of it
     from apc.mean_square.mean_square_stability import mean_square_growth, verdict_of
 
@@ -195,7 +195,7 @@ def _critical_by(criterion: str) -> Callable[[Model, str], SweepQuantity]:
 def _pointwise(
     system: Model, columns: tuple[TableColumn, ...], evaluate: Callable[[Model], Row]
 ) -> Callable[[Grid, Sequence[int]], Cells]:
-    """Return what evaluates some points of a grid, each by itself."""
+    """Return a function that evaluates points of a grid, one by one."""
 
     def cells(grid: Grid, points: Sequence[int]) -> Cells:
         rows = []

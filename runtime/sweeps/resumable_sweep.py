@@ -1,6 +1,6 @@
-"""One result at every combination of some parameters' values, with what is finished kept as it comes.
+"""One result at every combination of some parameters' values, each finished part stored at once.
 
-Takes: a `Model`, the values of each swept parameter, what to compute.
+Takes: a `Model`, the values of each swept parameter, the quantity.
 Gives: `Sweep`, `sweep`; `part_points`.
 Guarantees: the same rows in the same order whoever computes them, interrupted or not; a sweep with a target
 takes up its finished parts; the target is written when all of it is there, and its parts are removed then.
@@ -65,8 +65,8 @@ class Sweep(Result):
 
     `columns` and `column` give them: of numbers a float64 array (n,), NaN where a point has no number; of
     others object arrays. What stands in the file `out` is read from there, and not held. `counts` and
-    `messages` say how many points have which verdict and message. `made_of` says what made it: model, axes,
-    versions. `notes` tell what was out of the ordinary.
+    `messages` say how many points have which verdict and message. `made_of` is its provenance: model, axes,
+    versions. `notes` are remarks on exceptions.
     """
 
     shown_by = "parameter_studies_output:sweep"
@@ -142,12 +142,12 @@ def sweep(
     Parameters
     ----------
     system
-        The compiled topology; its numbers hold for what is not swept.
+        The compiled topology; its values hold for the parameters that are not swept.
     over
         The values of each swept parameter by its name: a range `"0 N/m:3000 N/m:31"` (`LOW:HIGH:COUNT`, and
         `:log` for equal ratios), or a list, `"0,8 ms"` or `["0 ms", "8 ms"]`. The last one turns fastest.
     of
-        What to compute, see `quantities.QUANTITIES`: `analyze`, …
+        The quantity to compute, see `quantities.QUANTITIES`: `analyze`, …
     criterion
         "mean-square" or "nominal", see `critical_values.critical`.
     out
@@ -167,7 +167,7 @@ def sweep(
     ApcError
         An axis is at fault (E622, E881 to E883, E896, E204, …); E884 nothing is computed under that name;
         E885 something else stands where its parts are kept; E878, E887 or E601 the target can't be written;
-        E888 the cluster; E889 a process ended, or nothing came for too long. What is finished is kept.
+        E888 the cluster; E889 a process ended, or no result came for too long. Finished parts are kept.
     """
     texts = {name: text if isinstance(text, str) else ",".join(text) for name, text in over.items()}
     check_size(list(texts.values()))
@@ -229,7 +229,7 @@ def part_points(points: int, *, quick: bool) -> int:
 
 
 def _description(system: Model, work: Work) -> dict[str, Any]:
-    """Return what a sweep is, as plain data: two with the same description have the same rows."""
+    """Return the description of a sweep, as plain data: two with the same description have the same rows."""
     parameters = {parameter.name: parameter.value for parameter in system.parameters}
     parameters |= {timing.name: float(timing.value) for timing in system.timings}
     varied = [axis.free for axis in work.grid.axes]
@@ -300,7 +300,7 @@ class Whose:
 
 
 def _compute_missing(work: Work, stored: _Stored, whose: Whose, progress: Progress | None) -> tuple[str, ...]:
-    """Compute the parts that aren't there, keep each as it comes, and return what to tell of it."""
+    """Compute the missing parts, store each at once, and return remarks on the computation."""
     there = stored.exists()
     missing = [part for part in range(work.parts) if part not in there or stored.read(part) is None]
     damaged = [part for part in missing if part in there]

@@ -22,7 +22,7 @@ from apc.sweeps.grid import Grid
 from apc.sweeps.quantities import Cells, SweepQuantity, find_quantity
 from apc.threads import single_threaded
 
-# What makes the numbers: with another version of one of them, the last digits may be others.
+# The libraries that compute the numbers: with another version of one of them, the last digits may be others.
 LIBRARIES = ("casadi", "numpy", "python-flint", "scipy")
 
 _SEQUENTIAL = threading.Lock()
@@ -30,9 +30,9 @@ _SEQUENTIAL = threading.Lock()
 
 @dataclass(frozen=True, slots=True)
 class Work:
-    """A whole sweep: the compiled model as bytes (see `processes`), what to compute, and where.
+    """A whole sweep: the compiled model as bytes (see `processes`), the quantity, and the points.
 
-    Part i holds the points from i·`part_points` on, `part_points` of them or what is left.
+    Part i holds the points from i·`part_points` on, `part_points` of them or the remaining ones.
     """
 
     model: bytes
@@ -53,7 +53,7 @@ class Work:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Computed:
-    """The cells of a part (see `quantities.SweepQuantity`), and the versions of what computed them."""
+    """The cells of a part (see `quantities.SweepQuantity`), and the versions of the libraries used."""
 
     part: int
     cells: Cells
@@ -69,7 +69,7 @@ def compute_part(work: Work, part: int) -> Computed:
 
 @cache
 def program_versions() -> tuple[tuple[str, str], ...]:
-    """Return what computes here: the versions of the libraries, and a digest of the program's own text."""
+    """Return the versions of the libraries in use, and a digest of the program's own text."""
     whole = hashlib.sha256(program_digest().encode())
     runtime = Path(__file__).resolve().parents[1]
     for path in sorted(runtime.rglob("*.py")):

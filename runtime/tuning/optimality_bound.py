@@ -47,7 +47,7 @@ def none_better(
     Parameters
     ----------
     topologies, prepared
-        The models that limit the gains most, and what `numeric_model.prepare` made of one.
+        The models that limit the gains most, and the result of `numeric_model.prepare` for one.
     gains, objective
         The gains' ranges, and the place of that which is to be large, or small.
     value, larger

@@ -291,7 +291,7 @@ class ScenarioOptimizer:
         return rows_of
 
     def _optimum(self, shares: Floats, rows: ConstraintValues) -> Optimum:
-        """Return an optimum with what its limits cost: the multipliers that best balance the aim."""
+        """Return an optimum with its shadow prices: the multipliers that best balance the objective."""
         worst = float(rows.values.max(initial=-np.inf))
         inner = (shares > self._ends[0] + OPEN) & (shares < self._ends[1] - OPEN)
         if self.column is None:  # the largest ln |λ| of a frame: weights of one

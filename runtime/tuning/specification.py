@@ -40,10 +40,10 @@ CHANGING = "delay=changing"
 # Objectives of minimization other than a gain.
 RADIUS, SETTLING = "spectral_radius", "settling_time"
 
-# What is felt that has a frequency of its own: where it is largest.
+# Transparency metrics with a frequency of their own: that of the maximum.
 HINF = "coordination_error_hinf"
 
-# What hands feel, by its name in a demand: its unit, and whether it is at a frequency.
+# Transparency metrics by name: the unit, and whether the metric is taken at a frequency.
 # `coordination_error_h2` is the rms at the ticks of a copy's error for white forces of 1 N rms at all hands,
 # `coordination_error_hinf` the largest gain from any forces, which add up to 0 over equal peers, to how far a
 # copy is from the mean of all.
@@ -311,7 +311,7 @@ def _counted(system: Model, free: ParameterRef, text: str, location: SourceLocat
         )
     try:
         apply(system, [Override(free, Fraction(low))])
-    except ApcError as error:  # too few for what follows the others
+    except ApcError as error:  # too few for the dependent parameters
         raise ApcError(replace(mistake, location=location) for mistake in error.mistakes) from None
     return Range(free, "1", Fraction(low), Fraction(high))
 

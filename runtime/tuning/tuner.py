@@ -181,9 +181,9 @@ class Tuning(Result):
     topologies: tuple[Model, ...] = field(compare=False, repr=False)
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw two gains over the stable regions of what limits them, and a strike; return the Axes.
+        """Draw two gains over the stable regions of the limiting scenarios, and a strike; return the Axes.
 
-        A strike is played now and with the gains found, in the scenario that limits them most.
+        A strike is simulated with the present and the tuned gains, in the scenario that limits them most.
 
         Raises
         ------
