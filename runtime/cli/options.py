@@ -163,10 +163,10 @@ class Command(click.Command):
         try:
             return super().parse_args(ctx, args)
         except click.NoSuchOption as error:
-            former = OPTIONS[""] | OPTIONS.get(self.name or "", {})
-            if error.option_name not in former:
+            present = (OPTIONS[""] | OPTIONS.get(self.name or "", {})).get(error.option_name)
+            if not any(present in parameter.opts for parameter in self.params):
                 raise
-            message = f"{error.option_name} is named {former[error.option_name]} now."
+            message = f"{error.option_name} is named {present} now."
             raise click.UsageError(message, ctx) from None
 
     def invoke(self, ctx: click.Context) -> Any:

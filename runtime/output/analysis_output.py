@@ -144,7 +144,9 @@ def analysis_text(result: Analysis) -> Lines:
         words += "\nWhat it does in time is played: apc simulate"
     if not result.states_per_peer:
         words = "Nothing here is free to move."
-    yield f"{result.topology}: {result.verdict}{LINEARIZED if result.linearized else ''}"
+    yield from wrapped(
+        f"{result.topology}: {result.verdict}{LINEARIZED if result.linearized else ''}", "", "  "
+    )
     yield from notes(*result.limitations)
     yield ""
     yield from sentences(*words.splitlines())
@@ -248,7 +250,7 @@ def answer_document(answer: AnalysisReport) -> Plain:
     plain |= {
         "margins": document(answer.margins.rows),
         "margins_note": answer.margins.note,
-        "buzz_note": "" if answer.limit_cycle else answer.no_limit_cycle or NOT_SIMULATED,
+        "limit_cycle_note": "" if answer.limit_cycle else answer.no_limit_cycle or NOT_SIMULATED,
         "warnings": [*answer.warnings, *filter(None, (answer.event_order.warning,))],
     }
     if answer.detailed:
@@ -416,8 +418,8 @@ def box_proof_document(box_proof: RobustStability) -> Plain:
             box_proof, "topology", "limitations", "verdict", "stable", "cells", "undecided_fraction", "notes"
         ),
         "box": [range_document(interval) for interval in box_proof.ranges],
-        "unstable_at": list(box_proof.counterexample) if box_proof.stable is False else None,
-        "open_around": list(box_proof.counterexample)
+        "counterexample": list(box_proof.counterexample) if box_proof.stable is False else None,
+        "undecided_around": list(box_proof.counterexample)
         if box_proof.stable is None and box_proof.counterexample
         else None,
         "changing": box_proof.changing and picked(box_proof.changing, "proved_to", "unstable", "note"),

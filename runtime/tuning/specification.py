@@ -243,6 +243,8 @@ def read_tuning_spec(
     if chosen == PASSIVE:
         for gain in (*gains, *box):
             refuse_time(system, gain.free, LOCATION, chosen)
+    for text in constraint:
+        _refuse_former(text, CONSTRAINT)
     metrics = tuple(_transparency_metric(text) for text in constraint if _names_metric(text))
     changing = [text for text in constraint if "".join(text.split()) == CHANGING]
     decays = [text for text in constraint if text not in changing and not _names_metric(text)]
@@ -328,6 +330,7 @@ def _objective(gains: Sequence[Range], maximize: str, minimize: str) -> Objectiv
     if text in (RADIUS, SETTLING) and not larger:
         return Objective(text, None, larger, "1")
     option = SourceLocation("--maximize" if larger else "--minimize")
+    _refuse_former(text, option)
     terms = []
     for sign, weight, name in _TERM.findall(text if text.startswith(("+", "-")) else f"+ {text}"):
         if spaced := _UNSPACED.search(name):
@@ -358,13 +361,21 @@ def _names_metric(text: str) -> bool:
     return name in TRANSPARENCY or name.startswith("feel.")
 
 
+def _refuse_former(text: str, location: SourceLocation) -> None:
+    """Refuse a former name of a metric in a text. Raises ApcError E996 with the text in present names."""
+    written = re.findall(r"\bfeel\.\w+", text)
+    named = [name for name in written if name in FORMER]
+    if named:
+        present = re.sub(r"\bfeel\.\w+", lambda name: FORMER.get(name[0], name[0]), text.strip())
+        if present in TRANSPARENCY and TRANSPARENCY[present][1]:
+            present += " at 5 Hz"
+        message = f"{named[0]} is named {FORMER[named[0]]} now"
+        raise ApcError(Diagnostic("E996", location, message, hint=f'{location.file} "{present}"'))
+
+
 def _measure(text: str, location: SourceLocation, wants: str = "") -> TransparencyMetric:
     """Read `impedance at 5 Hz`, or `damping`."""
     name, at, frequency = (item.strip() for item in text.strip().partition(" at "))
-    if name in FORMER:
-        message = f"{name} is named {FORMER[name]} now"
-        fix = f'{location.file} "{FORMER[name]}{at and f" at {frequency}"}{wants}"'
-        raise ApcError(Diagnostic("E996", location, message, hint=fix))
     if name not in TRANSPARENCY or bool(at) != TRANSPARENCY[name][1]:
         example = f'{location.file} "impedance at 5 Hz{wants}"'
         expected = f"one of {_METRICS}"
@@ -408,6 +419,7 @@ def _transparency_metric(text: str) -> TransparencyMetric:
 
 def read_tradeoff(text: str) -> TransparencyMetric:
     """Read the second metric of a Pareto front, `impedance at 5 Hz`."""
+    _refuse_former(text, TRADEOFF)
     return _measure(text, TRADEOFF)
 
 

@@ -65,6 +65,30 @@ def test_a_former_metric_names_the_present_one(old: str, topology: str, cli: Cli
     assert f'Write: --minimize "{FORMER[old]}{at}"' in ran.err
 
 
+@pytest.mark.parametrize(
+    ("words", "fix"),
+    [
+        (["--constraint", "feel.error at 1 Hz < 0.1 m/N"], '"coordination_error at 1 Hz < 0.1 m/N"'),
+        (["--minimize", "feel.transmitted"], '"transmitted_velocity at 5 Hz"'),
+        (
+            ["--maximize", "feel.damping - 0.01*coordination.stiffness"],
+            '"damping - 0.01*coordination.stiffness"',
+        ),
+        (["--tradeoff", "feel.error_h2"], '"coordination_error_h2"'),
+    ],
+)
+def test_the_fix_keeps_what_was_written(words: list[str], fix: str, topology: str, cli: Cli) -> None:
+    gain = ["--free", "coordination.stiffness=10 N/m:100 N/m", "--time", "1 s"]
+    more = [] if "--maximize" in words or "--minimize" in words else ["--maximize", "coordination.stiffness"]
+    ran = cli("tune", topology, *gain, *more, *words)
+    assert ran.code == 1 and f"Write: {words[0]} {fix}" in ran.err
+
+
+def test_an_option_that_the_command_never_had_has_no_new_name(topology: str, cli: Cli) -> None:
+    ran = cli("analyze", "--in", "nominal", topology)
+    assert ran.code == 2 and "No such option" in ran.err
+
+
 @pytest.mark.parametrize("old", RENAMED)
 def test_a_former_key_names_the_present_one(old: str, topology: str, cli: Cli) -> None:
     if old == "about":

@@ -126,7 +126,7 @@ def test_what_can_not_be_proved_is_left_open_and_says_where() -> None:
     assert (found.stable, found.verdict) == (None, "undecided")
     assert 0 < found.undecided_fraction < 0.1 and 0 < found.counterexample[0] < 20
     assert max(len(line) for line in str(found).splitlines()) <= 80
-    assert found.to_dict()["open_around"] == list(found.counterexample)
+    assert found.to_dict()["undecided_around"] == list(found.counterexample)
     loose = replaced(
         *(AVERAGE, ("damping: 5 N*s/m", "damping: 0 N*s/m"), ("damping: 5 N*s/m", "damping: 0 N*s/m")),
         ("500 N/m", "0 N/m"),
