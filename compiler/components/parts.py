@@ -74,7 +74,7 @@ PART_KEYS = (
 # By section, an entry without its name; and a type to show for an entry that has none.
 EXAMPLES = {
     "masses": ("device", "{mass: 0.1 kg}", "Mass"),
-    "links": ("lan", "{clock: network}", "Mass"),
+    "links": ("lan", "{clock: network}", "Link"),
     "couplers": ("contact", "{type: SampledSpringDamper}", "SampledSpringDamper"),
     "hands": ("hand", "{type: ConstantForce}", "ConstantForce"),
     "parts": ("tip", "{type: Mass}", "Mass"),

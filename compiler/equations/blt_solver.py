@@ -112,7 +112,8 @@ def balanced(
     )
     if too_many:
         only = f"only {counted(len(theirs), 'unknown')} ({listed(theirs)})" if theirs else "no unknown"
-        parts.append(f"{counted(len(too_many), 'equation')} hold {only}: {listed(too_many)}")
+        verb = "holds" if len(too_many) == 1 else "hold"
+        parts.append(f"{counted(len(too_many), 'equation')} {verb} {only}: {listed(too_many)}")
     if open_:
         by = f"only {counted(len(holding), 'equation')}, {listed(holding)}" if holding else "no equation"
         has = "has" if len(open_) == 1 else "have"

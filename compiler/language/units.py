@@ -423,7 +423,7 @@ def _in_catalogue(name: Token) -> str:
     dimension = every.get_dimensionality(unit)
     like = [other for other in COMMON if registry().get_dimensionality(other) == dimension]
     proposed = f"; there are {', '.join(like[:3])}" if like else ""
-    message = f"there is no unit {name} here: {spelled} is out of use{proposed}"
+    message = f"there is no unit {name} here: {spelled} is not supported{proposed}"
     lower = name.lower()
     similar = (other for other in like if lower == other.lower() or lower.startswith(other))
     raise ParseError("E223", name, message, hint=next(similar, ""), subject=name)

@@ -8,6 +8,7 @@ Does not: compute.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -42,6 +43,9 @@ SHOWN = 12
 # Digits of a table's numbers, at most.
 DIGITS = 6
 
+MODE_HEADINGS = ("mode", "damping", "required", "reserve", "frequency", "stiffness", "")
+NONE = "–"
+
 # The instants of the root mean squares of a `H2Gains`.
 NOISE_RMS = "at the ticks, motion between ticks not included"
 
@@ -74,9 +78,8 @@ def passive_text(absolute_stability: AbsoluteStability) -> Lines:
     yield from labelled(("devices clamped", moves), ("proof", str(absolute_stability.proof)))
     if absolute_stability.modes:
         yield ""
-        yield from table(
-            [("mode", "damping", "needed", "at", "at rest", ""), *map(_mode, absolute_stability.modes)]
-        )
+        yield "  damping in N*s/m, frequency in Hz, stiffness in N/m"
+        yield from table([MODE_HEADINGS, *map(_mode, absolute_stability.modes)], "<>>>>><")
 
 
 def _worst_lines(absolute_stability: AbsoluteStability, worst: PassiveMode) -> str:
@@ -114,20 +117,25 @@ def _worst_lines(absolute_stability: AbsoluteStability, worst: PassiveMode) -> s
 
 def _mode(passive_mode: PassiveMode) -> tuple[str, ...]:
     name = passive_mode.name + (f" × {passive_mode.multiplicity:,}" if passive_mode.multiplicity > 1 else "")
-    damping = "they differ" if passive_mode.damping is None else f"{passive_mode.damping:.6g} N*s/m"
     verdict = {True: "passive", False: "not passive", None: "undecided"}[passive_mode.passive]
+    needed = reserve = NONE
     if passive_mode.more is None:
-        needed, verdict = "none is enough", "not passive"
-    elif passive_mode.needed is None:
-        needed = f"{passive_mode.more:+.6g} N*s/m"
-    elif passive_mode.error is None or not np.isfinite(passive_mode.error):
-        needed = f"about {passive_mode.needed:.2g} N*s/m"
+        verdict = "not passive"
     else:
-        needed = f"{known_digits(passive_mode.needed, passive_mode.error, DIGITS)} N*s/m"
-    at = "" if passive_mode.frequency_hz is None else f"{passive_mode.frequency_hz:.5g} Hz"
+        reserve = f"{-passive_mode.more:+.4g}"
+        if passive_mode.needed is not None and passive_mode.needed <= 0:
+            needed = "0"
+        elif passive_mode.needed is not None:
+            error = math.inf if passive_mode.error is None else passive_mode.error
+            sure = math.isfinite(error)
+            needed = (
+                known_digits(passive_mode.needed, error, DIGITS) if sure else f"{passive_mode.needed:.2g}"
+            )
+    damping = NONE if passive_mode.damping is None else f"{passive_mode.damping:.6g}"
+    at = NONE if passive_mode.frequency_hz is None else f"{passive_mode.frequency_hz:.5g}"
     size = abs(passive_mode.stiffness or 0.0)
-    stiffness = "" if passive_mode.stiffness is None else f"{size if size > 1e-6 else 0:.5g} N/m"
-    return name, damping, needed, at, stiffness, verdict
+    stiffness = NONE if passive_mode.stiffness is None else f"{size if size > 1e-6 else 0:.5g}"
+    return name, damping, needed, reserve, at, stiffness, verdict
 
 
 def passive_document(absolute_stability: AbsoluteStability) -> Plain:

@@ -50,9 +50,9 @@ def run_comparison_text(run_comparison: RunComparison) -> Lines:
 def ticks_text(ticks: Sequence[Ticks]) -> Lines:
     """Yield the lateness of ticks, one row per peer."""
     for subject, shares in (("late by", "delayed"), ("took", "took")):
-        rows: list[tuple[str, ...]] = [("instants", *HEADINGS, subject)]
-        rows += [(f"{tick.ticks:,}", *map(_ms, getattr(tick, shares)), tick.peer) for tick in ticks]
-        yield from table(rows, ">>>>><")
+        rows: list[tuple[str, ...]] = [(subject, "instants", *HEADINGS)]
+        rows += [(tick.peer, f"{tick.ticks:,}", *map(_ms, getattr(tick, shares))) for tick in ticks]
+        yield from table(rows, "<>>>>>")
     for tick in ticks:
         printed = [f"not given: {why}" for why in tick.not_granted]
         printed += [f"joined at {tick.joined:.4g} s"] if tick.joined else []
@@ -66,13 +66,13 @@ def ticks_text(ticks: Sequence[Ticks]) -> Lines:
 
 
 def _arcs_text(arcs: Iterable[ArcRun]) -> Lines:
-    rows = [("packets", "lost", "half within", "all within", "way")]
+    rows = [("link", "packets", "lost", "half within", "all within")]
     for arc in arcs:
         came = arc.came
         middle = dict(came.quantiles).get(0.5, came.mean)
         name = f"{arc.link} {arc.sender} to {arc.receiver}: {arc.trace}"
-        rows.append((f"{came.packets:,}", f"{came.lost.count:,}", _ms(middle), _ms(came.longest), name))
-    return table(rows, ">>>><")
+        rows.append((name, f"{came.packets:,}", f"{came.lost.count:,}", _ms(middle), _ms(came.longest)))
+    return table(rows, "<>>>>")
 
 
 def _ms(seconds: float) -> str:

@@ -60,7 +60,7 @@ def tuning_text(tuning: Tuning) -> Lines:
     yield from wrapped(_sentence(tuning), "", "  ")
     yield from notes(MEANT.get(tuning.criterion, ""), *tuning.limitations, *tuning.notes)
     yield ""
-    rows = [("gain", "value", "before rounding", "chosen from")]
+    rows = [("gain", "value", "optimum", "range")]
     rows += [
         (
             gain.parameter,
@@ -78,7 +78,7 @@ def tuning_text(tuning: Tuning) -> Lines:
         value = quantity(tuning.optimum, tuning.unit, SHADOW_PRICES + 1)
     better = f"no gains in these ranges do better by {100 * float(SHARE):.3g} %"
     yield from labelled(
-        ("before rounding", f"{value}, the best of {tuning.evaluations:,} points" if tuning.feasible else ""),
+        ("optimum", f"{value}, the best of {tuning.evaluations:,} points" if tuning.feasible else ""),
         ("no others", f"{better}, proved in {tuning.bound_cells:,} cells" if tuning.bound_cells else ""),
         ("margin", _margin(tuning) if tuning.feasible else ""),
     )

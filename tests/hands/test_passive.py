@@ -534,3 +534,25 @@ def test_the_named_part_is_held_where_it_is(tmp_path: Path) -> None:
     hint = refused.value.mistakes[0].hint
     assert hint == "hands: {grip: {type: ConstantForce, flange: device, force: 0 N, at: [user]}}"
     assert apc.absolute_stability(compiled(f"{text}{hint}\n")).verdict
+
+
+@pytest.mark.parametrize("name", ["teleoperation-pair", "three-users-average", "stiff-wall-passivity"])
+def test_the_table_of_modes_has_numbers_below_each_heading(name: str) -> None:
+    """Required damping is none below 0, the reserve is what is left of the devices', and no cell is empty."""
+    found = apc.absolute_stability(TOPOLOGIES / f"{name}.yaml")
+    lines = str(found).splitlines()
+    assert all(len(line) <= 80 for line in lines)
+    first = next(k for k, line in enumerate(lines) if line.split()[:3] == ["mode", "damping", "required"])
+    for mode, line in zip(found.modes, lines[first + 1 :], strict=True):
+        cells = re.split(r" {2,}", line.strip())
+        assert len(cells) == 7
+        damping, required, reserve = (np.nan if cell == "–" else float(cell) for cell in cells[1:4])
+        assert np.isnan(required) or required >= 0
+        assert mode.more is not None and reserve == pytest.approx(-mode.more, rel=1e-3)
+        if not np.isnan(damping) and required > 0:
+            assert damping - required == pytest.approx(reserve, rel=1e-3, abs=1e-3)
+
+
+def test_a_long_headline_fits_a_terminal() -> None:
+    found = apc.analyze(TOPOLOGIES / "carried-beam.yaml")
+    assert found.linearized and all(len(line) <= 80 for line in str(found).splitlines())

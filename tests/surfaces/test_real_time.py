@@ -23,9 +23,11 @@ import pytest
 
 from apc.__main__ import run
 from apc.compiler.errors import ApcError, Diagnostic
+from apc.output.realtime_output import ticks_text
 from apc.processes import Workers
 from apc.realtime.device import device_function
 from apc.realtime.peer_run import run_of
+from apc.realtime.run_comparison import Ticks
 from apc.realtime.run_folder import read_run
 from apc.realtime.start import LocalRun, RunPart, run_all
 from tests.surfaces.wire import Other, Wire, loop_at, send_packets
@@ -251,3 +253,13 @@ def test_ctrl_c_ends_a_peer_and_what_it_did_is_kept(tmp_path: Path) -> None:
         assert playing.returncode == 0, told[1]
         assert "stopped before the end" in told[0]
         assert all(one.stopped for one in read_run(tmp_path / "all.run").peers)
+
+
+def test_each_heading_is_above_its_column() -> None:
+    ticks = Ticks("left[1]", 2000, (1e-5, 2e-5, 3e-5, 4e-5), (1e-4, 2e-4, 3e-4, 4e-4), 0.0, False, (), {})
+    lines = list(ticks_text([ticks]))
+    for subject, heading, row in (("late by", *lines[:2]), ("took", *lines[2:4])):
+        assert heading.split()[: len(subject.split())] == subject.split()
+        assert row.split()[:2] == ["left[1]", "2,000"]
+        assert heading.index("instants") + len("instants") == row.index("2,000") + len("2,000")
+        assert len(heading) == len(row)  # the numbers end where their headings do
