@@ -90,7 +90,7 @@ def put(place: Any, number: float) -> Callable[[Any], Any]:
         ("offsets", lambda _: {9: [0.0, 0.0]}, "it tells of a peer or link that isn't there"),
         ("offsets", lambda _: {1: [math.nan, 0.0]}, "what it tells is not what apc run writes"),
         ("stopped", lambda _: 1, "what it tells is not what apc run writes"),
-        ("not_given", lambda _: ["\x1b[2J"], "what it tells is not what apc run writes"),
+        ("not_granted", lambda _: ["\x1b[2J"], "what it tells is not what apc run writes"),
     ],
 )
 def test_what_no_peer_of_the_topology_can_have_done_is_refused(

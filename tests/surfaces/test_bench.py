@@ -19,6 +19,7 @@ from apc.benchmark.speed_and_error import SAME, Bench, MethodTiming, bench, pare
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.output.bench_output import bench_picture
+from apc.verdict import Limitation, LimitationCode
 from tests.commands import Cli, write
 from tests.hard.truths import HERE, TRUTHS, truth_of
 from tests.topologies import AVERAGE, TOPOLOGIES, compiled, replaced
@@ -140,13 +141,13 @@ def test_what_goes_wrong_in_the_end_costs_no_figures(
         raise ApcError(Diagnostic("E601", SourceLocation("bench.png"), "can't be written: no space"))
 
     assert found.faults == ()
-    note = "WRONG: the bound of dense does not hold"
+    note = Limitation(LimitationCode.WRONG_BOUND, ("dense",))
     first, *rest = found.comparisons
     broken = replace(found, comparisons=(replace(first, notes=(note,)), *rest))
     monkeypatch.setattr("apc.output.pictures.write_figure", full)
     for measured, plot, messages in (
         (found, "--plot bench.png", ["E601 can't be written"]),
-        (broken, "", ["E922", note]),
+        (broken, "", ["E922", "WRONG: the bound of dense does not hold"]),
     ):
         monkeypatch.setattr("apc.benchmark.speed_and_error.bench", lambda *_, measured=measured: measured)
         ran = cli(f"bench '{TOPOLOGIES}/template.yaml' {plot}")

@@ -534,7 +534,7 @@ def test_what_the_browser_can_t_say_changes_nothing(page: TopologyTab) -> None:
             if not is_number(value):  # of those the nearest values are taken
                 tapped(page, x, y)
         assert [one.value for one in models] == before, value
-    assert page.places == [one.start for one in page.sliders]
+    assert page.positions == [one.start for one in page.sliders]
     assert not Asked.requested
 
 
@@ -559,7 +559,7 @@ def test_what_the_browser_may_say_is_computed(page: TopologyTab) -> None:
         (page.at, "user[1].cube.x"),
     ):
         says(page, model, value)
-    assert page.places[0] == last
+    assert page.positions[0] == last
     assert page.sliders[page.chosen[0]].label == "device.mass"
     assert page.meant.value.startswith("packets")
     assert next(one for one in reversed(Asked.requested) if one.section == "motion").request is False
@@ -568,7 +568,7 @@ def test_what_the_browser_may_say_is_computed(page: TopologyTab) -> None:
     assert "contact.stiffness can&#x27;t be" in page.message.model.text
     says(page, page.selects[0], "contact.stiffness")
     tapped(page, 1500, 300)
-    moved = {one.label: one.values[at] for one, at in zip(page.sliders, page.places, strict=True)}
+    moved = {one.label: one.values[at] for one, at in zip(page.sliders, page.positions, strict=True)}
     assert moved["contact.stiffness"] == 1500 and moved["coordination.stiffness"] == 300
     page._ask_tune()
     free, best = Asked.requested[-1].request

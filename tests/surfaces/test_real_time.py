@@ -228,7 +228,7 @@ if __name__ == "__main__":
 def command(folder: Path, *words: str) -> subprocess.Popen[str]:
     (folder / "apc_play.py").write_text(PLAY, encoding="utf-8")  # a file: processes it starts read it again
     return subprocess.Popen(
-        [sys.executable, "apc_play.py", "play", "three.yaml", *words],
+        [sys.executable, "apc_play.py", "run", "three.yaml", *words],
         cwd=folder, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     )  # fmt: skip
 

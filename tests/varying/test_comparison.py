@@ -251,9 +251,9 @@ def test_a_cell_that_cant_be_had_says_why_below_its_dash() -> None:
     found = compared(SHAKING, LOSSY, ONE_MASS)
     missing = [dict(one.missing) for one in found.schemes]
     assert [sorted(one) for one in missing] == [
-        ["transparency", "loss"],
+        ["loss", "transparency"],
         ["delay"],
-        ["delay", "transparency", "loss", "stiffness"],
+        ["delay", "loss", "stiffness", "transparency"],
     ]
     assert missing[0]["loss"] == "no packet can get lost; loss: 0 % written to lan lets its loss be varied"
     assert missing[1]["delay"].startswith("apc critical lan.delay: lan.delay can't be varied in mean square")

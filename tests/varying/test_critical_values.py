@@ -263,7 +263,7 @@ ALONG = {
     "users that differ": (DIFFERENT, "lan.delay", {"upper": "160 ms"}, HALVES[:160:7], 0),
     "a delay by its name": (NAMED, "late", {"upper": "160 ms"}, HALVES[:160:13], 0),
     "peers that all differ": ("different-peers", "contact.stiffness", {}, [], 0),
-    "a finger": ("finger", "wall.delay", {"upper": "3 ms", "set": {"wall.stiffness": "5000 N/m"}}, [], 0),
+    "a finger": ("finger", "wall.delay", {"upper": "3 ms", "params": {"wall.stiffness": "5000 N/m"}}, [], 0),
     "linearized at its start": ("experiment-average", STIFFNESS, {}, [], 0),
     "a motor within its limits": ("limited-motor", "wall.stiffness", {}, [], 0),
     "a force against itself": (replaced(AVERAGE, OWN), STIFFNESS, {}, [], 1),
@@ -279,7 +279,7 @@ def test_the_verdict_along_a_scan_is_what_analyses_say(name: str) -> None:
     found = apc.critical(system, parameter, **requested)
     assert found.crossings and (not count or len(found.crossings) == count)
     assert found.value in [one.value for one in found.crossings]
-    check(apc.set_parameters(system, requested.get("set", {})), found, values)
+    check(apc.set_parameters(system, requested.get("params", {})), found, values)
 
 
 def test_how_many_users_is_answered_as_each_topology_alone_would() -> None:
