@@ -49,7 +49,7 @@ def encoded(system: Model) -> bytes:
 
 def decoded(model: bytes) -> Model:
     """Return the model of bytes that `encoded` gave."""
-    return msgspec.msgpack.decode(model, type=Model, dec_hook=_typed_fields)
+    return msgspec.msgpack.decode(model, type=Model, dec_hook=_decode)
 
 
 def _plain(value: Any) -> Any:
@@ -63,7 +63,7 @@ def _plain(value: Any) -> Any:
     raise NotImplementedError(type(value))
 
 
-def _typed_fields(requested: Any, value: Any) -> Any:
+def _decode(requested: Any, value: Any) -> Any:
     if requested is Fraction:
         return Fraction(value)
     if requested is casadi.Function:

@@ -82,7 +82,7 @@ class ComponentNames:
             elif getattr(parameter, "role", "") == "clock":
                 known[(interval_of(parameter.name),)] = SECOND
         known |= {(OTHERS, send.name): send.dimension for send in component.sends}
-        self.dimensions = {_complete(path): dimension for path, dimension in known.items()}
+        self.dimensions = {_vector_of(path): dimension for path, dimension in known.items()}
         self.sizes: dict[Path, int | None] = {**sizes_of(known)}
 
     def size_of(self, parts: Path) -> int | None:
@@ -156,10 +156,10 @@ class ComponentNames:
         waiting |= undeclared
         self.dimensions |= dict.fromkeys(waiting)
         self.sizes |= dict.fromkeys(waiting)
-        _settle(waiting, self._size, self.sizes)
+        _infer_all(waiting, self._size, self.sizes)
         # A size that contradicts itself, or depends only on itself, is undefined.
         self.sizes |= {name: self._size(*written) or 0 for name, written in waiting.items()}
-        _settle(waiting, self._inferred, self.dimensions)
+        _infer_all(waiting, self._inferred, self.dimensions)
         return [
             (text, _known(self.dimensions[name]))
             for name in reversed(undeclared)
@@ -250,7 +250,7 @@ class ComponentNames:
         return dimension_of(expression, self._lookup, where.text, where.location)
 
     def _lookup(self, name: Name) -> Dimension | None:
-        return self.dimensions.get(_complete(name.parts))
+        return self.dimensions.get(_vector_of(name.parts))
 
     def _check_names(self, expression: Expr, where: Where, mistakes: Mistakes) -> None:
         """Record names that the component does not have, and words and tables instead of numbers."""
@@ -289,7 +289,7 @@ class ComponentNames:
 
     def _check_name(self, parts: Path, location: SourceLocation, mistakes: Mistakes) -> None:
         """Record a name there isn't, or an entry that a vector hasn't got."""
-        whole, index = _complete(parts), whole_and_index(parts[-1])[1]
+        whole, index = _vector_of(parts), whole_and_index(parts[-1])[1]
         shown, size = ".".join(whole), self.size_of(whole) or 0
         if whole in self.dimensions and index <= size:
             return
@@ -306,7 +306,7 @@ class ComponentNames:
             mistakes.take(unknown("E303", location, message, shown, sorted(known)))
 
 
-def _complete(path: Path) -> Path:
+def _vector_of(path: Path) -> Path:
     """Return the vector that an entry is of; of a number its own path."""
     return (*path[:-1], whole_and_index(path[-1])[0])
 
@@ -315,7 +315,7 @@ def _location(where: Where, node: Expr) -> SourceLocation:
     return location_in(where.location, where.text, node.start)
 
 
-def _settle(
+def _infer_all(
     unresolved: Mapping[Path, Written],
     infer: Callable[[Expr, Where], T | None],
     known: dict[Path, T | None],
@@ -347,7 +347,10 @@ def _visible_names(component: Component) -> Iterator[tuple[Path, Dimension]]:
     for name, connector in component.connectors:
         yield from (((name, potential.name), potential.unit.dimension) for potential in connector.potentials)
     for inner in component.inner:
-        yield from (((inner.name, *path), related) for path, related in _visible_names(inner.component))
+        yield from (
+            ((inner.name, *path), inner_dimension)
+            for path, inner_dimension in _visible_names(inner.component)
+        )
 
 
 def _known(dimension: Dimension | None) -> Dimension:

@@ -134,7 +134,7 @@ class PartEntry:
 
     def connectors(self, kind: str) -> list[str]:
         """Return its connectors of a type."""
-        return [name for name, related in self.component.connectors if related.name == kind]
+        return [name for name, connector_type in self.component.connectors if connector_type.name == kind]
 
 
 @dataclass(frozen=True, slots=True)
@@ -325,7 +325,7 @@ def read_entry(entry: PartEntry, scope: EntryScope, mistakes: Mistakes, index: i
         with mistakes:
             if joined := _joined(name, kind.name, nodes.get(name), entry, scope, index):
                 connections.append((name, *joined))
-    targets = [(part, related) for _, part, related in connections if part != GROUND]
+    targets = [(part, connector_type) for _, part, connector_type in connections if part != GROUND]
     if len(targets) > 1 and len(set(targets)) == 1:
         mistakes.add("E210", entry.location, f"{entry.name} joins {targets[0][0]} to itself")
     return PartBindings(

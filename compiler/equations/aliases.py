@@ -28,7 +28,9 @@ class Aliases:
         self.moving = moving
         self.names = sorted(moving.variables, key=lambda name: (name not in started, name.count(".")))
         self.rank = {name: index for index, name in enumerate(self.names)}
-        self.stands: dict[str, tuple[int, str, int]] = {}  # name: ± (or 0 times) a derivative of another
+        self.replacements: dict[
+            str, tuple[int, str, int]
+        ] = {}  # name: ± (or 0 times) a derivative of another
         self.velocities: dict[Derivative, str] = {}  # derivatives that have names of their own
 
     def _velocities(self) -> dict[Derivative, str]:
@@ -48,7 +50,7 @@ class Aliases:
         """Return the expression in the names kept."""
         held = self.moving.derivatives(expression)
         return expression.xreplace(
-            {s: self.value(*pair) for s, pair in held.items() if pair[0] in self.stands}
+            {s: self.value(*pair) for s, pair in held.items() if pair[0] in self.replacements}
         )
 
     def shown(self, expression: Term) -> Term:
@@ -90,12 +92,12 @@ class Aliases:
         named = sign == 1 or high == 0 or (stays, high) in self._velocities()
         if low or abs(factor) != abs(other) or not named or (goes == stays and sign):
             return False
-        self.stands[goes] = (sign, stays, high)
+        self.replacements[goes] = (sign, stays, high)
         return True
 
     def _meaning(self, name: str, order: int) -> tuple[int, str, int]:
         sign = 1
-        while sign and name in self.stands:
-            related, name, more = self.stands[name]
-            sign, order = sign * related, order + more
+        while sign and name in self.replacements:
+            factor, name, more = self.replacements[name]
+            sign, order = sign * factor, order + more
         return sign, name, order

@@ -145,14 +145,14 @@ def _sorted(peer_type: ClockedPeerType, divisors: Divisors, mistakes: Mistakes) 
         received |= {part.symbol: part for part in parts if part.symbol not in received}
     partitions = []
     for part in peer_type.partitions[1:]:
-        related = problem(f"the equations of clock {part.clock}", part)
+        clock_problem = problem(f"the equations of clock {part.clock}", part)
         with mistakes:
-            equal = zip(part.equations, _sides(part.equations, None, related), strict=True)
+            equal = zip(part.equations, _sides(part.equations, None, clock_problem), strict=True)
             residuals = [
                 Residual((left - right).xreplace(reductions), flat_equation)
                 for flat_equation, (left, right) in equal
             ]
-            steps = solve_blocks(residuals, [symbol(name) for name in part.variables], related)
+            steps = solve_blocks(residuals, [symbol(name) for name in part.variables], clock_problem)
             partitions.append(SortedPartition(part.clock, steps))
     states, aliases, steps, read = _sorted_continuous(
         peer_type, problem("the continuous equations", peer_type.partitions[0])
@@ -202,7 +202,7 @@ def _sorted_continuous(
         *aliases.velocities,
         *(it for residual in read for it in moving.derivatives(residual.expression).values()),
     ]
-    orders = {name: 0 for name in variables if name not in aliases.stands} | dict(
+    orders = {name: 0 for name in variables if name not in aliases.replacements} | dict(
         sorted(requested, key=itemgetter(1))
     )
     reduction = IndexReduction(residuals, orders, moving, problem)

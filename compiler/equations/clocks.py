@@ -92,7 +92,7 @@ def check_single(component: Component, location: SourceLocation, mistakes: Mista
     clocks = _Clocks(flat, mistakes)
     for name, connector in component.connectors:
         for potential, flow in zip(connector.potentials, connector.flows, strict=True):
-            text, other = (f"{component.name}.{name}.{related.name}" for related in (potential, flow))
+            text, other = (f"{component.name}.{name}.{variables.name}" for variables in (potential, flow))
             if clocks.pinned(text) == CONTINUOUS != clocks.of(other) and other in clocks.given:
                 clocks.report_flow(other, clocks.given[other])
 
@@ -139,7 +139,7 @@ def _partitioned(peer_type: FlatPeerType, mistakes: Mistakes) -> ClockedPeerType
     for variable in clocks.variables:
         members.setdefault(clocks.of(variable), ([], []))[0].append(variable)
     partitions = tuple(
-        Partition(clock, tuple(related), tuple(of)) for clock, (related, of) in members.items()
+        Partition(clock, tuple(variables), tuple(of)) for clock, (variables, of) in members.items()
     )
     return ClockedPeerType(peer_type, partitions, samples, holds, previous, receives)
 

@@ -40,15 +40,15 @@ def connection_equations(
 
     passed, grounded = set(), set()
     for part in parts:
-        for connector, inner, related in part.component.passed:
+        for connector, inner, connector_of_other in part.component.passed:
             passed.add((part.name, connector))
-            join((part.name, connector), (f"{part.name}.{inner}", related))
+            join((part.name, connector), (f"{part.name}.{inner}", connector_of_other))
     for part in parts:
-        for connector, other, related in part.connections:
+        for connector, other, connector_of_other in part.connections:
             if other == GROUND:
                 grounded.add((part.name, connector))
             elif other in by_name:
-                join((part.name, connector), (other, related))
+                join((part.name, connector), (other, connector_of_other))
             else:
                 message = f"{part.name} is at groups where {other}, which it joins, is not"
                 hint = f"at: the same groups at both {part.name} and {other}"

@@ -46,7 +46,7 @@ def match(
     """
     n = len(held)
     node = {unknown: j for j, unknown in enumerate(unknowns, n)}
-    edges = [sorted(node[item] for item in related) for related in held]
+    edges = [sorted(node[item] for item in equation_unknowns) for equation_unknowns in held]
     holds = _graph(edges + [[]] * len(node))
     partner = maximum_bipartite_matching(holds[:n, n:], perm_type="row").tolist()
     graph = _graph(edges + [[i] if i >= 0 else [] for i in partner])
@@ -69,5 +69,7 @@ def match(
 def _graph(edges: Sequence[Sequence[int]]) -> Any:
     """Return the adjacency matrix of a graph, by where the edges of each of its nodes end."""
     ends = np.cumsum([0, *map(len, edges)])
-    locations = np.array([number for related in edges for number in related], dtype=np.int32)
+    locations = np.array(
+        [number for equation_unknowns in edges for number in equation_unknowns], dtype=np.int32
+    )
     return csr_array((np.ones(len(locations)), locations, ends), shape=(len(edges), len(edges)))

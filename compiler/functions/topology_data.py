@@ -129,12 +129,25 @@ def used_links(topology: Topology, peer_types: Sequence[PeerType], timings: Timi
             PairDelay(topology_delay.sender, topology_delay.receiver, timings.use(name, topology_delay.delay))
             for topology_delay, name in pairs
         )
-        delay, channel, related = timings.use(f"{link.name}.delay", link.delay), None, link.channel
-        if related is not None:
-            loss = Loss(*(name for name, _ in related.loss)) if related.loss else None
-            jitter = None if related.jitter is None else timings.use(f"{link.name}.jitter", related.jitter)
+        delay, channel, channel_declaration = (
+            timings.use(f"{link.name}.delay", link.delay),
+            None,
+            link.channel,
+        )
+        if channel_declaration is not None:
+            loss = Loss(*(name for name, _ in channel_declaration.loss)) if channel_declaration.loss else None
+            jitter = (
+                None
+                if channel_declaration.jitter is None
+                else timings.use(f"{link.name}.jitter", channel_declaration.jitter)
+            )
             channel = Channel(
-                loss, jitter, related.distribution, related.reorder, related.on_loss, related.trace
+                loss,
+                jitter,
+                channel_declaration.distribution,
+                channel_declaration.reorder,
+                channel_declaration.on_loss,
+                channel_declaration.trace,
             )
         links.append(Link(link.name, link.clock, delay, link.graph, delays, channel))
     return tuple(links)
@@ -204,7 +217,7 @@ def check_links(topology: Topology, peer_types: Sequence[PeerType], indices: Seq
     groups, counts = topology.groups, [group.count for group in topology.groups]
     for link in (link for link in topology.links if link.graph.shape == "arcs"):  # else all have senders
         owner = np.repeat(np.arange(len(groups)), counts)
-        used = [_timings(peer_types[index], link.name) for index in indices]
+        used = [_undefined_reduction(peer_types[index], link.name) for index in indices]
         sends = [any(send.link == link.name for send in peer_types[index].sends) for index in indices]
         senders, receivers = link.graph.arcs.T
         asking = np.flatnonzero(np.array(used, dtype=bool)[owner])
@@ -226,7 +239,7 @@ def check_links(topology: Topology, peer_types: Sequence[PeerType], indices: Seq
     mistakes.raise_if_any()
 
 
-def _timings(peer_type: PeerType, link: str) -> str:
+def _undefined_reduction(peer_type: PeerType, link: str) -> str:
     """Return the peer type's `mean`, `max` or `min` over a link, undefined without senders; "" if none."""
     operators = (
         receive.operator for clock in peer_type.clocks for receive in clock.receives if receive.link == link

@@ -242,8 +242,8 @@ def _inside(part: PartInstance, inner: Inner, peers: int, mistakes: Mistakes) ->
         ),
         starts=settled(entry.starts),
         connections=tuple(
-            (local, GROUND if other == GROUND else f"{part.name}.{other}", related)
-            for local, other, related in entry.connections
+            (local, GROUND if other == GROUND else f"{part.name}.{other}", connector_of_other)
+            for local, other, connector_of_other in entry.connections
             if other
         ),
     )

@@ -228,7 +228,7 @@ def parametric_subsystems(
         message = f"{system.name} is not linear: where it is linearized may move with the parameters"
         raise ApcError(Diagnostic("E832", SourceLocation(system.origin.topology), message))
     field = Ratios.of(len(ranges))
-    opened = [_parametric_groups(system, group, ranges, field) for group in system.groups]
+    opened = [_dependent_parameters(system, group, ranges, field) for group in system.groups]
     point = [
         Override(interval.free, interval.low + GENERIC**index * (interval.high - interval.low))
         for index, interval in enumerate(ranges, 1)
@@ -242,7 +242,7 @@ def parametric_subsystems(
     return ParametricSubsystems(at, groups, exchange, subsystems)
 
 
-def _parametric_groups(
+def _dependent_parameters(
     system: Model, group: Group, ranges: Sequence[Range], field: Ratios
 ) -> dict[str, Ratio]:
     """Return the parameters of a group's peer type that depend on those of the box."""

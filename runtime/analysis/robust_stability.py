@@ -2,7 +2,7 @@
 
 Takes: a `Model` and ranges.
 Gives: `RobustStability`, `ChangingDelay`, `prove_robust_stability`; `search_box`, `CellTest`, `CellVerdict`,
-`middle`; `BoxProblem`, `undecided_notes`; `TOGETHER`, `UNDECIDED`.
+`middle`; `BoxProblem`, `box_problem`; `TOGETHER`, `UNDECIDED`.
 Guarantees: stable means proved for every point of the box, unstable proved at the named point.
 Does not: find the boundary (see the undecided fraction).
 
@@ -133,7 +133,7 @@ def prove_robust_stability(
     """
     with single_threaded(), np.errstate(all="ignore"):
         prepared = prepare(system)
-        opened = undecided_notes(system, ranges, prepared, inside)
+        opened = box_problem(system, ranges, prepared, inside)
 
         def is_unstable(point: Sequence[Fraction]) -> bool:
             values = [Override(interval.free, value) for interval, value in zip(ranges, point, strict=True)]
@@ -170,7 +170,7 @@ class BoxProblem:
     notes: tuple[str, ...]
 
 
-def undecided_notes(system: Model, ranges: Sequence[Range], prepared: Prepared, inside: float) -> BoxProblem:
+def box_problem(system: Model, ranges: Sequence[Range], prepared: Prepared, inside: float) -> BoxProblem:
     """Return the systems whose stability is to be proved over a box.
 
     Parameters

@@ -110,7 +110,7 @@ def _verdict(system: Model, prepared: Prepared, _: None) -> Plain:
         "linear": not analysis.linearized,
         "at_once": not analysis.linearized or prepare_at_start(system, prepared) is not None,
         "radius": analysis.spectral_radius,
-        "limits": _limits(analysis),
+        "limits": _dominant_mode_text(analysis),
         "notes": analysis.limitations,
         "text": str(analysis),
         "real": values.real,
@@ -124,7 +124,7 @@ def _named(mode: Mode) -> str:
     return f"{mode.family}{at}"
 
 
-def _limits(analysis: Analysis) -> str:
+def _dominant_mode_text(analysis: Analysis) -> str:
     """Return a sentence on the dominant mode: its growth or decay, and its largest participations."""
     if not analysis.modes:
         return "Nothing moves."

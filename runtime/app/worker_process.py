@@ -98,7 +98,7 @@ class Desk:
         self.stack.close()
 
     def _next(self) -> None:
-        if self.busy is not None or not self.waiting or self._keep():
+        if self.busy is not None or not self.waiting or self._must_wait():
             return
         if self.workers is None:
             self.workers = self.stack.enter_context(local_processes(compute, self.model, 1, LOST))
@@ -109,7 +109,7 @@ class Desk:
         future = self.workers.submit(task)
         future.add_done_callback(lambda done: self.call_later(lambda: self._done(number, task, done), 0))
 
-    def _keep(self) -> bool:
+    def _must_wait(self) -> bool:
         """Return whether others go first, and look again when they may have had long enough."""
         now = time.monotonic()
         if all(desk.busy is None for desk in self.before):

@@ -93,10 +93,10 @@ def scale(path: Path, counts: Sequence[int]) -> Scale:
         raise ApcError(Diagnostic("E921", SourceLocation("--scale"), "the list", expected, got))
     name, _ = _largest(path)
     rows, refused = [], []
-    floor = _single_user(_floor, path, 0)
+    floor = _measure_in_process(_floor, path, 0)
     for count in dict.fromkeys(counts):
         try:
-            rows.append(_single_user(_measure, path, count))
+            rows.append(_measure_in_process(_measure, path, count))
         except ApcError as error:
             refused.append((count, reason_of(error)))
     if not rows:
@@ -142,7 +142,7 @@ def _largest(path: Path) -> tuple[str, Scalar]:
     return name, number
 
 
-def _single_user(measure: Callable[[Path, int], Found], path: Path, count: int) -> Found:
+def _measure_in_process(measure: Callable[[Path, int], Found], path: Path, count: int) -> Found:
     """Measure in a process of its own."""
     location = SourceLocation("--scale")
     message = "the process that measured it ended without a word: stopped from outside, or out of memory"

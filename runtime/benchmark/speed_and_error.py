@@ -425,5 +425,5 @@ def pareto_front(measured: Sequence[MethodTiming]) -> tuple[MethodTiming, ...]:
 
 def _beats(measured: MethodTiming, other: MethodTiming) -> bool:
     faster = measured.seconds + measured.spread + other.spread < other.seconds
-    mine, related = (max(m.error or 0.0, SAME) for m in (measured, other))
-    return (faster and mine <= related) or (mine < related and measured.seconds <= other.seconds)
+    mine, theirs = (max(m.error or 0.0, SAME) for m in (measured, other))
+    return (faster and mine <= theirs) or (mine < theirs and measured.seconds <= other.seconds)

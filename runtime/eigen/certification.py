@@ -119,7 +119,7 @@ def prove(system: ClosedLoop, free: RigidModes) -> Proof:
                 free, searched = find_rigid_modes(system), True
                 polynomials = _polynomials(matrix, free)
             result = [root_discs(polynomial) for polynomial in polynomials]
-            verdicts = [discs.inside for discs in result] if _is_fixed(matrix, free) else [None]
+            verdicts = [discs.inside for discs in result] if _may_be_fixed(matrix, free) else [None]
         centres, radii = (
             np.concatenate([np.empty(0), *(getattr(discs, name) for discs in result)])
             for name in ("centres", "radii")
@@ -195,7 +195,7 @@ def _above(value: Any) -> float:
     return known + 4 * UNIT_ROUNDOFF * abs(known)
 
 
-def _is_fixed(matrix: Balls, free: RigidModes) -> bool:
+def _may_be_fixed(matrix: Balls, free: RigidModes) -> bool:
     """Return whether the balls allow that M v = v for the rigid directions.
 
     The directions are exact for rational weights; with others, one that depends on the weight would be wrong.

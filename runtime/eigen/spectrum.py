@@ -346,13 +346,13 @@ def _modes(systems: Sequence[ClosedLoop], solved: Sequence[_SolvedLoop]) -> tupl
                     multiplicity=systems[index].multiplicity,
                     family=systems[index].name,
                     error=float(solved[index].bounds.errors[row]),
-                    motion=LazyTuple(functools.partial(_mode_of, motions, number)),
+                    motion=LazyTuple(functools.partial(_motion_of, motions, number)),
                 )
             )
     return tuple(modes)
 
 
-def _mode_of(motions: Sequence[ModeMotion], number: int) -> tuple[ModeMotion]:
+def _motion_of(motions: Sequence[ModeMotion], number: int) -> tuple[ModeMotion]:
     return (motions[number],)
 
 

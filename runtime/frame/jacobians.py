@@ -61,9 +61,11 @@ def guards_of(expression: Any, moving: Any, *, tables: bool = True) -> list[Any]
             result.append(parts[0])
         elif code in _STEPS:
             # Changes sign at each integer and half-way between, where the split has no effect.
-            result.append(_all_entries(parts[0]))
+            result.append(_integer_indicator(parts[0]))
     if tables:
-        result += [_all_entries(function_of(table.positions())(at)) for table, at in lookups_of(expression)]
+        result += [
+            _integer_indicator(function_of(table.positions())(at)) for table, at in lookups_of(expression)
+        ]
     return [item for item in result if casadi.depends_on(item, moving)]
 
 
@@ -73,7 +75,7 @@ def lookups_of(expression: Any) -> list[tuple[Interpolation, Any]]:
     return [(table_of(call.which_function()), call.dep(0)) for call in calls]
 
 
-def _all_entries(expression: Any) -> Any:
+def _integer_indicator(expression: Any) -> Any:
     """Return a function that changes sign where an expression is an integer."""
     return casadi.sin(np.pi * expression)
 

@@ -225,9 +225,9 @@ def _split(
     terms = MIDPOINT_RADIUS.multiply(
         MIDPOINT_RADIUS.exact(counts[None]), terms.swapaxes(0, 1).reshape(2, subsystems, -1)
     )
-    u, w = _rank_single(change)
-    u, w, sent = (_last_as_unit(values, large) for values in (u[:, None], w[:, None], _size(a)))
-    received = _last_as_unit(_size(b).swapaxes(1, 2), large)
+    u, w = _rank_one_bound(change)
+    u, w, sent = (_merge_last(values, large) for values in (u[:, None], w[:, None], _size(a)))
+    received = _merge_last(_size(b).swapaxes(1, 2), large)
     circle = np.concatenate([u * w, counts[:, None, None] * sent * u, w * received], axis=1).swapaxes(1, 2)
     error = _pole_errors(values, circle[:, :-1, 0], circle[:, -1, 0] * block / radius)
     exact, error_bound = residues.reshape(2, subsystems * large, n_s * n_r)
@@ -302,7 +302,7 @@ def _block_series(row: Matrix, column: Matrix, small: Complexes, radius: float) 
     return real, block
 
 
-def _rank_single(sizes: Floats) -> tuple[Floats, Floats]:
+def _rank_one_bound(sizes: Floats) -> tuple[Floats, Floats]:
     """Return u and w with u_k w_l ≥ sizes_kl."""
     floor = np.finfo(np.float64).tiny
     u = np.maximum(sizes.max(axis=2), floor)
@@ -311,7 +311,7 @@ def _rank_single(sizes: Floats) -> tuple[Floats, Floats]:
     return u, w
 
 
-def _last_as_unit(rows: Floats, large: int) -> Floats:
+def _merge_last(rows: Floats, large: int) -> Floats:
     """Return rows (k, m, n) with the entries from `large` on as one, their 2-norm: (k, m, large + 1)."""
     return np.concatenate([rows[..., :large], np.linalg.norm(rows[..., large:], axis=-1)[..., None]], axis=-1)
 

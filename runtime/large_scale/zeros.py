@@ -63,7 +63,7 @@ BRACKETED, MOST_COUNTS, ALONGSIDE = 1e-3, 40, 1e-6
 MOST_EVALUATIONS = 4
 
 
-def enclosed_around(function: Characteristic, point: complex) -> tuple[float, int]:
+def enclosing_radius(function: Characteristic, point: complex) -> tuple[float, int]:
     """Return the radius of a circle about a point that has eigenvalues in it, and how many; or inf and 0.
 
     Nearby a zero, at ζ + h, |f| ≈ |f′| h is known to a share c of it: the zero is known to about c h.
@@ -265,7 +265,7 @@ def find_zeros(
     wider = sorted((2 * np.abs(zeros - 1)[np.abs(zeros - 1) < WIDEST]).tolist(), reverse=True)
     rigid_radius = _rigid_radius(function, rigid, wider, rigid_radius)
     zeros = _distinct(zeros, rigid_radius)
-    error_of = cache(lambda zero: enclosed_around(function, zero)[0])
+    error_of = cache(lambda zero: enclosing_radius(function, zero)[0])
     low, high, outside_radius = 0.0, 0.0, -1
     for search in range(SEARCHES):
         largest, error = _largest(zeros, exact, error_of)
@@ -362,7 +362,7 @@ def _cancelled_poles(
         if any(abs(pole - other) <= SAME * abs(pole) for other in used):
             continue
         used.append(pole)
-        error, many = enclosed_around(function, pole)
+        error, many = enclosing_radius(function, pole)
         if np.isfinite(error) and not any(abs(pole - zero) <= 2 * error for zero in zeros.tolist()):
             result.append(_local(function, index, error, many))
     return result

@@ -118,7 +118,7 @@ def prove_mean_square(system: Model, ranges: Sequence[Range], *, cells: int | No
                 note = f"{loop.name} moves freely in a direction that changes with the parameters"
                 return RobustStability(system.name, tuple(ranges), UNDECIDED, None, 0, 1.0, (), (note,))
         is_unstable = partial(_is_unstable, question)
-        cell_tests = partial(_cell_tested, question), is_unstable
+        cell_tests = partial(_test_cells, question), is_unstable
         return search_box(
             system.name,
             ranges,
@@ -204,8 +204,8 @@ def _is_unstable(question: _Question, point: Sequence[Fraction]) -> bool:
     return result.proved and result.stable is False
 
 
-def _cell_tested(question: _Question, cells: Sequence[Cell]) -> Iterator[CellVerdict]:
-    """Look at cells, their frames lifted many at a time, until one is found unstable."""
+def _test_cells(question: _Question, cells: Sequence[Cell]) -> Iterator[CellVerdict]:
+    """Yield the verdicts of cells, whose frames are lifted in batches, until one is unstable."""
     widths = np.array([float(interval.high - interval.low) for interval in question.ranges])
     for start in range(0, len(cells), TOGETHER):
         some = cells[start : start + TOGETHER]

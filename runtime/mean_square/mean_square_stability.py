@@ -305,7 +305,7 @@ def _by_tags(system: Model, prepared: Prepared, first: Fraction | None) -> Stabi
 
 def _unserved(system: Model, lossy: Sequence[tuple[Link, ChannelLaw]]) -> str:
     """Return the unsupported features of the model, "" if none."""
-    if why := next((why for link, _ in lossy if (why := _packet_questions(system, link))), ""):
+    if why := next((why for link, _ in lossy if (why := _other_coupling(system, link))), ""):
         return why
     if any(law.trace is not None for _, law in lossy):
         if not all(law.trace is not None for _, law in lossy):
@@ -334,7 +334,7 @@ def _unserved(system: Model, lossy: Sequence[tuple[Link, ChannelLaw]]) -> str:
     return ""
 
 
-def _packet_questions(system: Model, link: Link) -> str:
+def _other_coupling(system: Model, link: Link) -> str:
     """Return the coupling of a model over a link besides packet contents, "" if there is none."""
     receives = [
         receive
@@ -403,7 +403,7 @@ def _mean_square_stability(system: Model, prepared: Prepared, *, certify: bool) 
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         result = mean_square_growth(system, prepared)
         lost = [link for link, law in unreliable(system) if law.mean_loss]
-        followed = lost and not any(_packet_questions(system, link) for link in lost)
+        followed = lost and not any(_other_coupling(system, link) for link in lost)
         worst = worst_case(system, prepared) if followed else None
         surely, unsure = _almost_sure(system, prepared, result)
         metres, unmeasured = _rms_error(result)

@@ -174,7 +174,7 @@ class Recording:
             if partial:
                 self.path = partial_name(self.path)
             for temporary, added in [*self._files.items()]:
-                finish_file(temporary, self._axes_position(added))
+                finish_file(temporary, self._part_path(added))
                 del self._files[temporary]
         except OSError as error:
             self.discard()
@@ -187,11 +187,11 @@ class Recording:
             self._drop()
 
     def _temporary(self, added: str) -> Path:
-        temporary = begin_file(self._axes_position(added))
+        temporary = begin_file(self._part_path(added))
         self._files[temporary] = added
         return temporary.path
 
-    def _axes_position(self, added: str) -> Path:
+    def _part_path(self, added: str) -> Path:
         return self.path.with_name(f"{self.path.name}{added}")
 
     def _drop(self) -> None:

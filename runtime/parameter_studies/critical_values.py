@@ -333,10 +333,10 @@ def _searched(
             raise delay_search_refused(system)
         begin = limits[0] or Fraction(0)
         end = limits[1] or delay_reach(system, free, begin, pieces=PIECES, further=FURTHER)[0]
-        tell = delay_progress(system, free, begin, end, location=_LOCATION, progress=progress)
+        report_progress = delay_progress(system, free, begin, end, location=_LOCATION, progress=progress)
         result = stable_in_all(
             [
-                search(DelayPath(side.system, free, start, begin, end, tell))
+                search(DelayPath(side.system, free, start, begin, end, report_progress))
                 for side, start in zip(sides(system, prepared), starts, strict=True)
                 if start is not None
             ]

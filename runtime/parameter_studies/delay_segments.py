@@ -135,14 +135,14 @@ def delay_progress(
     pieces = _count(free, low, high, borders(system, free, location=location), location)
     begun, done = time.monotonic(), 0
 
-    def tell(value: Fraction) -> None:
+    def report_progress(value: Fraction) -> None:
         nonlocal done
         if progress:
             left = time_left(time.monotonic() - begun, done, pieces)
             progress(f"looking at {free.label} up to {float(value):.6g} s of {float(high):.6g} s{left}")
         done += 1
 
-    return tell
+    return report_progress
 
 
 def _count(

@@ -221,7 +221,7 @@ class PeerLoop:
             elif leads and set(self.others) == set(self.post.nonces):
                 self.begins, self.session = now() + HEAD_START, self.post.nonce
             elif now() > end:
-                raise self._single(patience)
+                raise self._no_answer(patience)
         if now() > self.begins:  # who begins late, or again, comes in with the frame after the next
             self.first = (now() - self.begins) // self.frame_ns + 2
             self.player.instant = self.first * self.frame_ns
@@ -232,7 +232,7 @@ class PeerLoop:
         for other in others:
             self._send(self.post.hello(now(), other), self.others[other])
 
-    def _single(self, patience: float) -> ApcError:
+    def _no_answer(self, patience: float) -> ApcError:
         missing = sorted(set(self.others) - set(self.post.nonces)) or sorted(self.others)[:1]
         names = ", ".join(self.exchange.peer_name(number) for number in missing)
         dropped = self.post.dropped.items()
@@ -303,9 +303,9 @@ class PeerLoop:
                     answer = self.post.answer(now(), hello, came, self.begins, self.session)
                     self._send(answer, address)
                 case HelloReply() as answer:
-                    self._connected(answer, came)
+                    self._synchronize(answer, came)
 
-    def _connected(self, answer: HelloReply, came: int) -> None:
+    def _synchronize(self, answer: HelloReply, came: int) -> None:
         """Learn another's clock, and when the model begins, by a round trip (RFC 5905, section 8)."""
         trip = (came - answer.requested) - (answer.time - answer.came)
         ahead = ((answer.came - answer.requested) + (answer.time - came)) // 2

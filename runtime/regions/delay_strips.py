@@ -169,18 +169,20 @@ def _delay_strips(
             ends = [
                 float((number - delay.low) / (delay.high - delay.low)) for number in (piece.low, piece.high)
             ]
-            yield _fixed_delays(piece, other, ends, prepared)
+            yield _delay_independent_strip(piece, other, ends, prepared)
         return
     # An oversized problem is refused before any strip is analyzed.
     longest = system_with_delay(system, delay.free, delay.high)
     evaluator_of_many(longest, [other.free], LOCATION, prepared=prepared)
-    tell = delay_progress(system, delay.free, delay.low, delay.high, location=LOCATION, progress=progress)
+    report_progress = delay_progress(
+        system, delay.free, delay.low, delay.high, location=LOCATION, progress=progress
+    )
     for piece in delay_segments(system, delay.free, delay.low, prepared, location=LOCATION, high=delay.high):
         high = min(piece.high, delay.high)
-        tell(high)
+        report_progress(high)
         ends = [float((number - delay.low) / (delay.high - delay.low)) for number in (piece.low, high)]
         if piece.evaluator is None:
-            yield _fixed_delays(piece, other, ends, prepared)
+            yield _delay_independent_strip(piece, other, ends, prepared)
         else:
             yield _moving(system, delay, other, piece, ends, prepared, cells, tolerance)
 
@@ -202,7 +204,7 @@ def _between_periods(strips: Sequence[_Strip]) -> list[_Strip]:
     return result
 
 
-def _fixed_delays(
+def _delay_independent_strip(
     piece: DelaySegment, other: Range, ends: Sequence[float], prepared: Prepared
 ) -> _Strip | None:
     """Return a strip in which nothing depends on the delay: straight lines at the other's critical values."""

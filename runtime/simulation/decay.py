@@ -43,7 +43,7 @@ OPEN = 0.5
 LARGE = 0.1  # share of the largest amplitude from which a pole that is not known leaves the rate open
 FADED = 1e-10  # share of the largest second difference from which a sample counts
 STEADY = 0.5  # share of the range of the last quarter that the step to it must be, for a drift
-STORED = 0.8  # share of a step that the next but one must keep, for a drift
+KEPT_SHARE = 0.8  # share of a step that the next but one must keep, for a drift
 LATE = 0.9  # share of the samples: a motion that ends before has ended
 UNIT = float(np.finfo(np.float64).eps)
 PARTS = ((0.0, 0.7), (0.3, 1.0))  # of the window, which are fitted again
@@ -283,6 +283,6 @@ def _drifts(window: Floats) -> bool:
     quarters = np.array_split(window, 4)
     steps = np.diff([part.mean(axis=0) for part in quarters], axis=0)
     onwards = (np.sign(steps) == np.sign(steps[0])).all(axis=0)
-    kept = np.abs(steps[2]) > STORED * np.abs(steps[0])
+    kept = np.abs(steps[2]) > KEPT_SHARE * np.abs(steps[0])
     large = np.abs(steps[2]) > np.maximum(RAMP * np.ptp(window, axis=0), STEADY * np.ptp(quarters[3], axis=0))
     return bool((onwards & kept & large).any())

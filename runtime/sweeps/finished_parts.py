@@ -72,7 +72,7 @@ class SweepParts:
             return None
         return _unpacked(read_arrays(body, _ARRAYS, _LARGEST))
 
-    def exists(self) -> set[int]:
+    def finished(self) -> set[int]:
         """Return the numbers of the parts that have a file, damaged or not. Raises ApcError E601."""
         try:
             listed = [path.name for path in self.folder.iterdir()]
@@ -85,7 +85,7 @@ class SweepParts:
 
     def remove(self) -> None:
         """Remove the parts, as the sweep is done. Raises ApcError E601 if they can't be."""
-        for part in self.exists():
+        for part in self.finished():
             try:
                 self._path(part).unlink(missing_ok=True)
             except OSError as error:

@@ -274,7 +274,7 @@ class _Memory:
     def read(self, part: int) -> Cells | None:
         return self._cells.get(part)
 
-    def exists(self) -> set[int]:
+    def finished(self) -> set[int]:
         return set(self._cells)
 
 
@@ -301,7 +301,7 @@ class Whose:
 
 def _compute_missing(work: Work, stored: _Stored, whose: Whose, progress: Progress | None) -> tuple[str, ...]:
     """Compute the missing parts, store each at once, and return remarks on the computation."""
-    there = stored.exists()
+    there = stored.finished()
     missing = [part for part in range(work.parts) if part not in there or stored.read(part) is None]
     damaged = [part for part in missing if part in there]
     done = work.grid.points - sum(len(work.points_of(part)) for part in missing)

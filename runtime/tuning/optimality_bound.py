@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.cell_bounds import Cell, ParametricClosedLoop, matrices_over
-from apc.analysis.robust_stability import TOGETHER, undecided_notes
+from apc.analysis.robust_stability import TOGETHER, box_problem
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.eigen.enclosure import least_radius
@@ -63,7 +63,7 @@ def none_better(
     if not spans[objective][0] < spans[objective][1] or len(gains) > GAINS:
         return None
     try:
-        opened = [undecided_notes(topology, gains, prepared, inside) for topology in topologies]
+        opened = [box_problem(topology, gains, prepared, inside) for topology in topologies]
     except ApcError:  # a model that is no rational function of the gains
         return None
     questions = [question for item in opened for question in item.questions]
@@ -74,7 +74,7 @@ def none_better(
             return None
         some, cells = cells[:TOGETHER], cells[TOGETHER:]
         evaluations += len(some)
-        unstable, widest, size = _cell_tested(questions, some)
+        unstable, widest, size = _test_cells(questions, some)
         entries += size
         for cell, position in ((some[index], int(widest[index])) for index in np.flatnonzero(~unstable)):
             low, high = cell[position]
@@ -83,7 +83,7 @@ def none_better(
     return evaluations
 
 
-def _cell_tested(
+def _test_cells(
     questions: Sequence[ParametricClosedLoop], cells: Sequence[Cell]
 ) -> tuple[NDArray[np.bool_], NDArray[np.intp], int]:
     """Return the cells proved unstable, the most sensitive gain of each, and the entries evaluated."""

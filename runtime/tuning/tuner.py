@@ -292,14 +292,14 @@ class _Work:
         objective = self.spec.objective
         starts: list[Floats] = []
         while True:
-            optimum = self._satisfied(objective.column, starts)
+            optimum = self._optimize_scenarios(objective.column, starts)
             if (
                 objective.column is not None and optimum.worst_case > BINDS
             ):  # perhaps they only were not found
-                least = self._satisfied(None, [])
+                least = self._optimize_scenarios(None, [])
                 if least.worst_case > 0:
                     return self._unmet(least)
-                optimum = self._satisfied(objective.column, [self._shares(least)])
+                optimum = self._optimize_scenarios(objective.column, [self._shares(least)])
             if objective.column is None and self.spec.decay < 1 and optimum.worst_case > BINDS:
                 return self._unmet(optimum)
             gains, proofs, failed = self._settled(optimum)
@@ -311,7 +311,7 @@ class _Work:
     def _shares(self, optimum: Optimum) -> Floats:
         return ScenarioOptimizer(self.constraints, self.scenarios, None).shares(optimum)
 
-    def _satisfied(self, column: int | None, starts: list[Floats]) -> Optimum:
+    def _optimize_scenarios(self, column: int | None, starts: list[Floats]) -> Optimum:
         """Return the best of all scenarios, those added that limit it more than those there are."""
         sign = 1.0 if self.spec.objective.maximize else -1.0
         begun: list[Floats] = []

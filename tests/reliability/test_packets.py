@@ -278,7 +278,7 @@ def test_of_answers_the_shortest_round_trip_tells_a_clock_and_the_first_the_begi
     """A peer that starts slowly answers old hellos: these are answers too."""
     loop = loop_at(Wire(monkeypatch), compiled(MOVING), DIGEST, b"", "1")
     for requested, begins in ((1_000, 0), (2_000, 9_000), (1_000, 8_000)):
-        loop._connected(HelloReply(1, 5_000, 3, 4, requested, 4_000, begins, int(begins > 0)), 6_000)
+        loop._synchronize(HelloReply(1, 5_000, 3, 4, requested, 4_000, begins, int(begins > 0)), 6_000)
     assert loop.offsets[1][0] == 6_000 - 2_000 - 1_000
     assert loop.began is not None
     assert loop.began.begins == 9_000
